@@ -1,0 +1,111 @@
+"""The command line: one command a registered stage, and those that look after datasets and the store.
+
+Only the command that was asked for is built, and only its module imported: ``tacpipe --help`` and a hit must not wait for
+torch, pyarrow, pandas, scikit-learn or open3d.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from tacpipe import commands, registry
+from tacpipe.errors import INTERRUPTED, TacpipeError
+
+HELP = """From a tactile sensor's cable to a table of results that can be traced back to its bytes.
+
+Stages read and write datasets: `tacpipe STAGE INPUT... -o OUTPUT`. What was computed before is not computed again.
+Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data, 5 device missing or lost,
+6 lock wait timed out, 130 interrupted.
+"""
+SUMMARIES = {
+    "ingest": "Read published recordings into a dataset.",
+    "segment": "Cut recordings down to what matters in them.",
+    "compress": "Turn tactile channels into latents.",
+    "train": "Train a model.",
+    "simulate": "Write recordings of the simulated rig, with ground truth.",
+}
+
+
+def app(arguments: list[str]) -> typer.Typer:
+    """Return the program that can answer ``arguments``: with the one command they name, or all of them for help."""
+    program = typer.Typer(
+        help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    )
+
+    @program.callback()
+    def version(show: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
+        if show:
+            from importlib.metadata import version as installed
+
+            typer.echo(installed("tacpipe"))
+            raise typer.Exit
+
+    first = next((argument for argument in arguments if not argument.startswith("-")), None)
+    if first == "--version" or "--version" in arguments[:1]:
+        program.info.invoke_without_command = True
+    names = registry.stages()
+    groups = {name.partition(".")[0] for name in names}
+    if first in commands.NAMES:
+        commands.NAMES[first](program)
+    elif first in groups:
+        _add_stages(program, first, [name for name in names if name.partition(".")[0] == first], arguments)
+    else:
+        _add_summaries(program, names, groups)
+    return program
+
+
+def main() -> None:
+    """Run the command line; exit with the documented codes."""
+    try:
+        app(sys.argv[1:])(prog_name="tacpipe")
+    except TacpipeError as error:
+        print(f"tacpipe: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        sys.exit(0)
+
+
+def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: list[str]) -> None:
+    from tacpipe import stage_command
+
+    if names == [group]:
+        stage_command.add(program, group, group)
+        return
+    methods = typer.Typer(help=SUMMARIES.get(group), no_args_is_help=True, rich_markup_mode=None)
+    for name in names:
+        method = name.partition(".")[2]
+        if method in arguments:
+            stage_command.add(methods, name, method)
+        else:  # a broken method spoils itself alone
+            methods.command(method, help=registry.summary(name))(_nothing)
+    program.add_typer(methods, name=group)
+
+
+def _add_summaries(program: typer.Typer, names: dict[str, str], groups: set[str]) -> None:
+    """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
+    lines = {
+        group: SUMMARIES.get(group) or registry.summary(group if group in names else _first(names, group))
+        for group in groups
+    }
+    for name in (*ORDER, *sorted(groups - set(ORDER)), *commands.NAMES):
+        if name in lines or name in commands.NAMES:
+            program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
+
+
+ORDER = ("ingest", "simulate", "synchronize", "segment", "split", "compress", "train", "evaluate", "predict", "report")
+
+
+def _first(names: dict[str, str], group: str) -> str:
+    return next(name for name in names if name.startswith(f"{group}."))
+
+
+def _nothing() -> None:
+    """Stand for a command that was not asked for."""
+
+
+if __name__ == "__main__":
+    main()

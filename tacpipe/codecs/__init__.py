@@ -1,0 +1,1 @@
+"""What turns tactile channels into latents and back."""

@@ -1,0 +1,83 @@
+"""The commands beside the stages: what looks after datasets and the store."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
+SUMMARIES = {
+    "label": "Change labels of recordings, or exclude them, without touching a shard.",
+    "show": "Show what is in a dataset: recordings, streams, rates, gaps, saturation, labels.",
+    "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
+    "store": "Look after the store: status, verify, repair, gc, link, push, pull.",
+    "demo": "Run the main job on the simulated rig, small, from recordings to a report.",
+}
+
+
+def _label(program: typer.Typer) -> None:
+    @program.command(
+        "label", help=SUMMARIES["label"] + "\n\nExample: tacpipe label data/recordings trial-003 --set material=foam"
+    )
+    def label(
+        dataset: Annotated[Path, typer.Argument(help="The recordings.")],
+        names: Annotated[list[str], typer.Argument(help="Names of recordings; * and ? stand for any letters.")],
+        set_: Annotated[list[str] | None, typer.Option("--set", help="name=value; a value of null removes it.")] = None,
+        exclude: Annotated[str | None, typer.Option("--exclude", help="Leave out of every stage, and why.")] = None,
+        include: Annotated[bool, typer.Option("--include", help="Take back an --exclude.")] = False,
+    ) -> None:
+        from tacpipe import labels
+
+        print(labels.change(dataset, names, labels.parse(set_ or [], exclude, include=include)))
+
+
+def _show(program: typer.Typer) -> None:
+    @program.command("show", help=SUMMARIES["show"] + "\n\nExample: tacpipe show data/recordings")
+    def show(
+        dataset: Annotated[Path, typer.Argument(help="A dataset.")],
+        as_json: AsJson = False,
+        full: Annotated[bool, typer.Option("--full", help="Every recording, not the first 20.")] = False,
+    ) -> None:
+        from tacpipe import overview
+
+        _print(overview.of(dataset), overview.to_text, as_json=as_json, full=full)
+
+
+def _explain(program: typer.Typer) -> None:
+    @program.command("explain", help=SUMMARIES["explain"] + "\n\nExample: tacpipe explain results/forward")
+    def explain(dataset: Annotated[Path, typer.Argument(help="A dataset or report.")], as_json: AsJson = False) -> None:
+        from tacpipe import lineage
+
+        _print(lineage.of(dataset), lineage.to_text, as_json=as_json)
+
+
+def _demo(program: typer.Typer) -> None:
+    @program.command("demo", help=SUMMARIES["demo"] + "\n\nExample: tacpipe demo -o demo")
+    def demo(output: Annotated[Path, typer.Option("-o", "--output", help="Where to write.")] = Path("demo")) -> None:
+        from tacpipe import demonstration
+
+        print(demonstration.run(output))
+
+
+def _store(program: typer.Typer) -> None:
+    from tacpipe import store_command
+
+    store_command.add(program, SUMMARIES["store"])
+
+
+def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
+    print(json.dumps(value) if as_json else to_text(value, **options))
+
+
+NAMES: dict[str, Callable[[typer.Typer], None]] = {
+    "label": _label,
+    "show": _show,
+    "explain": _explain,
+    "store": _store,
+    "demo": _demo,
+}

@@ -1,0 +1,141 @@
+"""A dataset opened for reading: shards and files by name, their bytes verified when asked for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.hashing import digest
+from tacpipe.manifest import Manifest, shard_path
+from tacpipe.stage import Attribute
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+    import pyarrow as pa
+    import torch
+
+Reader = Callable[[str, str], bytes]  # digest, path within the dataset directory -> verified content
+
+
+class Shard:
+    """One recording of a dataset: its attributes, and its tables when asked for."""
+
+    def __init__(self, name: str, entry: Mapping[str, Any], read: Reader) -> None:
+        self.name = name
+        self.attributes: Mapping[str, Attribute] = MappingProxyType(dict(entry["attributes"]))
+        self._shards = entry["shards"]
+        self._read = read
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """The names of the recording's streams; ``("",)`` where one table holds all."""
+        return tuple(sorted(self._shards))
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """The digest of each stream."""
+        return {stream: shard["digest"] for stream, shard in self._shards.items()}
+
+    @property
+    def digest(self) -> str:
+        """The digest of the recording's only stream, or of all of them."""
+        digests = self.digests
+        return digests[""] if set(digests) == {""} else digest(digests)
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        """Return a stream as an arrow table with field metadata; its bytes are verified first."""
+        from tacpipe.tables import from_parquet
+
+        if stream not in self._shards:
+            raise UsageError(
+                f"Recording {self.name} has no stream {stream!r}; it has {', '.join(map(repr, self.streams))}."
+            )
+        return from_parquet(self._read(self._shards[stream]["digest"], shard_path(self.name, stream)), columns)
+
+
+class LazyFiles(Mapping[str, bytes]):
+    """The files of a dataset by name; their content is read and verified when asked for."""
+
+    def __init__(self, files: Mapping[str, Any], read: Reader) -> None:
+        self._files, self._read = files, read
+
+    def __getitem__(self, name: str) -> bytes:
+        return self._read(self._files[name]["digest"], name)
+
+    def __iter__(self) -> Any:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+
+class Dataset:
+    """A dataset opened for reading: recordings by name, files by name."""
+
+    def __init__(self, manifest: Manifest, read: Reader, names: Iterable[str] | None = None) -> None:
+        included = manifest.included
+        chosen = sorted(included if names is None else names)
+        self.source = manifest
+        self.shards: dict[str, Shard] = {name: Shard(name, included[name], read) for name in chosen}
+        self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as plain values."""
+        value: dict[str, Any] = json.loads(self.source.content)
+        return value
+
+    @property
+    def digest(self) -> str:
+        """The dataset's digest."""
+        return self.source.digest
+
+    def table(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return all recordings in one arrow table, after a first column ``recording``.
+
+        ``stream`` may be left out where the recordings have one table each.
+        """
+        import pyarrow as pa
+
+        name = self._only_stream() if stream is None else stream
+        tables = []
+        for shard in self.shards.values():
+            table = shard.table(name, columns).replace_schema_metadata(None)
+            names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([shard.name]))
+            tables.append(table.add_column(0, "recording", names))
+        if not tables:
+            raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
+        plain = [pa.Table.from_arrays(table.columns, names=table.column_names) for table in tables]
+        return pa.concat_tables(plain, promote_options="default").unify_dictionaries()
+
+    def to_pandas(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pd.DataFrame:
+        """Return all recordings in one frame, after a categorical column ``recording``."""
+        frame: pd.DataFrame = self.table(stream, columns).to_pandas()
+        return frame
+
+    def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Return one array of shape (time, channel) a recording, in the order of ``columns``."""
+        import numpy as np
+
+        name = self._only_stream() if stream is None else stream
+        tables = {shard.name: shard.table(name, columns) for shard in self.shards.values()}
+        return {
+            recording: np.column_stack([table[column].to_numpy() for column in columns or table.column_names])
+            for recording, table in tables.items()
+        }
+
+    def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
+        """Return one tensor of shape (time, channel) a recording, in the order of ``columns``."""
+        import torch
+
+        return {name: torch.from_numpy(values) for name, values in self.to_numpy(stream, columns).items()}
+
+    def _only_stream(self) -> str:
+        streams = {stream for shard in self.shards.values() for stream in shard.streams}
+        if len(streams) > 1:
+            raise UsageError(f"Name the stream to read: the recordings have {', '.join(sorted(streams))}.")
+        return next(iter(streams), "")

@@ -1,0 +1,124 @@
+"""The directory of a dataset: shards linked beside the manifest, for programs that read files."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from pathlib import Path
+
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.hashing import bytes_digest
+from tacpipe.manifest import NAME, Manifest, parse
+from tacpipe.store import Store
+
+
+def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) -> None:
+    """Make ``directory`` show ``manifest``: shards linked beside it, the manifest last, then a root in the store.
+
+    What an earlier manifest named and this one does not is removed. Raises `UsageError` if the directory holds
+    something that tacpipe did not write.
+    """
+    directory = directory.absolute()
+    check_output(store, directory)
+    wanted = dict(manifest.objects())
+    current = _current(directory, manifest.content)
+    before = set(wanted) if current else _named(directory)
+    for path, name in wanted.items():
+        if not (current and _matches(directory / path, store.object_path(name))):
+            place(store, name, directory / path, copy=copy)
+    if not current:
+        _write(directory / NAME, manifest.content)
+    for path in before - set(wanted):
+        with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            (directory / path).unlink()
+    for path in before - set(wanted):
+        with contextlib.suppress(OSError):  # not empty, or gone already
+            if (directory / path).parent != directory:
+                (directory / path).parent.rmdir()
+    store.set_root(directory, bytes_digest(manifest.content))
+
+
+def check_output(store: Store, directory: Path) -> None:
+    """Refuse to write a dataset over something that tacpipe did not write."""
+    directory = directory.absolute()
+    if directory.is_file():
+        raise UsageError(f"{directory} is a file; give -o a directory.")
+    if not directory.is_dir() or (directory / NAME).exists() or store.get_root(directory) is not None:
+        return
+    foreign = [entry.name for entry in directory.iterdir() if entry.name != ".gitignore"]
+    if foreign:
+        raise UsageError(
+            f"{directory} holds {foreign[0]} and no {NAME}, so tacpipe did not write it. Give -o a new directory."
+        )
+
+
+def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
+    """Put the object ``name`` at ``path``: by reflink, hard link or copy, in this order; only by copy if ``copy``."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    source = store.object_path(name)
+    with contextlib.suppress(FileNotFoundError):
+        draft.unlink()
+    try:
+        if copy or not _link(source, draft):
+            shutil.copyfile(source, draft)
+        draft.replace(path)
+    except FileNotFoundError:
+        raise DamagedError(
+            f"Object {name[:12]} vanished from the store while it was linked; run the same command again."
+        ) from None
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            draft.unlink()
+
+
+def _link(source: str, target: Path) -> bool:
+    import fcntl
+
+    with open(source, "rb") as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
+        fcntl.ioctl(writing.fileno(), 0x40049409, reading.fileno())  # FICLONE
+        return True
+    target.unlink()
+    with contextlib.suppress(OSError):
+        os.link(source, target)
+        return True
+    return False
+
+
+def _matches(path: Path, source: str) -> bool:
+    """Return whether ``path`` still looks like the object it was made from: the same inode, or the same size."""
+    try:
+        there, stored = os.stat(path), os.stat(source)  # noqa: PTH116  (twice a shard on every hit)
+    except FileNotFoundError:
+        return False
+    return there.st_ino == stored.st_ino or there.st_size == stored.st_size
+
+
+def _current(directory: Path, content: bytes) -> bool:
+    try:
+        return (directory / NAME).read_bytes() == content
+    except FileNotFoundError:
+        return False
+
+
+def _named(directory: Path) -> set[str]:
+    """Return the paths that the manifest in ``directory`` names; none if there is no readable one."""
+    try:
+        return {path for path, _ in parse((directory / NAME).read_bytes(), str(directory)).objects()}
+    except (FileNotFoundError, TacpipeError):
+        return set()
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with open(draft, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            draft.unlink()

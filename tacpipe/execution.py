@@ -1,0 +1,296 @@
+"""How one key is made: arguments out of an identity, then the stage, then objects and a record."""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tacpipe import params as params_of
+from tacpipe import registry
+from tacpipe.dataset import Dataset, Shard
+from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.hashing import bytes_digest, digest, file_digest
+from tacpipe.manifest import Manifest, shard_path
+from tacpipe.stage import Recording, Result, Stage
+from tacpipe.store import MissingError, Object, Store
+
+_LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One key to make: all that a worker process needs."""
+
+    store: str
+    name: str  # of the stage
+    identity: Mapping[str, Any]
+    recording: str = ""
+    files: Mapping[str, str] | None = None  # of a published source: name to path
+    beside: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
+    replace: bool = False  # the old record names objects that are gone
+    dry: bool = False  # compute and compare, store nothing
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a task: a record, or what was wrong with the recording."""
+
+    recording: str
+    record: Mapping[str, Any] | None
+    error: str = ""
+    exit_code: int = 0
+    made: bool = True  # False if another process was faster
+
+
+def compute(task: Task) -> Done:
+    """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
+    store, key = Store(task.store), digest(task.identity)
+    try:
+        if task.dry:
+            return Done(task.recording, {"result": execute(task, store, _Scratch())})
+        with store.lease(key):
+            record = store.record(key)
+            if record is not None and complete(store, record):
+                return Done(task.recording, record, made=False)
+            started = time.perf_counter()
+            replace = task.replace or record is not None
+            result = execute(task, store, store)
+            stage = stage_of(task.name)
+            made = {**provenance(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+            record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
+            shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
+            return Done(task.recording, record)
+    except TacpipeError as error:
+        return Done(task.recording, None, str(error), error.exit_code)
+
+
+class _Scratch:
+    """Takes content as a store does, and keeps only its name."""
+
+    def put(self, content: bytes, *, durable: bool = False) -> Object:
+        return Object(bytes_digest(content), len(content))
+
+
+def execute(task: Task, store: Store, sink: Store | _Scratch) -> dict[str, Any]:
+    """Call the stage for the task and return what a record's ``result`` holds, its content put into ``sink``."""
+    stage = stage_of(task.name)
+    params = params_of.from_json(stage, task.identity["params"])
+    with _arguments(stage, task, store) as arguments:
+        try:
+            returned = stage(params, **arguments)
+        except Exception as error:
+            error.add_note(f"in stage {task.name}, recording {task.recording or 'all'}")
+            raise
+    if not isinstance(returned, Result):
+        returned = (
+            Result(recordings={"": _recording(task.name, returned)}) if stage.mapped else _files(task.name, returned)
+        )
+    recordings = {
+        name: _entry(recording, sink, durable=stage.source) for name, recording in sorted(returned.recordings.items())
+    }
+    files = {name: vars(sink.put(content)) for name, content in sorted(returned.files.items())}
+    return {"recordings": recordings, "files": files}
+
+
+def stage_of(name: str) -> Stage:
+    """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``."""
+    stage = registry.load(name.removesuffix(".fit"))
+    if name.endswith(".fit"):
+        assert stage.fit is not None
+        return stage.fit
+    return stage
+
+
+def complete(store: Store, record: Mapping[str, Any]) -> bool:
+    """Return whether every object that the record names is in the store."""
+    return all(store.has(name) for name in named(record["result"]))
+
+
+def named(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the digests of all shards and files of a record's ``result`` (or of a manifest)."""
+    for entry in result["recordings"].values():
+        for shard in entry["shards"].values():
+            yield shard["digest"]
+    for file in result["files"].values():
+        yield file["digest"]
+
+
+def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> list[str]:
+    """Return the paths of shards and files whose content is other in two results; ``name`` is that of a mapped recording."""
+
+    def contents(result: Mapping[str, Any]) -> dict[str, str]:
+        shards = {
+            shard_path(recording or name, stream): shard["digest"]
+            for recording, entry in result["recordings"].items()
+            for stream, shard in entry["shards"].items()
+        }
+        return {**shards, **{file: value["digest"] for file, value in result["files"].items()}}
+
+    before, now = contents(stored), contents(made)
+    return sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
+
+
+def reader(store: Store, beside: tuple[str, ...] = ()) -> Callable[[str, str], bytes]:
+    """Return a function (digest, path within its dataset) -> content that heals what it finds damaged.
+
+    It reads from the store; what is missing there is adopted from the directories ``beside``, or made again from its
+    record. Raises `DamagedError` where neither can be done.
+    """
+
+    def read(name: str, path: str) -> bytes:
+        try:
+            return store.read(name)
+        except MissingError as error:
+            return _adopt(store, name, path, beside) or _remake(store, name, path, str(error))
+
+    return read
+
+
+def _adopt(store: Store, name: str, path: str, beside: tuple[str, ...]) -> bytes | None:
+    for directory in beside:
+        try:
+            content = (Path(directory) / path).read_bytes()
+        except OSError:
+            continue
+        if bytes_digest(content) == name:
+            store.prepare()
+            store.put(content, durable=True)
+            return content
+    return None
+
+
+def _remake(store: Store, name: str, path: str, why: str) -> bytes:
+    for _, record in store.records():
+        identity = record["identity"]
+        if "stage" not in identity or name not in set(named(record["result"])):
+            continue
+        stage = stage_of(identity["stage"])
+        if stage.source:
+            raise DamagedError(
+                f"{why} It is the recording {path}, which cannot be made again: restore it with `tacpipe store pull`, "
+                f"or ingest it again."
+            )
+        if stage.version != identity["version"]:
+            continue
+        result = execute(Task(str(store.root), identity["stage"], identity), store, store)
+        if name in set(named(result)):
+            return store.read(name)
+    raise DamagedError(
+        f"{why} Nothing in the store says how {path} was made: bring it with `tacpipe store pull`, or run the stage again."
+    )
+
+
+@contextmanager
+def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any]]:
+    """Yield the arguments that the identity describes, by name."""
+    read = reader(store, task.beside)
+    inputs = task.identity["inputs"]
+    found: dict[str, Any] = {}
+    for name, kind in stage.arguments.items():
+        if kind == "Shard":
+            found[name] = Shard(task.recording, inputs[name], read)
+        elif kind in ("Dataset", "Model"):
+            found[name] = _dataset(inputs[name], read)
+        elif kind == "Datasets":
+            found[name] = tuple(_dataset(value, read) for value in inputs[name])
+        elif kind == "Fitted":
+            found[name] = {file: read(value, file) for file, value in inputs[name].items()}
+        elif kind == "Files":
+            found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
+        elif kind == "Trial":
+            found[name] = inputs[name]
+        elif kind == "Roles":
+            found[name] = read_roles(read(inputs[name], "split.parquet")) if inputs[name] else {}
+        else:
+            found[name] = store.root / "checkpoints" / digest(task.identity)
+            found[name].mkdir(parents=True, exist_ok=True)
+    yield found
+    for file, path in (task.files or {}).items():
+        if file_digest(path) != inputs[stage.argument("Files")][file]:
+            raise TacpipeError(f"{path} changed while it was read. Run the same command again.")
+
+
+def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
+    lineage = value["lineage"]
+    manifest = Manifest(
+        stage=lineage["stage"],
+        version=lineage["version"],
+        params=lineage["params"],
+        chain=lineage["chain"],
+        recordings=value["recordings"],
+        files={name: {"digest": file} for name, file in value["files"].items()},
+    )
+    return Dataset(manifest, read)
+
+
+def read_roles(content: bytes) -> dict[tuple[str, int], str]:
+    """Return (recording, fold) to role from the Parquet bytes of a split."""
+    from tacpipe.tables import from_parquet
+
+    rows = from_parquet(content, ["recording", "fold", "role"]).to_pydict()
+    return dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
+
+
+def _recording(name: str, returned: Any) -> Recording:
+    if isinstance(returned, Recording):
+        return returned
+    if hasattr(returned, "schema") or isinstance(returned, Mapping):
+        return Recording(returned)
+    raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a table, tables or files.")
+
+
+def _files(name: str, returned: Any) -> Result:
+    if isinstance(returned, Mapping):
+        return Result(files=returned)
+    raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a Result or files by name.")
+
+
+def _entry(recording: Recording, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
+    from tacpipe.tables import to_parquet
+
+    shards = {
+        stream: {**vars(sink.put(to_parquet(table), durable=durable)), "rows": table.num_rows}
+        for stream, table in sorted(recording.streams.items())
+    }
+    return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
+
+
+@functools.cache
+def _provenance() -> dict[str, Any]:
+    import subprocess
+    from importlib.metadata import PackageNotFoundError, version
+
+    libraries = {}
+    for name in _LIBRARIES:
+        try:
+            libraries[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    git = ["git", "rev-parse", "HEAD"]
+    try:
+        commit = subprocess.run(git, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
+    except OSError:
+        commit = ""
+    return {
+        "libraries": libraries,
+        "git_commit": commit or None,
+        "host": platform.node(),
+        "python": sys.version.split()[0],
+        "threads": len(os.sched_getaffinity(0)),
+    }
+
+
+def provenance(seconds: float) -> dict[str, Any]:
+    """Return where and with what something was made; no part of any key or digest."""
+    torch = sys.modules.get("torch")
+    device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
+    return {**_provenance(), "device": device, "seconds": seconds}

@@ -1,0 +1,66 @@
+"""Where shards are computed: in this process, or in a pool of processes on this machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from tacpipe.errors import TacpipeError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+Task = TypeVar("Task")
+Done = TypeVar("Done")
+_POOL_FROM = 8  # starting workers costs more than a few shards
+_CHUNKS_A_JOB = 8  # how often a worker comes back for more: progress against overhead
+
+
+def jobs_wanted(jobs: int) -> int:
+    """Return the number of processes to use: ``jobs``, or one a usable core for 0."""
+    return jobs if jobs > 0 else len(os.sched_getaffinity(0))
+
+
+def run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
+    """Yield ``compute(task)`` of every task, in any order.
+
+    Raises `TacpipeError` if a worker dies (out of memory, killed); what the others finished is in the store by then.
+    """
+    jobs = min(jobs_wanted(jobs), len(tasks))
+    if jobs <= 1 or len(tasks) < _POOL_FROM:
+        yield from map(compute, tasks)
+        return
+    import multiprocessing  # 10 ms that a hit does not pay
+    from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+
+    context = multiprocessing.get_context("forkserver" if os.name == "posix" else "spawn")
+    if context.get_start_method() == "forkserver":
+        context.set_forkserver_preload(list(preload))
+    size = max(1, len(tasks) // (jobs * _CHUNKS_A_JOB))
+    chunks = [tasks[start : start + size] for start in range(0, len(tasks), size)]
+    pool = ProcessPoolExecutor(jobs, mp_context=context)
+    try:
+        pending: set[Future[list[Done]]] = {pool.submit(_compute_chunk, compute, chunk) for chunk in chunks}
+        while pending:
+            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield from _result(future)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _compute_chunk(compute: Callable[[Any], Done], chunk: Sequence[Any]) -> list[Done]:
+    return [compute(task) for task in chunk]
+
+
+def _result(future: Future[list[Done]]) -> list[Done]:
+    from concurrent.futures.process import BrokenProcessPool
+
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise TacpipeError(
+            "A worker process died, most likely for lack of memory. What was finished is kept: run the same command "
+            "again, with a smaller --jobs if it happens again."
+        ) from error

@@ -1,0 +1,1 @@
+"""One published layout of recordings a file."""

@@ -1,0 +1,59 @@
+"""What a lab notices afterwards: labels set by hand, without touching a shard."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from tacpipe import directory as directory_of
+from tacpipe import manifest as manifest_of
+from tacpipe.errors import UsageError
+from tacpipe.stage import Attribute
+from tacpipe.store import locate
+
+
+def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
+    """Return the labels of ``name=value`` texts; numbers and true, false, null are read as YAML does."""
+    import yaml
+
+    labels: dict[str, Attribute] = {}
+    for text in sets:
+        name, equals, value = text.partition("=")
+        if not equals or not name.isidentifier():
+            raise UsageError(f"--set {text} should read name=value, as in --set material=foam.")
+        labels[name] = yaml.safe_load(value) if value else ""
+        if not isinstance(labels[name], str | int | float | bool | None):
+            labels[name] = value
+    if exclude is not None and include:
+        raise UsageError("--exclude and --include contradict each other; give one.")
+    if exclude is not None:
+        labels["excluded"] = exclude or "excluded"
+    if include:
+        labels["excluded"] = None
+    if not labels:
+        raise UsageError("Nothing to change: give --set name=value, --exclude REASON or --include.")
+    return labels
+
+
+def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Path:
+    """Set ``labels`` on the recordings whose names match and return the dataset's directory.
+
+    Raises `UsageError` if a pattern matches no recording.
+    """
+    directory, content = manifest_of.read_manifest(path)
+    manifest = manifest_of.parse(content, str(directory / manifest_of.NAME))
+    names: set[str] = set()
+    for pattern in patterns:
+        found = {name for name in manifest.recordings if fnmatchcase(name, pattern)}
+        if not found:
+            some = ", ".join(sorted(manifest.recordings)[:5])
+            raise UsageError(f"{directory} has no recording {pattern}; it has {len(manifest.recordings)}: {some} …")
+        names |= found
+    store = locate(directory)
+    store.prepare()
+    store.put(content)
+    changed = manifest.labelled({name: dict(labels) for name in sorted(names)})
+    store.put(changed.content)
+    directory_of.publish(store, changed, directory, copy=not changed.chain)
+    return directory

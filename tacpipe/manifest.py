@@ -1,0 +1,180 @@
+"""The manifest: what a dataset is, told in one deterministic JSON file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import DamagedError, UsageError
+from tacpipe.hashing import digest
+from tacpipe.stage import Attribute
+
+FORMAT = 1
+NAME = "manifest.json"
+Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a dataset is: recordings, files, and how they came to be."""
+
+    stage: str
+    version: int
+    params: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)
+    chain: Sequence[Mapping[str, Any]] = ()
+    recordings: Mapping[str, Entry] = field(default_factory=dict)
+    files: Mapping[str, Any] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
+
+    @cached_property
+    def digest(self) -> str:
+        """The dataset's digest: of names, attributes, shards and files, and not of how they were made."""
+        recordings = {
+            name: {
+                "attributes": entry["attributes"],
+                "shards": {stream: shard["digest"] for stream, shard in entry["shards"].items()},
+            }
+            for name, entry in self.recordings.items()
+        }
+        return digest({"recordings": recordings, "files": {name: file["digest"] for name, file in self.files.items()}})
+
+    @cached_property
+    def content(self) -> bytes:
+        """The bytes of ``manifest.json``: the same manifest gives the same bytes."""
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        value = {"format": FORMAT, "digest": self.digest, **fields}
+        return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode() + b"\n"
+
+    @property
+    def included(self) -> dict[str, Entry]:
+        """The recordings that nobody excluded."""
+        return {name: entry for name, entry in self.recordings.items() if not entry["attributes"].get("excluded")}
+
+    def labelled(self, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
+        """Return the manifest with attributes set by hand; labels of recordings that are not here are dropped."""
+        kept = {
+            name: {**self.labels.get(name, {}), **values} for name, values in labels.items() if name in self.recordings
+        }
+        recordings = dict(self.recordings)
+        for name, values in kept.items():
+            attributes = {**recordings[name]["attributes"], **values}
+            known = {key: value for key, value in attributes.items() if value is not None}
+            recordings[name] = {**recordings[name], "attributes": known}
+        return replace(self, recordings=recordings, labels={**self.labels, **kept})
+
+    def objects(self) -> Iterable[tuple[str, str]]:
+        """Yield (path in the directory, digest) of every shard and file."""
+        for name, entry in self.recordings.items():
+            for stream, shard in entry["shards"].items():
+                yield shard_path(name, stream), shard["digest"]
+        for name, file in self.files.items():
+            yield name, file["digest"]
+
+    @property
+    def rows(self) -> int:
+        """How many rows all shards have together."""
+        return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
+
+
+def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
+    """Return the manifest of these bytes; ``verified`` ones come from the store and need no second look.
+
+    Raises `DamagedError` if they are no manifest, or if what they name does not give their digest.
+    """
+    try:
+        value = json.loads(content)
+        found, stored = value.pop("format"), value.pop("digest")
+        if found != FORMAT:
+            raise UsageError(f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}.")
+        manifest = Manifest(**value)
+        manifest.__dict__["content"] = content  # primes the cached property: the bytes are at hand
+        computed = stored if verified else manifest.digest
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedError(
+            f"{where} is not a manifest of tacpipe ({error}). Restore it, or run the stage that made it again."
+        ) from None
+    if computed != stored:
+        raise DamagedError(
+            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it says {str(stored)[:12]}. "
+            f"Run the stage that made it again; labels are changed with `tacpipe label`."
+        )
+    return manifest
+
+
+def shard_path(recording: str, stream: str) -> str:
+    """Return the path of a shard within its dataset directory.
+
+    >>> shard_path("trial-01", "xela1"), shard_path("trial-01", "")
+    ('trial-01/xela1.parquet', 'trial-01.parquet')
+    """
+    return f"{recording}/{stream}.parquet" if stream else f"{recording}.parquet"
+
+
+def read_manifest(path: Path | str) -> tuple[Path, bytes]:
+    """Return the directory of the dataset at ``path`` (it or its manifest) and the bytes of its manifest."""
+    given = Path(path)
+    file = given if given.name == NAME else given / NAME
+    try:
+        return file.parent, file.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        what = "is empty or not there" if not given.exists() else f"has no {NAME}"
+        raise UsageError(
+            f"{given} {what}, so it is no dataset. Give the directory that a tacpipe command wrote with -o."
+        ) from None
+
+
+def merge(manifests: Sequence[Manifest]) -> Manifest:
+    """Return several datasets of one kind read as one.
+
+    Raises `UsageError` if two recordings share a name, if the files differ, or if other chains of stages lie behind them.
+    """
+    if len(manifests) == 1:
+        return manifests[0]
+    recordings: dict[str, Entry] = {}
+    files: dict[str, Any] = {}
+    for manifest in manifests:
+        for name in manifest.recordings:
+            if name in recordings:
+                raise UsageError(
+                    f"Two of the datasets hold a recording named {name}. Names must be unique; leave one dataset out."
+                )
+        if manifest.chain != manifests[0].chain:
+            raise UsageError(
+                f"These datasets were made in different ways and cannot be read as one: "
+                f"{chain_difference(manifests[0].chain, manifest.chain)}."
+            )
+        recordings.update(manifest.recordings)
+        files.update(manifest.files)
+    first = manifests[0]
+    return Manifest(first.stage, first.version, first.params, {}, first.chain, recordings, files)
+
+
+def chain_difference(wanted: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> str:
+    """Return in words where two chains of stages part.
+
+    >>> step = {"stage": "synchronize", "version": 1, "params": {"rate_hz": 50.0}, "fitted": None}
+    >>> chain_difference([step], [{**step, "params": {"rate_hz": 100.0}}])
+    'synchronize has rate_hz 100.0 instead of 50.0'
+    """
+    for ours, theirs in zip(wanted, found, strict=False):
+        if ours["stage"] != theirs["stage"]:
+            return f"{theirs['stage']} stands where {ours['stage']} should"
+        if ours["version"] != theirs["version"]:
+            return f"{ours['stage']} has version {theirs['version']} instead of {ours['version']}"
+        for name in sorted({*ours["params"], *theirs["params"]}):
+            left, right = ours["params"].get(name), theirs["params"].get(name)
+            if left != right:
+                return f"{ours['stage']} has {name} {right} instead of {left}"
+        if ours["fitted"] != theirs["fitted"]:
+            return f"{ours['stage']} was fitted on other recordings"
+    if len(wanted) != len(found):
+        longer = wanted if len(wanted) > len(found) else found
+        return f"only one of them went through {longer[min(len(wanted), len(found))]['stage']}"
+    return "they are the same"

@@ -1,0 +1,163 @@
+"""From defaults, ``params.yaml``, presets and options to a stage's params."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+from tacpipe.errors import UsageError
+from tacpipe.stage import Stage
+
+PRESETS = ("paper", "quick")
+
+
+def build(
+    name: str,
+    stage: Stage,
+    *,
+    file: Path | None = None,
+    block: str | None = None,
+    preset: str | None = None,
+    sets: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+) -> Any:
+    """Return the params of stage ``name``: defaults, then file, preset, ``--set``, options, each over the one before.
+
+    Raises `UsageError` for an unknown name or a value of the wrong type, with where it stands.
+    """
+    values: dict[str, Any] = {}
+    if file is not None:
+        values.update(_from_file(file, block or name, required=block is not None))
+        where = f"{file}, block {block or name}"
+        values = {key: check(stage, key, value, where) for key, value in values.items()}
+    if preset is not None:
+        values.update(_from_preset(name, stage, preset))
+    for text in sets:
+        key, _, value = text.partition("=")
+        field = key.removeprefix(f"{name}.")
+        values[field] = check(stage, field, _parse(value), f"--set {text}")
+    for key, value in (options or {}).items():
+        values[key] = check(stage, key, value, f"--{key.replace('_', '-')}")
+    try:
+        return stage.params(**values)
+    except TypeError as error:
+        raise UsageError(f"The params of {name} are not complete: {error}.") from error
+
+
+def fields(stage: Stage) -> dict[str, Any]:
+    """Return the type of each param of a stage."""
+    hints = typing.get_type_hints(stage.params)
+    return {field.name: hints[field.name] for field in dataclasses.fields(stage.params)}
+
+
+def check(stage: Stage, key: str, value: Any, where: str) -> Any:
+    """Return ``value`` if the param ``key`` can hold it, an int as a float where one is wanted.
+
+    Raises `UsageError` otherwise.
+    """
+    known = fields(stage)
+    if key not in known:
+        raise UsageError(f"{where}: there is no param {key}; there are {', '.join(known) or 'none'}.")
+    wanted = known[key]
+    fitted = _fit(value, wanted)
+    if fitted is _NO:
+        raise UsageError(f"{where}: {key} is {value!r}, which is no {_name(wanted)}.")
+    return fitted
+
+
+def to_json(params: Any) -> dict[str, Any]:
+    """Return the params as they stand in keys and manifests."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(params).items()
+    }
+
+
+def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
+    """Return the params that `to_json` gave."""
+    known = fields(stage)
+    return stage.params(**{k: tuple(v) if get_origin(known.get(k)) is tuple else v for k, v in values.items()})
+
+
+def comments(stage: Stage) -> dict[str, str]:
+    """Return the comment behind each field of a stage's params, which is its help."""
+    try:
+        lines = inspect.getsource(stage.params).splitlines()
+    except (OSError, TypeError):
+        return {}
+    found = (re.match(r"\s+(\w+)\s*:[^#]*#\s*(.*)", line) for line in lines)
+    return {match[1]: match[2] for match in found if match}
+
+
+_NO = object()
+
+
+def _fit(value: Any, wanted: Any) -> Any:
+    origin = get_origin(wanted)
+    if origin in (typing.Union, types.UnionType):
+        return next((fit for kind in get_args(wanted) if (fit := _fit(value, kind)) is not _NO), _NO)
+    if origin is typing.Literal:
+        return value if value in get_args(wanted) else _NO
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            return _NO
+        fits = [_fit(item, get_args(wanted)[0]) for item in value]
+        return _NO if _NO in fits else tuple(fits)
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if wanted is type(None):
+        return value if value is None else _NO
+    right = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
+    return value if right else _NO
+
+
+def _name(wanted: Any) -> str:
+    if get_origin(wanted) is typing.Literal:
+        return "one of " + ", ".join(map(str, get_args(wanted)))
+    names = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+    return names.get(wanted, str(wanted))
+
+
+def _parse(text: str) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _from_file(path: Path, block: str, *, required: bool) -> dict[str, Any]:
+    import yaml
+
+    try:
+        found = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
+    except FileNotFoundError:
+        raise UsageError(f"There is no file {path} to read params from.") from None
+    except yaml.YAMLError as error:
+        raise UsageError(f"{path} cannot be read: {error}.") from error
+    for part in block.split("."):
+        if not isinstance(found, dict):
+            raise UsageError(f"{path}: {part} of block {block} stands in {found!r}, which is no mapping.")
+        if part not in found:
+            if required:
+                raise UsageError(f"{path} has no block {block}; at {part} there are {', '.join(map(str, found))}.")
+            return {}
+        found = found[part]
+    if not isinstance(found, dict):
+        raise UsageError(f"{path}: block {block} is {found!r}; it should be a mapping of params.")
+    return found
+
+
+def _from_preset(name: str, stage: Stage, preset: str) -> dict[str, Any]:
+    presets = getattr(stage.params, "PRESETS", {})
+    if preset not in PRESETS:
+        raise UsageError(f"There is no preset {preset}; there are {', '.join(PRESETS)}.")
+    return {
+        key: check(stage, key, value, f"preset {preset} of {name}") for key, value in presets.get(preset, {}).items()
+    }

@@ -1,0 +1,343 @@
+"""What a command does: find out what is needed, answer from the store, run the rest, publish the dataset."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from tacpipe import directory, execution, executors, keys, manifest, progress, registry
+from tacpipe import params as params_of
+from tacpipe import request as request_of
+from tacpipe.dataset import Dataset
+from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
+from tacpipe.execution import Done, Task
+from tacpipe.hashing import bytes_digest, digest, file_digest
+from tacpipe.manifest import Entry, Manifest
+from tacpipe.request import Inputs, Request
+from tacpipe.stage import ROLES
+from tacpipe.store import MissingError, Store, locate
+
+
+@dataclass
+class Outcome:
+    """What a command did."""
+
+    output: Path
+    key: str = ""
+    ran: int = 0
+    reused: int = 0
+    rows: int = 0
+    seconds: float = 0.0
+    bad: dict[str, str] = field(default_factory=dict)
+    differs: list[str] = field(default_factory=list)
+
+
+def open_dataset(path: Path | str) -> Dataset:
+    """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
+    found = request_of.read(Path(path))
+    return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),)))
+
+
+def run(request: Request) -> Outcome:
+    """Make the dataset that ``request`` asks for, doing only what was not done before."""
+    started = time.perf_counter()
+    store, inputs = locate(), Inputs(request)
+    identity = inputs.identity()
+    outcome = Outcome(request.output, digest(identity))
+    hit = None if request.compare else _answer(store, outcome.key)
+    if hit is None:
+        made = _Run(request, store, inputs, outcome).make()
+    else:
+        made, outcome.reused = hit, len(hit.recordings) or 1
+    made = _keep_labels(request, made)
+    outcome.rows = made.rows
+    if request.check:
+        _check(store, request, made)
+    elif not request.compare:
+        if hit is None:
+            _remember(store, identity, made, outcome)
+        _publish(store, request, made)
+    outcome.seconds = round(time.perf_counter() - started, 3)
+    return outcome
+
+
+def _answer(store: Store, key: str) -> Manifest | None:
+    """Return the manifest that this run gave before, if everything it names is still there."""
+    record = store.record(key)
+    if record is None:
+        return None
+    try:
+        content = store.read(record["result"]["files"][manifest.NAME]["digest"])
+    except MissingError:
+        return None
+    found = manifest.parse(content, "the stored manifest", verified=True)
+    return found if all(store.has(name) for _, name in found.objects()) else None
+
+
+class _Run:
+    """One run that the store could not answer whole."""
+
+    def __init__(self, request: Request, store: Store, inputs: Inputs, outcome: Outcome) -> None:
+        self.request, self.store, self.inputs, self.outcome = request, store, inputs, outcome
+        self.stage = inputs.stage
+
+    def make(self) -> Manifest:
+        """Return the manifest of the result, having run what was missing."""
+        if self.request.check or self.request.compare:
+            return self._make()
+        self.store.prepare()
+        if not self.request.single_file:
+            directory.check_output(self.store, self.request.output)
+        with self.store.running([found.digest for found in self.inputs.used]):
+            for found in self.inputs.used:
+                found.manifest  # noqa: B018  (a manifest edited by hand is refused before anything is written)
+                self.store.put(found.content)  # explain and gc follow a dataset to the manifests it descends from
+            return self._make()
+
+    def _make(self) -> Manifest:
+        request, stage = self.request, self.stage
+        made = Manifest(request.name, stage.version, params_of.to_json(request.params), self.inputs.lineage())
+        if not stage.mapped:
+            identity = keys.identity(request.name, stage, request.params, self._whole_inputs())
+            result = self._whole(request.name, identity)
+            return replace(made, chain=self._chain(), recordings=result["recordings"], files=result["files"])
+        fitted = self._fit() if stage.fit else None
+        chain: Sequence[Mapping[str, Any]] = ()
+        entries: Mapping[str, Entry] = {}
+        if stage.argument("Shard"):
+            given = self.inputs.merged
+            step = keys.chain_step(request.name, stage, request.params, fitted)
+            tasks = keys.shard_tasks(self.store, given, step, self.inputs.beside)
+            entries, chain = given.included, [*given.chain, step]
+        elif stage.source:
+            found, digests = self.inputs.sources, self.inputs.source_digests
+            tasks = keys.source_tasks(self.store, request.name, stage, request.params, found, digests)
+        else:
+            tasks = keys.trial_tasks(self.store, request.name, stage, request.params)
+        if not tasks:
+            raise UsageError(f"{request.name} found no recording to work on.")
+        recordings = self._map(request.name, tasks, entries)
+        carried = {name: why for found in self.inputs.datasets for name, why in found.manifest.skipped.items()}
+        return replace(
+            made,
+            chain=chain,
+            recordings=recordings,
+            files=fitted or {},
+            skipped={**carried, **self.outcome.bad},
+            sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
+        )
+
+    def _chain(self) -> Sequence[Mapping[str, Any]]:
+        if "model" in self.inputs.named:
+            return self.inputs.model.chain
+        chains = [found.manifest.chain for found in self.inputs.datasets]
+        return chains[0] if chains and all(chain == chains[0] for chain in chains) else ()
+
+    # ---- stages over whole datasets
+
+    def _whole_inputs(self) -> dict[str, Any]:
+        return {
+            name: self._whole_input(name, kind) for name, kind in self.stage.arguments.items() if kind != "Workspace"
+        }
+
+    def _whole_input(self, name: str, kind: str) -> Any:
+        inputs, reads = self.inputs, self.stage.reads
+        if kind == "Model":
+            return keys.of_dataset(inputs.model, None, {})
+        if kind == "Datasets":
+            return [keys.of_dataset(found.manifest, reads, found.manifest.included) for found in inputs.datasets]
+        if kind == "Roles":
+            old = inputs.named.get("extend")
+            return request_of.split_digest(old) if old else None
+        if name in ROLES:
+            return keys.of_dataset(inputs.merged, reads, inputs.in_role(inputs.merged, name))
+        given = self._replay() if "model" in inputs.named else inputs.merged
+        if "split" in inputs.named:
+            return keys.of_dataset(given, reads, inputs.in_role(given, self.request.role or "test"))
+        if self.request.role is not None:
+            raise UsageError(f"--role {self.request.role} says nothing without --split.")
+        return keys.of_dataset(given, reads, given.included)
+
+    def _whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:
+        """Return the result of a key over whole datasets, from the store or by running the stage."""
+        record = self.store.record(digest(identity))
+        known = record is not None and execution.complete(self.store, record)
+        if record is not None and known and not self.request.compare:
+            self.outcome.reused += counted
+            result: Mapping[str, Any] = record["result"]
+            return result
+        if self.request.check:
+            raise WouldChangeError(f"{name} would run: there is no result for these inputs and params.")
+        task = Task(
+            str(self.store.root),
+            name,
+            identity,
+            beside=self.inputs.beside,
+            replace=record is not None,
+            dry=self.request.compare,
+        )
+        done = execution.compute(task)
+        if done.record is None:
+            raise _error(done.exit_code, done.error)
+        if self.request.compare and known and record is not None:
+            self.outcome.differs += execution.differences(record["result"], done.record["result"], name)
+        self.outcome.ran += done.made and counted
+        self.outcome.reused += counted and not done.made
+        made: Mapping[str, Any] = done.record["result"]
+        return made
+
+    def _fit(self) -> dict[str, Any]:
+        """Return the files that the stage's fit made of the training recordings, or those of ``--codec``."""
+        codec, name, fit = self.inputs.named.get("codec"), self.request.name, self.stage.fit
+        if codec is not None:
+            step = codec.manifest.chain[-1] if codec.manifest.chain else {}
+            if step.get("stage") != name:
+                raise UsageError(f"{codec.directory} was not made by {name}, so it holds no codec of its kind.")
+            return dict(codec.manifest.files)
+        assert fit is not None
+        given = self.inputs.merged
+        described = keys.of_dataset(given, fit.reads or (), self.inputs.in_role(given, "train"))
+        identity = keys.identity(f"{name}.fit", fit, self.request.params, {next(iter(fit.arguments)): described})
+        return dict(self._whole(f"{name}.fit", identity, counted=False)["files"])
+
+    # ---- stages recording by recording
+
+    def _map(self, name: str, tasks: Sequence[Task], entries: Mapping[str, Entry]) -> dict[str, Entry]:
+        """Return what each task gives, from the store or by running it, with the attributes of ``entries`` before."""
+        results: dict[str, Mapping[str, Any]] = {}
+        missing: list[Task] = []
+        for task in tasks:
+            record = self.store.record(digest(task.identity))
+            if record is not None and execution.complete(self.store, record):
+                results[task.recording] = record["result"]
+            else:
+                missing.append(replace(task, replace=record is not None))
+        if missing and self.request.check:
+            raise WouldChangeError(f"{name} would run for {len(missing)} of {len(tasks)} recordings.")
+        if self.request.compare:
+            missing = [replace(task, dry=True) for task in tasks]
+        self.outcome.reused += len(tasks) - len(missing)
+        results.update(self._compute(name, missing, results))
+        recordings: dict[str, Entry] = {}
+        for recording, result in sorted(results.items()):
+            made = result["recordings"][""]
+            before = entries[recording]["attributes"] if recording in entries else {}
+            recordings[recording] = {"attributes": {**before, **made["attributes"]}, "shards": made["shards"]}
+        return recordings
+
+    def _compute(
+        self, name: str, tasks: Sequence[Task], stored: Mapping[str, Mapping[str, Any]]
+    ) -> dict[str, Mapping[str, Any]]:
+        results: dict[str, Mapping[str, Any]] = {}
+        bad: dict[str, Done] = {}
+        preload = ["tacpipe.tables", "tacpipe.execution", registry.stages()[name].partition(":")[0]]
+        with progress.bar(name, len(tasks)) as advance:
+            for done in executors.run(execution.compute, tasks, self.request.jobs, preload):
+                advance(note=done.recording)
+                if done.record is None:
+                    bad[done.recording] = done
+                    continue
+                self.outcome.ran += done.made
+                self.outcome.reused += not done.made
+                result = results[done.recording] = done.record["result"]
+                if self.request.compare and done.recording in stored:
+                    self.outcome.differs += execution.differences(stored[done.recording], result, done.recording)
+        self._refuse(name, bad)
+        return results
+
+    def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
+        self.outcome.bad.update({recording: bad[recording].error for recording in sorted(bad)})
+        damaged_only = all(done.exit_code == TacpipeError.exit_code for done in bad.values())
+        if not bad or (self.request.skip_bad and damaged_only):
+            return
+        lines = "\n".join(f"  {recording}: {bad[recording].error}" for recording in sorted(bad))
+        plural = "recordings" if len(bad) > 1 else "recording"
+        raise _error(
+            max(done.exit_code for done in bad.values()),
+            f"{name} could not read {len(bad)} {plural}:\n{lines}\n"
+            f"What is good is kept in the store; mend these, or leave them out with --skip-bad.",
+        )
+
+    # ---- models: the chain that they carry
+
+    def _replay(self) -> Manifest:
+        """Return the given dataset after the stages that the model was trained behind, from wherever it stands now."""
+        given, wanted = self.inputs.merged, self.inputs.model.chain
+        if list(given.chain) != list(wanted[: len(given.chain)]):
+            raise UsageError(
+                f"The model was trained behind other stages than {self.request.datasets[0]} went through: "
+                f"{manifest.chain_difference(wanted, given.chain)}. Give the recordings themselves: the model's own "
+                f"stages are then run on them."
+            )
+        for step in wanted[len(given.chain) :]:
+            stage = registry.load(step["stage"])
+            if stage.version != step["version"]:
+                raise UsageError(
+                    f"The model was trained behind version {step['version']} of {step['stage']}; this tacpipe has version "
+                    f"{stage.version}. Train it again."
+                )
+            tasks = keys.shard_tasks(self.store, given, step, self.inputs.beside)
+            recordings = self._map(step["stage"], tasks, given.included)
+            files = {name: self.inputs.model.files[name] for name in step["fitted"] or {}}
+            given = Manifest(
+                step["stage"], step["version"], step["params"], {}, [*given.chain, step], recordings, files
+            )
+        return given
+
+
+def _error(exit_code: int, sentence: str) -> TacpipeError:
+    error = TacpipeError(sentence)
+    error.exit_code = exit_code
+    return error
+
+
+def _keep_labels(request: Request, made: Manifest) -> Manifest:
+    """Return recordings with the labels that were set by hand on those they replace."""
+    if request.datasets or not made.recordings or request.single_file:
+        return made
+    try:
+        labels = request_of.read(request.output).manifest.labels
+    except TacpipeError:
+        return made
+    return made.labelled(labels) if labels else made
+
+
+def _check(store: Store, request: Request, made: Manifest) -> None:
+    root = store.get_root(request.output.absolute())
+    if root is None or root["manifest"] != bytes_digest(made.content):
+        raise WouldChangeError(f"{request.output} would change: it was made from other inputs or params.")
+
+
+def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome: Outcome) -> None:
+    """Store the manifest, and the run if every recording was good: then a rerun is answered at once."""
+    stored = vars(store.put(made.content))
+    if not outcome.bad:
+        result = {"recordings": {}, "files": {manifest.NAME: stored}}
+        store.commit(identity, result, execution.provenance(0.0), replace=True)
+
+
+def _publish(store: Store, request: Request, made: Manifest) -> None:
+    try:
+        if request.single_file:
+            _publish_file(store, request, made)
+        else:
+            recordings = not request.datasets and bool(made.recordings)
+            directory.publish(store, made, request.output, copy=recordings)
+    except OSError as error:
+        raise TacpipeError(
+            f"{request.output} cannot be written: {error.strerror or error}. The result is kept in the store: run the same "
+            f"command again when that is mended."
+        ) from error
+
+
+def _publish_file(store: Store, request: Request, made: Manifest) -> None:
+    name = next((name for name in made.files if name.endswith(request.output.suffix)), None)
+    if name is None:
+        raise UsageError(f"{request.name} makes no {request.output.suffix} file; give -o a directory.")
+    wanted = made.files[name]["digest"]
+    if not request.output.exists() or file_digest(request.output) != wanted:
+        directory.place(store, wanted, request.output.absolute(), copy=True)
+    store.set_root(request.output.absolute(), bytes_digest(made.content))

@@ -1,0 +1,117 @@
+"""Names of stages, formats and tasks, found through entry points and loaded when asked for."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib
+import importlib.util
+import sys
+from configparser import ConfigParser
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.stage import Stage
+
+STAGES, FORMATS, TASKS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks"
+
+
+@functools.cache
+def entry_points() -> dict[str, dict[str, str]]:
+    """Return group, name and target of every entry point of tacpipe's groups.
+
+    Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
+    takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
+    """
+    found: dict[str, dict[str, str]] = {STAGES: {}, FORMATS: {}, TASKS: {}}
+    for folder in dict.fromkeys(sys.path):
+        for file in _entry_point_files(folder):
+            try:
+                text = file.read_text(encoding="utf-8")
+            except OSError:
+                continue
+            if "[tacpipe." not in text:
+                continue
+            parser = ConfigParser(delimiters=("=",), interpolation=None)
+            parser.optionxform = str  # type: ignore[assignment, method-assign]  # names keep their case
+            parser.read_string(text)
+            for group, targets in found.items():
+                if parser.has_section(group):
+                    for name, target in parser.items(group):
+                        targets.setdefault(name, target)
+    return found
+
+
+def _entry_point_files(folder: str) -> list[Path]:
+    if not folder or not folder.endswith("-packages"):
+        pattern = "*.egg-info/entry_points.txt"
+        places = [Path(folder or ".")]
+    else:
+        pattern = "*.dist-info/entry_points.txt"
+        places = [Path(folder)]
+    return [file for place in places for file in place.glob(pattern)]
+
+
+@functools.cache
+def stages() -> dict[str, str]:
+    """Return the target of every stage by name; a format ``x`` is the stage ``ingest.x``."""
+    found = entry_points()
+    formats = {f"ingest.{name}": target for name, target in found[FORMATS].items()}
+    return dict(sorted({**found[STAGES], **formats}.items()))
+
+
+def load(name: str) -> Stage:
+    """Return the stage of this name.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = stages().get(name)
+    if target is None:
+        raise UsageError(f"There is no stage {name}; there are {', '.join(stages())}.")
+    found = _import(name, target)
+    if not isinstance(found, Stage):
+        raise TacpipeError(f"{target}, registered as stage {name}, is no stage: decorate it with @stage(version=1).")
+    return found
+
+
+def load_task(name: str) -> Any:
+    """Return the module of the task of this name."""
+    target = entry_points()[TASKS].get(name)
+    if target is None:
+        raise UsageError(f"There is no task {name}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
+    return _import(name, target)
+
+
+def _import(name: str, target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    try:
+        loaded = importlib.import_module(module)
+        return getattr(loaded, attribute) if attribute else loaded
+    except ImportError as error:
+        raise TacpipeError(
+            f"{name} needs {error.name or target}, which cannot be imported ({error}). Install it: "
+            f"`pip install 'tacpipe[all]'` brings what the built-in stages use."
+        ) from error
+    except AttributeError as error:
+        raise TacpipeError(f"{module} has no {attribute}, though it is registered as {name}.") from error
+
+
+def summary(name: str) -> str:
+    """Return the first line of the docstring of a stage's function, or of its module; never imports, never raises."""
+    module, _, attribute = stages()[name].partition(":")
+    try:
+        tree = ast.parse(source(module).read_text(encoding="utf-8"))
+        functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+        text = "." in name and attribute in functions and ast.get_docstring(functions[attribute])
+        return (text or ast.get_docstring(tree) or "").split("\n")[0]
+    except (OSError, SyntaxError, ValueError, ImportError):
+        return "(its module cannot be read)"
+
+
+def source(module: str) -> Path:
+    """Return the file of a module that is not imported yet."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise ImportError(module)
+    return Path(spec.origin)

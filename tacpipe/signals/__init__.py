@@ -1,0 +1,1 @@
+"""The maths of recorded signals: numpy arrays in, numpy arrays out."""

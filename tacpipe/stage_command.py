@@ -1,0 +1,217 @@
+"""A stage as a command: arguments from its signature, options from its params."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_origin
+
+import typer
+
+from tacpipe import params as params_of
+from tacpipe import pipeline, registry
+from tacpipe.errors import FAILED, INTERRUPTED
+from tacpipe.request import Request
+from tacpipe.stage import Stage
+
+_PLACES = {  # what examples call the datasets
+    "ingest": "data/recordings",
+    "simulate": "data/recordings",
+    "synchronize": "data/synced",
+    "segment": "data/segments",
+    "split": "data/split",
+    "compress": "data/latents",
+    "train": "models/forward",
+    "evaluate": "results/forward",
+    "report": "report.html",
+}
+_BEFORE = {
+    "synchronize": "recordings",
+    "segment": "synced",
+    "split": "segments",
+    "compress": "segments",
+    "train": "latents",
+    "evaluate": "latents",
+}
+
+
+def add(program: typer.Typer, name: str, command: str) -> None:
+    """Add stage ``name`` to ``program`` as ``command``."""
+    stage = registry.load(name)
+    fields = params_of.fields(stage)
+    parameters = [*_arguments(stage), *_shared(stage), *_options(stage, fields)]
+
+    def call(**given: Any) -> None:
+        _call(name, stage, given, [field for field in fields if given.get(field) is not None])
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    program.command(command, help=_help(name, stage))(call)
+
+
+def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) -> None:
+    if given["quiet"]:
+        os.environ["TACPIPE_QUIET"] = "1"
+    params = params_of.build(
+        name,
+        stage,
+        file=_params_file(given),
+        block=given["block"],
+        preset=given["preset"],
+        sets=given["set_"] or (),
+        options={field: given[field] for field in named},
+    )
+    if given["print_params"]:
+        print(json.dumps(params_of.to_json(params), indent=1))
+        return
+    if given["output"] is None:
+        raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
+    paths = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend")}
+    request = Request(
+        name,
+        params,
+        given["output"],
+        datasets=given.get("datasets") or (),
+        fold=given.get("fold") or 0,
+        role=given.get("role"),
+        jobs=given["jobs"],
+        skip_bad=given["skip_bad"],
+        check=given["check"],
+        compare=given["compare"],
+        **paths,
+    )
+    try:
+        outcome = pipeline.run(request)
+    except KeyboardInterrupt:
+        print("tacpipe: interrupted; what was finished is kept.", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
+    _report(outcome, as_json=given["json_"])
+
+
+def _report(outcome: pipeline.Outcome, *, as_json: bool) -> None:
+    for name, why in outcome.bad.items():
+        print(f"tacpipe: left out {name}: {why}", file=sys.stderr)
+    if not os.environ.get("TACPIPE_QUIET"):
+        print(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s", file=sys.stderr)
+    if as_json:
+        value = {"schema_version": 1, **vars(outcome), "output": str(outcome.output)}
+        print(json.dumps(value))
+    else:
+        print(outcome.output)
+    if outcome.differs:
+        print("tacpipe: these differ from what is stored: " + "; ".join(outcome.differs), file=sys.stderr)
+        raise typer.Exit(FAILED)
+
+
+def _params_file(given: dict[str, Any]) -> Path | None:
+    if given["params_file"] is not None:
+        return Path(given["params_file"])
+    default = Path("params.yaml")
+    return default if given["block"] is not None or default.exists() else None
+
+
+def _arguments(stage: Stage) -> list[inspect.Parameter]:
+    kinds = set(stage.arguments.values())
+    found = []
+    if "Files" in kinds:
+        found.append(_parameter("source", Path, typer.Argument(help="Folder of the published recordings.")))
+    if "Model" in kinds:
+        found.append(_parameter("model", Path, typer.Argument(help="A trained model.")))
+    if kinds & {"Shard", "Dataset", "Datasets"}:
+        found.append(
+            _parameter("datasets", list[Path], typer.Argument(help="Datasets to read; several are read as one."))
+        )
+    return found
+
+
+def _shared(stage: Stage) -> list[inspect.Parameter]:
+    kinds = set(stage.arguments.values())
+    found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
+    if stage.needs_split or "Model" in kinds:
+        found += [
+            _parameter(
+                "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
+            ),
+            _parameter("fold", int, typer.Option(0, "--fold", help="Fold of the split.")),
+        ]
+    if "Model" in kinds:
+        found.append(
+            _parameter("role", str | None, typer.Option(None, "--role", help="Role to read: train, val or test."))
+        )
+    if stage.fit is not None:
+        text = "A dataset whose fitted codec to apply."
+        found.append(_parameter("codec", Path | None, typer.Option(None, "--codec", help=text)))
+    if "Roles" in kinds:
+        text = "An older split whose roles to keep."
+        found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
+    return found
+
+
+def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+    helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
+    found = []
+    for name, kind in fields.items():
+        many = get_origin(kind) is tuple
+        flag = f"--{name.replace('_', '-')}"
+        flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
+        annotation = list[kind.__args__[0]] | None if many else kind | None  # type: ignore[name-defined]
+        default = _default(stage, name)
+        text = f"{helps.get(name, '')} [{default}]".strip()
+        found.append(_parameter(name, annotation, typer.Option(None, *flags, help=text, show_default=False)))
+    more: list[tuple[str, Any, Any]] = [
+        ("preset", str | None, typer.Option(None, "--preset", help="paper or quick; without one, the best we know.")),
+        (
+            "params_file",
+            Path | None,
+            typer.Option(None, "--params", help="File of params [params.yaml if there is one]."),
+        ),
+        ("block", str | None, typer.Option(None, "--block", help="Block of the params file, as forward.synchronize.")),
+        ("set_", list[str] | None, typer.Option(None, "--set", help="Set a param: --set name=value.")),
+        (
+            "print_params",
+            bool,
+            typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
+        ),
+        ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
+        ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Go on without recordings that cannot be read.")),
+        ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
+        (
+            "compare",
+            bool,
+            typer.Option(False, "--recompute-and-compare", help="Run again what is stored and name what differs."),
+        ),
+        ("json_", bool, typer.Option(False, "--json", help="Print one JSON object.")),
+        ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),
+    ]
+    return [*found, *(_parameter(*item) for item in more)]
+
+
+def _default(stage: Stage, name: str) -> str:
+    field = stage.params.__dataclass_fields__[name]
+    return str(field.default)
+
+
+def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _help(name: str, stage: Stage) -> str:
+    text = inspect.cleandoc(stage.function.__doc__ or sys.modules[stage.function.__module__].__doc__ or "")
+    return f"{text}\n\nExample: {example(name, stage)}"
+
+
+def example(name: str, stage: Stage) -> str:
+    """Return a command line that shows the stage at work."""
+    group = name.partition(".")[0]
+    words = ["tacpipe", *name.split(".")]
+    kinds = set(stage.arguments.values())
+    words += ["published/recordings"] if "Files" in kinds else []
+    words += ["models/forward"] if "Model" in kinds else []
+    words += [f"data/{_BEFORE.get(group, 'recordings')}"] if kinds & {"Shard", "Dataset"} else []
+    words += ["results/forward"] if "Datasets" in kinds else []
+    words += ["--split", "data/split"] if stage.needs_split or "Model" in kinds else []
+    return " ".join([*words, "-o", _PLACES.get(group, "data/out")])

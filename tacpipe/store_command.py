@@ -1,0 +1,130 @@
+"""The commands of ``tacpipe store``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tacpipe import garbage
+from tacpipe.errors import DAMAGED
+from tacpipe.store import locate
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
+Remote = Annotated[Path, typer.Argument(help="The other store, a directory.")]
+Ancestors = Annotated[bool, typer.Option("--ancestors", help="With the shards of all that the datasets descend from.")]
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the group ``store`` to ``program``."""
+    group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
+    for command in (status, verify, repair, gc, link, push, pull):
+        group.command(command.__name__)(command)
+    program.add_typer(group, name="store")
+
+
+def status(as_json: AsJson = False) -> None:
+    """Show where the store is, how much lies in it, and which paths hold which manifest.
+
+    Example: tacpipe store status
+    """
+    from tacpipe import upkeep
+
+    value = upkeep.status(locate())
+    _print(value, as_json=as_json, text=upkeep.status_text(value))
+
+
+def verify(as_json: AsJson = False) -> None:
+    """Read every object and record; exit with 4 if one is damaged or missing. Damaged ones are quarantined.
+
+    Example: tacpipe store verify
+    """
+    from tacpipe import upkeep
+
+    found = upkeep.verify(locate())
+    _print(asdict(found), as_json=as_json, text=found.to_text())
+    if not found.clean:
+        raise typer.Exit(DAMAGED)
+
+
+def repair(as_json: AsJson = False) -> None:
+    """Make again what is damaged or missing; exit with 4 if something cannot be made again.
+
+    Example: tacpipe store repair
+    """
+    from tacpipe import upkeep
+
+    found = upkeep.repair(locate())
+    _print(asdict(found), as_json=as_json, text=found.to_text())
+    if found.lost:
+        raise typer.Exit(DAMAGED)
+
+
+def gc(
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be removed.")] = False,
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Also recordings that nothing names any more.")
+    ] = False,
+    grace_days: Annotated[
+        float, typer.Option("--grace-days", help="How long a dataset counts whose path cannot be reached.")
+    ] = garbage.GRACE_DAYS,
+    as_json: AsJson = False,
+) -> None:
+    """Remove what no dataset, nothing that one descends from, and no running process needs.
+
+    Example: tacpipe store gc --dry-run
+    """
+    found = garbage.collect(locate(), dry_run=dry_run, recordings=recordings, grace_days=grace_days)
+    verb = "would remove" if dry_run else "removed"
+    text = (
+        f"{verb} {found.objects} objects ({found.bytes / 1e6:.1f} MB), {found.records} records, {found.drafts} drafts"
+    )
+    if found.kept_recordings:
+        text += f"; kept {found.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
+    _print(found.to_json(), as_json=as_json, text=text)
+
+
+def link(datasets: Paths) -> None:
+    """Link shards beside their manifest anew, for programs that read the files directly.
+
+    Example: tacpipe store link data/synced
+    """
+    from tacpipe import upkeep
+
+    for path in datasets:
+        count = upkeep.link(path)
+        print(f"{path}: {count} linked anew")
+
+
+def push(remote: Remote, datasets: Paths, ancestors: Ancestors = False, as_json: AsJson = False) -> None:
+    """Copy what datasets need to another store.
+
+    Example: tacpipe store push /mnt/lab/store models/forward data/latents data/split
+    """
+    from tacpipe import transfer
+
+    done = transfer.push(remote, datasets, ancestors=ancestors)
+    _print(asdict(done), as_json=as_json, text=_moved("pushed", done))
+
+
+def pull(remote: Remote, datasets: Paths, ancestors: Ancestors = False, as_json: AsJson = False) -> None:
+    """Copy what datasets need from another store: those whose manifest is here, else what was pushed from that path.
+
+    Example: tacpipe store pull /mnt/lab/store models/forward data/latents data/split
+    """
+    from tacpipe import transfer
+
+    done = transfer.pull(remote, datasets, ancestors=ancestors)
+    _print(asdict(done), as_json=as_json, text=_moved("pulled", done))
+
+
+def _moved(verb: str, done: Any) -> str:
+    return f"{verb} {done.objects} objects ({done.bytes / 1e6:.1f} MB); {done.there} were there already"
+
+
+def _print(value: Any, *, as_json: bool, text: str) -> None:
+    print(json.dumps(value) if as_json else text)

@@ -1,0 +1,118 @@
+"""A table and its Parquet bytes: encodings chosen by measurement, units and layout kept as field metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tacpipe.errors import DamagedError
+
+ROW_GROUP_ROWS = 1 << 20
+HELD_SHARE = 0.25  # above this share of repeated rows zstd beats delta packing; measured, docs/format.md
+ZSTD_LEVEL = 3
+ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
+_CLOCKS = ("t_ns", "t_device_ns", "seq")
+_KEY = b"tacpipe"
+
+
+def to_parquet(table: pa.Table) -> bytes:
+    """Return ``table`` as the bytes of a Parquet file; the same table gives the same bytes.
+
+    >>> table = pa.table({"t_ns": pa.array([0, 1], pa.int64())})
+    >>> from_parquet(to_parquet(table)).equals(table)
+    True
+    """
+    held = _held_share(table) > HELD_SHARE
+    encoding, compression_level = {}, {}
+    for field in table.schema:
+        delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not held)
+        compression_level[field.name] = ZSTD_LEVEL if delta or not held else ZSTD_LEVEL_HELD
+        if pa.types.is_floating(field.type):
+            encoding[field.name] = "BYTE_STREAM_SPLIT"
+        elif delta:
+            encoding[field.name] = "DELTA_BINARY_PACKED"
+        elif not pa.types.is_boolean(field.type):
+            encoding[field.name] = "PLAIN"
+    sink = pa.BufferOutputStream()
+    bare = table.cast(pa.schema([pa.field(field.name, field.type) for field in table.schema]))
+    with pq.ParquetWriter(
+        sink,
+        bare.schema,
+        use_dictionary=False,
+        column_encoding=encoding,
+        compression="zstd",
+        compression_level=compression_level,
+        write_statistics=False,
+        write_page_checksum=True,
+        store_schema=False,
+    ) as writer:
+        writer.write_table(bare, row_group_size=ROW_GROUP_ROWS)
+        writer.add_key_value_metadata({_KEY: _fields_to_json(table.schema)})
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
+
+    Raises `DamagedError` when the bytes are no Parquet file.
+    """
+    try:
+        file = pq.ParquetFile(pa.BufferReader(content))
+        table = file.read(columns=list(columns) if columns is not None else None)
+    except pa.ArrowException as error:
+        raise DamagedError(f"These {len(content)} bytes are no Parquet file: {error}.") from error
+    stored = (file.metadata.metadata or {}).get(_KEY)
+    if stored is None:
+        return table
+    names = file.schema_arrow.names
+    return table.cast(_with_fields(table.schema, names, json.loads(stored)))
+
+
+def _held_share(table: pa.Table) -> float:
+    """Return the share of rows whose integer channels all equal those of the row before."""
+    channels = [
+        column.to_numpy()
+        for name, column in zip(table.column_names, table.columns, strict=True)
+        if pa.types.is_integer(column.type) and name not in _CLOCKS and not column.null_count
+    ]
+    if not channels or table.num_rows < 2:
+        return 0.0
+    same = np.ones(table.num_rows - 1, dtype=bool)  # (time,)
+    for channel in channels:
+        same &= channel[1:] == channel[:-1]
+    return float(same.mean())
+
+
+def _fields_to_json(schema: pa.Schema) -> bytes:
+    """Return all field metadata as JSON: key to value to the positions of the columns that carry it."""
+    fields: dict[str, dict[str, list[int]]] = {}
+    for position, field in enumerate(schema):
+        for key, value in (field.metadata or {}).items():
+            if not key.startswith(b"PARQUET:"):
+                fields.setdefault(key.decode(), {}).setdefault(value.decode(), []).append(position)
+    return json.dumps({"fields": fields}, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _with_fields(schema: pa.Schema, names: Sequence[str], stored: dict[str, Any]) -> pa.Schema:
+    metadata: dict[str, dict[str, str]] = {}
+    for key, values in stored["fields"].items():
+        for value, positions in values.items():
+            for position in positions:
+                metadata.setdefault(names[position], {})[key] = value
+    return pa.schema([pa.field(field.name, field.type, metadata=metadata.get(field.name)) for field in schema])
+
+
+def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Table:
+    """Return ``table`` with ``metadata`` (column to key to text) added to that of its fields."""
+    fields = []
+    for field in table.schema:
+        kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        merged = {**kept, **metadata.get(field.name, {})}
+        fields.append(pa.field(field.name, field.type, metadata=merged or None))
+    return table.cast(pa.schema(fields))

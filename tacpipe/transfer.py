@@ -1,0 +1,119 @@
+"""Copies of datasets between stores: a directory now, so that CI evaluates what a rig recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tacpipe import directory as directory_of
+from tacpipe import execution, garbage
+from tacpipe import manifest as manifest_of
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.hashing import bytes_digest
+from tacpipe.store import MissingError, Store, locate, project
+
+
+@dataclass
+class Transferred:
+    """How much went over, and how much was there already."""
+
+    objects: int = 0
+    bytes: int = 0
+    there: int = 0
+
+
+def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Transferred:
+    """Copy datasets to the store at ``remote``: shards, files, records, and the manifests they descend from.
+
+    With ``ancestors`` the shards of those go too. Raises `DamagedError` for a shard that is damaged here and cannot be made
+    again.
+    """
+    there, done = Store(remote.absolute()), Transferred()
+    there.prepare()
+    for path in paths:
+        here = locate(path)
+        directory, content = manifest_of.read_manifest(path)
+        manifest_of.parse(content, str(directory))
+        here.prepare()
+        here.put(content)
+        _copy(here, there, bytes_digest(content), done, beside=(str(directory.absolute()),), ancestors=ancestors)
+        there.set_root(_name(directory), bytes_digest(content))
+    return done
+
+
+def pull(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Transferred:
+    """Copy datasets from the store at ``remote``: those whose manifest lies at the path, else what was pushed from there."""
+    there, done = Store(remote.absolute()), Transferred()
+    if not (there.root / "format").exists():
+        raise UsageError(f"{remote} is no store: it has no file `format`. Give a directory that `store push` wrote.")
+    for path in paths:
+        directory = path.parent if path.name == manifest_of.NAME else path
+        here = locate(directory if directory.exists() else None)
+        here.prepare()
+        if (directory / manifest_of.NAME).exists():
+            content = (directory / manifest_of.NAME).read_bytes()
+            manifest_of.parse(content, str(directory))
+            here.put(content)
+        else:
+            root = there.get_root(_name(directory))
+            if root is None:
+                known = ", ".join(sorted(found["path"] for found in there.roots())) or "nothing"
+                raise UsageError(f"{remote} has no dataset {_name(directory)}; it has {known}.")
+            content = there.read(root["manifest"])
+        _copy(there, here, bytes_digest(content), done, beside=(), ancestors=ancestors)
+        manifest = manifest_of.parse(content, str(directory))
+        directory_of.publish(here, manifest, directory, copy=bool(manifest.sources))
+    return done
+
+
+def _name(directory: Path) -> Path:
+    """Return how a dataset is called in a remote store: its path within the project."""
+    directory = directory.absolute()
+    root = project(directory if directory.exists() else None)
+    return directory.relative_to(root) if directory.is_relative_to(root) else Path(directory.name)
+
+
+def _copy(
+    source: Store, target: Store, manifest: str, done: Transferred, *, beside: tuple[str, ...], ancestors: bool
+) -> None:
+    read = execution.reader(source, beside)
+    moved: set[str] = set()
+    todo, seen = [manifest], set()
+    while todo:
+        name = todo.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        try:
+            content = source.read(name) if source.has(name) else target.read(name)
+        except MissingError:
+            if name == manifest:
+                raise
+            continue
+        moved.add(name)
+        _put(target, content, name, done)
+        found = manifest_of.parse(content, name, verified=True)
+        todo += garbage.ancestors(found)
+        if ancestors or name == manifest:
+            for path, wanted in found.objects():
+                moved.add(wanted)
+                if target.has(wanted):
+                    done.there += 1
+                else:
+                    _put(target, read(wanted, path), wanted, done)
+    for _, record in source.records():
+        names = set(execution.named(record["result"]))
+        if names and names <= moved:
+            target.commit(record["identity"], record["result"], record["provenance"])
+
+
+def _put(target: Store, content: bytes, name: str, done: Transferred) -> None:
+    if target.has(name):
+        done.there += 1
+        return
+    stored = target.put(content, durable=True)
+    if stored.digest != name:
+        raise TacpipeError(f"Object {name[:12]} changed on its way to {target.root}. Run the same command again.")
+    done.objects += 1
+    done.bytes += stored.bytes

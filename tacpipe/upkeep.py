@@ -1,0 +1,135 @@
+"""Looking after a store: what is in it, whether it is sound, and mending it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tacpipe import directory as directory_of
+from tacpipe import execution
+from tacpipe import manifest as manifest_of
+from tacpipe.errors import TacpipeError
+from tacpipe.hashing import file_digest
+from tacpipe.store import MissingError, Store, locate
+
+
+@dataclass
+class Soundness:
+    """What was looked at, what was wrong, and what could be done about it."""
+
+    objects: int = 0
+    records: int = 0
+    damaged: list[str] = field(default_factory=list)  # digests and keys, now in quarantine
+    missing: list[str] = field(default_factory=list)  # objects that a root's manifest names
+    repaired: list[str] = field(default_factory=list)
+    lost: dict[str, str] = field(default_factory=dict)  # digest to why it cannot be made again
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was damaged and nothing is missing."""
+        return not (self.damaged or self.missing or self.lost)
+
+    def to_text(self) -> str:
+        """Return the findings in words."""
+        lines = [f"{self.objects} objects and {self.records} records read"]
+        lines += [f"damaged, now in quarantine: {name}" for name in self.damaged]
+        lines += [f"missing: {name}" for name in self.missing]
+        lines += [f"made again: {name}" for name in self.repaired]
+        lines += [f"cannot be made again: {name}: {why}" for name, why in self.lost.items()]
+        if self.clean:
+            lines.append("all sound")
+        elif not self.repaired and not self.lost:
+            lines.append("`tacpipe store repair` makes again what it can")
+        return "\n".join(lines)
+
+
+def verify(store: Store) -> Soundness:
+    """Return the soundness of every object and record; damaged ones are moved to quarantine."""
+    found = Soundness()
+    for path in sorted(store.root.glob("objects/*/*")):
+        found.objects += 1
+        try:
+            store.read(path.name)
+        except MissingError:
+            found.damaged.append(path.name)
+    for path in sorted(store.root.glob("records/*/*.json")):
+        found.records += 1
+        if store.record(path.stem) is None:
+            found.damaged.append(path.stem)
+    found.missing = sorted(set(_wanted(store)) - set(found.damaged))
+    return found
+
+
+def repair(store: Store) -> Soundness:
+    """Return the soundness after making again, or adopting from dataset directories, what roots name and is not there."""
+    found = verify(store)
+    wanted = _wanted(store)
+    beside = tuple(root["path"] for root in store.roots())
+    read = execution.reader(store, beside)
+    for name, path in sorted(wanted.items()):
+        try:
+            read(name, path)
+            found.repaired.append(name)
+        except TacpipeError as error:
+            found.lost[name] = str(error)
+    found.missing = []
+    return found
+
+
+def link(path: Path) -> int:
+    """Link the shards of the dataset at ``path`` anew where they do not match its manifest; return how many."""
+    directory, content = manifest_of.read_manifest(path)
+    manifest = manifest_of.parse(content, str(directory / manifest_of.NAME))
+    store = locate(directory)
+    store.prepare()
+    read = execution.reader(store, (str(directory.absolute()),))
+    count = 0
+    for name, digest in manifest.objects():
+        if not store.has(digest):
+            read(digest, name)
+        if not (directory / name).exists() or file_digest(directory / name) != digest:
+            read(digest, name)
+            directory_of.place(store, digest, directory / name, copy=bool(manifest.sources))
+            count += 1
+    store.put(content)
+    directory_of.publish(store, manifest, directory, copy=bool(manifest.sources))
+    return count
+
+
+def status(store: Store) -> dict[str, Any]:
+    """Return where the store is, counts and bytes of what lies in it, its roots and who is at work."""
+    folders = {}
+    for name in ("objects", "records", "quarantine", "tmp", "checkpoints"):
+        files = [path for path in (store.root / name).rglob("*") if path.is_file()]
+        folders[name] = {"files": len(files), "bytes": sum(path.stat().st_size for path in files)}
+    roots = [{**root, "reachable": Path(root["path"]).exists()} for root in store.roots()]
+    return {"store": str(store.root), **folders, "roots": roots, "running": [note for note, _ in store.runs()]}
+
+
+def status_text(value: dict[str, Any]) -> str:
+    """Return the status in words."""
+    lines = [value["store"]]
+    lines += [
+        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB"
+        for name in ("objects", "records", "quarantine", "tmp", "checkpoints")
+    ]
+    lines += [
+        f"  root  {root['manifest'][:12]}  {root['path']}" + ("" if root["reachable"] else "  (cannot be reached)")
+        for root in value["roots"]
+    ]
+    lines += [f"  at work: process {note.get('pid')} on {note.get('host')}" for note in value["running"]]
+    return "\n".join(lines)
+
+
+def _wanted(store: Store) -> dict[str, str]:
+    """Return the objects that are named by the manifests at the roots' paths and are not in the store, with their paths."""
+    wanted = {}
+    for root in store.roots():
+        try:
+            _, content = manifest_of.read_manifest(Path(root["path"]))
+            objects = list(manifest_of.parse(content, root["path"]).objects())
+        except TacpipeError:
+            continue
+        wanted.update({name: path for path, name in objects if not store.has(name)})
+    return wanted

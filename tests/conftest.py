@@ -1,0 +1,124 @@
+"""A lab for tests: a project folder with its own store, the command line at hand, and a third party's plug-in."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from tacpipe import cli, registry
+from tacpipe.manifest import Manifest, parse
+from tacpipe.store import Store
+
+ENTRY_POINTS = """
+[tacpipe.stages]
+simulate.toy = toy_stages:make
+scale = toy_stages:scale
+named = toy_stages:named
+centre = toy_stages:centre
+total = toy_stages:total
+halves = toy_stages:halves
+
+[tacpipe.formats]
+numbers = toy_stages:read
+"""
+
+
+@dataclass
+class Ran:
+    """What a command printed, and how it ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+@dataclass
+class Lab:
+    """A project folder in which commands run."""
+
+    folder: Path
+    call: Callable[[str], Ran]
+
+    def run(self, command: str) -> Ran:
+        """Run a command that must succeed."""
+        ran = self.call(command)
+        assert ran.code == 0, f"{command} ended with {ran.code}: {ran.err}"
+        return ran
+
+    def manifest(self, path: str) -> Manifest:
+        """Return the manifest of a dataset."""
+        return parse((self.folder / path / "manifest.json").read_bytes(), path)
+
+    @property
+    def store(self) -> Store:
+        """The project's store."""
+        return Store(self.folder / ".tacpipe")
+
+
+def sample_data() -> Path:
+    """Return where published recordings lie, if they are there."""
+    named = os.environ.get("TACPIPE_SAMPLE_DATA")
+    return Path(named) if named else Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an installed plug-in with small stages."""
+    folder = tmp_path_factory.mktemp("plugin")
+    shutil.copy(Path(__file__).parent / "plugin" / "toy_stages.py", folder)
+    (folder / "toy.egg-info").mkdir()
+    (folder / "toy.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
+    return folder
+
+
+@pytest.fixture
+def lab(
+    tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Lab]:
+    """An empty project, its commands run in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TACPIPE_STORE", raising=False)
+    monkeypatch.delenv("TACPIPE_QUIET", raising=False)
+    monkeypatch.syspath_prepend(plugin)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")]))
+    (tmp_path / ".tacpipe").mkdir()
+    forget()
+
+    def call(command: str) -> Ran:
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "argv", ["tacpipe", *shlex.split(command)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        out, err = capsys.readouterr()
+        return Ran(code, out, err)
+
+    yield Lab(tmp_path, call)
+    forget()
+
+
+def forget() -> None:
+    """Make the registry look again for what is installed."""
+    registry.entry_points.cache_clear()
+    registry.stages.cache_clear()
+
+
+def tacpipe(folder: Path, command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "tacpipe.cli", *shlex.split(command)],
+        cwd=folder,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
