@@ -139,3 +139,7 @@ class Dataset:
         if len(streams) > 1:
             raise UsageError(f"Name the stream to read: the recordings have {', '.join(sorted(streams))}.")
         return next(iter(streams), "")
+
+
+Model = Dataset  # whose files hold weights and configuration
+Datasets = tuple[Dataset, ...]

@@ -8,14 +8,17 @@ import shutil
 from pathlib import Path
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.hashing import bytes_digest
+from tacpipe.hashing import bytes_digest, digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import Store
 
+_DRAFT = ".draft"
+
 
 def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) -> None:
-    """Make ``directory`` show ``manifest``: shards linked beside it, the manifest last, then a root in the store.
+    """Make ``directory`` show ``manifest``: a root in the store, then shards linked, the manifest last.
 
+    The root comes first so that what a killed run left behind is known to be ours.
     What an earlier manifest named and this one does not is removed. Raises `UsageError` if the directory holds
     something that tacpipe did not write.
     """
@@ -23,20 +26,30 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) ->
     check_output(store, directory)
     wanted = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    before = set(wanted) if current else _named(directory)
-    for path, name in wanted.items():
-        if not (current and _matches(directory / path, store.object_path(name))):
-            place(store, name, directory / path, copy=copy)
-    if not current:
-        _write(directory / NAME, manifest.content)
-    for path in before - set(wanted):
+    stale = [
+        path for path, name in wanted.items() if not (current and _matches(directory / path, store.object_path(name)))
+    ]
+    if current and not stale:
+        store.set_root(directory, bytes_digest(manifest.content))
+        return
+    with store.lease(digest(["output", str(directory)])):
+        store.set_root(directory, bytes_digest(manifest.content))
+        for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
+            draft.unlink()  # of a process that was killed
+        for path in stale:
+            place(store, wanted[path], directory / path, copy=copy)
+        _remove(directory, _named(directory) - set(wanted))
+        if not current:
+            _write(directory / NAME, manifest.content)
+
+
+def _remove(directory: Path, paths: set[str]) -> None:
+    for path in paths:
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
             (directory / path).unlink()
-    for path in before - set(wanted):
+    for folder in {(directory / path).parent for path in paths} - {directory}:
         with contextlib.suppress(OSError):  # not empty, or gone already
-            if (directory / path).parent != directory:
-                (directory / path).parent.rmdir()
-    store.set_root(directory, bytes_digest(manifest.content))
+            folder.rmdir()
 
 
 def check_output(store: Store, directory: Path) -> None:
@@ -56,7 +69,7 @@ def check_output(store: Store, directory: Path) -> None:
 def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
     """Put the object ``name`` at ``path``: by reflink, hard link or copy, in this order; only by copy if ``copy``."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = path.with_name(f".{path.name}{_DRAFT}")
     source = store.object_path(name)
     with contextlib.suppress(FileNotFoundError):
         draft.unlink()
@@ -112,7 +125,7 @@ def _named(directory: Path) -> set[str]:
 
 def _write(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = path.with_name(f".{path.name}{_DRAFT}")
     try:
         with open(draft, "wb") as file:
             file.write(content)

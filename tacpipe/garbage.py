@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import os
+import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -63,9 +66,24 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
     Raises `LockedError` if another collection runs.
     """
-    lock = _try_lock(store.root / "leases" / "gc.lock") if not dry_run else -1
-    if lock is None:
+    with _alone(store) if not dry_run else contextlib.nullcontext():
+        return _collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
+
+
+@contextlib.contextmanager
+def _alone(store: Store) -> Iterator[None]:
+    path = store.root / "leases" / "gc.lock"
+    handle = _try_lock(path)
+    if handle is None:
         raise LockedError("Another `tacpipe store gc` is at work on this store. Wait for it.")
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
     objects, manifests, kept_from_s = live(store, grace_days)
     objects |= manifests
     collected = Collected()
@@ -127,8 +145,6 @@ def _expired(store: Store, root: dict[str, Any], grace_days: float) -> bool:
         return False
     file = store.root_path(path)
     if "missing_since_s" not in root:
-        import json
-
         with contextlib.suppress(TacpipeError):
             store.write_file(file, json.dumps({**root, "missing_since_s": int(time.time())}, sort_keys=True).encode())
         return grace_days <= 0
@@ -155,8 +171,6 @@ def _sweep(store: Store, collected: Collected, grace_days: float, *, dry_run: bo
         if store.record(folder.name) is not None:
             collected.checkpoints += 1
             if not dry_run:
-                import shutil
-
                 shutil.rmtree(folder, ignore_errors=True)
 
 

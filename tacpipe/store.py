@@ -79,7 +79,7 @@ class Store:
         """
         name = bytes_digest(content)
         path = self.object_path(name)
-        with contextlib.suppress(FileNotFoundError, MissingError):
+        with contextlib.suppress(FileNotFoundError, MissingError), _readable_errors(self._root):
             if durable:
                 self.read(name)
             if os.stat(path).st_size == len(content):  # noqa: PTH116
@@ -125,7 +125,7 @@ class Store:
                     os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
                     return _move(draft, str(path), exclusive)
             finally:
-                with contextlib.suppress(FileNotFoundError):
+                with contextlib.suppress(OSError):  # a draft that stays is swept up by gc
                     os.unlink(draft)  # noqa: PTH108
                 if durable:
                     _sync_folder(os.path.dirname(path))  # noqa: PTH120
@@ -203,7 +203,7 @@ class Store:
         try:
             yield
         finally:
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(OSError):  # the kernel frees the lock in any case
                 path.unlink()
             os.close(handle)
 
@@ -220,7 +220,7 @@ class Store:
                 os.write(handle, json.dumps(note).encode())
             yield
         finally:
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(OSError):  # the kernel frees the lock in any case
                 path.unlink()
             os.close(handle)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
 from tacpipe import cli, registry
 from tacpipe.manifest import Manifest, parse
 from tacpipe.store import Store

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from tacpipe.errors import TacpipeError
 from tacpipe.hashing import bytes_digest, canonical, digest, file_digest
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+
 import tacpipe
 from tacpipe import directory
 from tacpipe.dataset import Shard
@@ -11,7 +12,6 @@ from tacpipe.execution import named
 from tacpipe.hashing import digest, file_digest
 from tacpipe.manifest import Manifest
 from tacpipe.tables import to_parquet
-
 from tests.conftest import Lab
 
 

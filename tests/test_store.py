@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.hashing import bytes_digest, digest
 from tacpipe.store import MissingError, Store, locate, project
@@ -83,8 +84,10 @@ def test_a_record_that_was_tampered_with_counts_as_none_and_is_quarantined(store
 
 
 def test_a_lease_is_held_by_one_and_its_wait_times_out_with_its_own_exit_code(store: Store) -> None:
-    with store.lease("ab" * 32), pytest.raises(LockedError, match="TACPIPE_LOCK_TIMEOUT_S") as caught, store.lease(
-        "ab" * 32, timeout_s=0.05
+    with (
+        store.lease("ab" * 32),
+        pytest.raises(LockedError, match="TACPIPE_LOCK_TIMEOUT_S") as caught,
+        store.lease("ab" * 32, timeout_s=0.05),
     ):
         pass
     assert caught.value.exit_code == 6

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from tacpipe.errors import DamagedError
 from tacpipe.tables import from_parquet, to_parquet, with_metadata
 
@@ -21,7 +22,9 @@ def tables(draw: st.DrawFn) -> pa.Table:
     columns = {}
     for position, kind in enumerate(draw(st.lists(st.sampled_from(types), min_size=1, max_size=6))):
         raw = np.array(draw(st.lists(st.integers(0, 200), min_size=rows, max_size=rows)), dtype=np.int64)
-        columns[f"channel{position}"] = pa.array(raw).cast(kind, safe=False) if kind != pa.bool_() else pa.array(raw > 9)
+        columns[f"channel{position}"] = (
+            pa.array(raw).cast(kind, safe=False) if kind != pa.bool_() else pa.array(raw > 9)
+        )
     return pa.table(columns)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -60,10 +62,16 @@ def read(params: Read, files: Files) -> Recording:
     return Recording({"left": pa.table({"x": pa.array(values, pa.uint16())})})
 
 
+def die(*arguments: object) -> None:
+    """End the process as the kernel does that is out of memory."""
+    os._exit(9)
+
+
 @dataclass(frozen=True)
 class Scale:
     factor: int = 2  # that every value is multiplied by
     refuse: int = -1  # a first value that counts as bad
+    pause_s: float = 0.0  # how long each recording takes
 
 
 @stage(version=1)
@@ -72,6 +80,7 @@ def scale(params: Scale, recording: Shard) -> pa.Table:
     import pyarrow as pa
     import pyarrow.compute as pc
 
+    time.sleep(params.pause_s)
     table = recording.table("left")
     if table.num_rows and table["x"][0].as_py() == params.refuse:
         raise TacpipeError(f"It begins with {params.refuse}, which this stage refuses.")

@@ -1,0 +1,38 @@
+"""Judge a model on recordings, beside its baselines, with intervals over recordings.
+
+Writes ``metrics.json``, ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording) and the predictions of
+each recording. Recordings that the model was trained on are reported apart, under ``seen``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.stage import stage
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+    from tacpipe.stage import Result
+
+    Model = Dataset
+
+
+@dataclass(frozen=True)
+class Params:
+    """Nothing to choose: how a model is judged is not up to who trained it."""
+
+
+@stage(version=1)
+def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
+    """Judge a model on recordings, by the measures of the task it was trained for."""
+    import json
+
+    from tacpipe import registry
+    from tacpipe.errors import TacpipeError
+
+    if "config.json" not in model.files:
+        raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train`.")
+    task = registry.load_task(json.loads(model.files["config.json"])["task"])
+    result: Result = task.evaluate(model.files, recordings)
+    return result

@@ -1,0 +1,31 @@
+"""Put results on one page that needs nothing but a browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.stage import stage
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+    from tacpipe.stage import Result
+
+    Datasets = tuple[Dataset, ...]
+
+
+@dataclass(frozen=True)
+class Params:
+    """What the page shows."""
+
+    title: str = "Touch, predicted"  # heading of the page
+    traces: int = 2  # recordings of each result whose predictions are drawn
+
+
+@stage(version=1)
+def report(params: Params, results: Datasets) -> Result:
+    """Put results on one page: headline, figures, tables, and where every number comes from."""
+    from tacpipe.report import page
+    from tacpipe.stage import Result
+
+    return Result(files={"report.html": page.render(results, title=params.title, traces=params.traces)})

@@ -1,0 +1,43 @@
+"""Give each recording its role: train, val or test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.stage import Recording, Result, stage
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class Params:
+    """How recordings are dealt out."""
+
+    scheme: str = "random"  # random, kfold, blocked (in the order of names), leave-one-out or authors
+    val: float = 0.15  # share of the recordings to watch; where the scheme picks the test ones, of the others
+    test: float = 0.15  # share of the recordings to test; of no effect with kfold, leave-one-out and authors
+    seed: int = 0  # of every draw
+    folds: int = 5  # how many parts kfold makes
+    by: str = "object"  # attribute whose values leave-one-out leaves out one by one
+    stratify: str = ""  # attribute whose values are spread evenly over the roles; empty for none
+
+
+@stage(version=1)
+def split(params: Params, recordings: Dataset) -> Result:
+    """Return one table, ``split``, with a row a recording and fold: recording, fold, role."""
+    import pyarrow as pa
+
+    from tacpipe.splits import Scheme, assign
+
+    scheme = Scheme(params.scheme, params.val, params.test, params.seed, params.folds, params.by, params.stratify)
+    roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme)
+    table = pa.table(
+        {
+            "recording": pa.array([name for name, _ in roles], pa.string()),
+            "fold": pa.array([fold for _, fold in roles], pa.int32()),
+            "role": pa.array(list(roles.values()), pa.string()),
+        }
+    )
+    return Result(recordings={"split": Recording(table)})

@@ -1,0 +1,175 @@
+"""Numeric CSV files, read strictly: a wrong cell is an error with its file and row, never a silent NaN or shift.
+
+pyarrow parses the file at once; only when that fails, or a value is not allowed, is it gone through again to find the
+row. What pyarrow would do by itself and may not here: take empty cells, ``NA`` and ``nan`` for nulls, guess a column's
+type from its first rows, and count rows without blank lines and header, so that its messages point to the wrong line.
+Rows are counted as lines of the file, from 1, as an editor shows them; the header is row 1.
+
+A row that was cut short is seen. A last *number* that was cut short (``0.1234`` of ``0.123456``) cannot be.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+_NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
+
+
+def read_csv(
+    path: Path,
+    columns: Sequence[str],
+    *,
+    integers: pa.DataType | None = None,
+    allow_nan: bool = False,
+    trailing_comma: bool = False,
+) -> pa.Table:
+    """Return ``columns`` of a numeric CSV file, in this order, as float64 or as the type ``integers``.
+
+    Other columns of the file must be numbers too, and are left out. ``trailing_comma`` is for files whose data rows end
+    in a comma, whether the header does or not. Blank lines hold no row. Raises `TacpipeError`, naming file and row, for:
+    an empty file, one without rows, a missing or doubled column, a row of another width, a cell that is no number, NaN
+    unless ``allow_nan``, infinity, and, with ``integers``, a fraction or a value out of the type's range.
+    """
+    names = read_header(path)
+    if trailing_comma and not names[-1]:
+        names = names[:-1]
+    _check_header(path, names, columns)
+    tail = [""] if trailing_comma else []
+    try:
+        table = pc.read_csv(
+            path,
+            read_options=pc.ReadOptions(column_names=[*names, *tail], skip_rows=1, use_threads=False),
+            convert_options=pc.ConvertOptions(
+                column_types={**dict.fromkeys(names, pa.float64()), **dict.fromkeys(tail, pa.string())},
+                null_values=[],
+            ),
+        )
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
+        raise TacpipeError(_first_fault(path, names, trailing_comma) or f"{path} is no CSV file: {error}.") from error
+    if not table.num_rows:
+        raise TacpipeError(f"{path} has a header and no rows; the recording is empty. Delete it or record it again.")
+    if tail and any(cell != "" for cell in table.column(len(names)).unique().to_pylist()):
+        raise TacpipeError(_first_fault(path, names, trailing_comma) or f"{path} has a cell too many in some row.")
+    arrays = [table.column(names.index(name)).to_numpy() for name in columns]
+    for name, array in zip(columns, arrays, strict=True):
+        _check_values(path, name, array, integers, allow_nan)
+    kind = integers or pa.float64()
+    return pa.table({name: pa.array(array).cast(kind) for name, array in zip(columns, arrays, strict=True)})
+
+
+def read_header(path: Path) -> list[str]:
+    """Return the column names in the first line of a CSV file, without the spaces around them.
+
+    Raises `TacpipeError` for a file that is empty or cannot be read.
+    """
+    for _, cells in _rows(path):
+        return [cell.strip() for cell in cells]
+    raise TacpipeError(f"{path} is empty; a header and rows were expected. Copy it again from its source.")
+
+
+def read_record(path: Path) -> dict[str, str]:
+    """Return the one data row of a CSV file as text by column name, as in the ``meta_data.csv`` of a trial.
+
+    Such files are written by hand in part: a row that is longer than the header because someone wrote commas into the
+    column ``notes`` is put together again, empty cells at the end are dropped, and cells that are missing at the end
+    are left out. Raises `TacpipeError`, naming file and row, for any other width and for none or several data rows.
+    """
+    names = read_header(path)
+    rows = [(line, cells) for line, cells in _rows(path) if any(cell.strip() for cell in cells)][1:]
+    if len(rows) != 1:
+        raise TacpipeError(
+            f"{path} has {len(rows)} rows below its header; it must have one. Put it right and try again."
+        )
+    line, cells = rows[0]
+    while len(cells) > len(names) and not cells[-1].strip():
+        cells = cells[:-1]
+    surplus = len(cells) - len(names)
+    if surplus > 0 and "notes" in names:
+        at = names.index("notes")
+        cells = [*cells[:at], ",".join(cells[at : at + surplus + 1]), *cells[at + surplus + 1 :]]
+    elif surplus > 0:
+        raise TacpipeError(
+            f"{path}, row {line} has {len(cells)} fields under a header of {len(names)}; "
+            f"which of them is too much cannot be told. Put quotes around text with commas."
+        )
+    return {name: cell.strip() for name, cell in zip(names, cells, strict=False)}
+
+
+def file_row(path: Path, index: int) -> int:
+    """Return the line, from 1, that holds the data row ``index`` (from 0) of a CSV file; for messages."""
+    position = -1  # the header
+    for line, _ in _rows(path):
+        if position == index:
+            return line
+        position += 1
+    raise IndexError(f"{path} has no data row {index}.")
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and the cells of each line that is not blank."""
+    try:
+        with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
+            reader = csv.reader(file)
+            for cells in reader:
+                if cells:
+                    yield reader.line_num, cells
+    except (OSError, csv.Error) as error:
+        raise TacpipeError(f"{path} cannot be read: {error}. Check the path and copy the file again.") from error
+
+
+def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise TacpipeError(f"{path} has more than one column {', '.join(doubled)}; each name may stand once.")
+    missing = [name for name in columns if name not in names]
+    if missing:
+        listed = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
+        raise TacpipeError(
+            f"{path} lacks the column {listed}; its header begins with {', '.join(names[:4])}. "
+            f"It may belong to another format."
+        )
+
+
+def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool) -> str | None:
+    """Return a sentence about the first row that is no row of numbers, or None."""
+    rows = _rows(path)
+    next(rows)
+    for line, cells in rows:
+        if trailing_comma and len(cells) == len(names) + 1 and not cells[-1].strip():
+            cells = cells[:-1]
+        elif trailing_comma and len(cells) == len(names):
+            return f"{path}, row {line} does not end in a comma as the other rows do; it was cut short."
+        if len(cells) != len(names):
+            cause = "it was cut short" if len(cells) < len(names) else "a cell or a comma is too much"
+            return f"{path}, row {line} has {len(cells)} fields instead of {len(names)}; {cause}. Copy the file again."
+        for name, cell in zip(names, cells, strict=True):
+            if not _NUMBER.fullmatch(cell):
+                return f"{path}, row {line}, column {name} holds {cell!r}, which is no number. Put the cell right."
+    return None
+
+
+def _check_values(path: Path, name: str, array: NDArray[np.float64], integers: pa.DataType | None, nan: bool) -> None:
+    """Raise for the first value of a column that is not allowed."""
+    if nan:
+        bad, wanted = np.isinf(array), "a finite number or NaN"
+    else:
+        bad, wanted = ~np.isfinite(array), "a finite number"
+    if integers is not None and not bad.any():
+        limits = np.iinfo(integers.to_pandas_dtype())
+        bad = (array != np.rint(array)) | (array < limits.min) | (array > limits.max)
+        wanted = f"a whole number from {limits.min} to {limits.max}"
+    if bad.any():
+        index = int(bad.argmax())
+        raise TacpipeError(
+            f"{path}, row {file_row(path, index)}, column {name} holds {array[index]:.12g}; it must be {wanted}."
+        )

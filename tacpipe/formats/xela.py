@@ -1,0 +1,195 @@
+"""What the published XELA trials have in common: a folder a trial, uSkin counts, markers, one line about the trial."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats import channels
+from tacpipe.stage import ROLES, Attribute, Files
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+T = TypeVar("T")
+PREFIX = "data_sample_"
+SENSORS = {"xela1": "xela_sensor1.csv", "xela2": "xela_sensor2.csv"}
+META = "meta_data.csv"
+UNSEEN = 10.0  # in all seven columns of a marker that the camera did not see; found in the recordings
+UNIT_TOLERANCE = 1e-3  # by how much a quaternion's length may differ from 1; the recordings stay below 1e-6
+
+
+def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
+    """Return the trials below ``source``: recording name to file name to path, with only the files that are there.
+
+    A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
+    recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
+    Raises `TacpipeError` if ``source`` is no folder or holds no trial.
+    """
+    if not source.is_dir():
+        raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
+    folders = sorted(
+        folder
+        for folder in [source, *(path for path in source.rglob("*") if path.is_dir())]
+        if folder.name.startswith(PREFIX) or any((folder / name).is_file() for name in names)
+    )
+    folders = [folder for folder in folders if not any(other.parent == folder for other in folders)]
+    if not folders:
+        raise TacpipeError(
+            f"{source} holds no trial: no folder in it has {', '.join(names[:3])} or the like. "
+            f"Give the folder of the unpacked data set."
+        )
+    by_name: dict[str, list[Path]] = {}
+    for folder in folders:
+        by_name.setdefault(_valid(folder.name), []).append(folder)
+    found: dict[str, dict[str, Path]] = {}
+    for name, same in by_name.items():
+        for folder in same:
+            unique = name if len(same) == 1 else _valid("-".join([*folder.relative_to(source).parts[:-1], name]))
+            found[unique] = {file: folder / file for file in names if (folder / file).is_file()}
+    return dict(sorted(found.items()))
+
+
+def require(files: Files, names: Sequence[str]) -> str:
+    """Return the name of the trial's folder. Raises `TacpipeError` if it lacks one of the files ``names``."""
+    folder = next((path.parent for path in files.values()), None)
+    missing = [name for name in names if name not in files]
+    if missing:
+        place = str(folder) if folder else "A trial folder"
+        raise TacpipeError(f"{place} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
+    assert folder is not None
+    return folder.name
+
+
+def read_uskin(path: Path) -> list[NDArray[np.uint16]]:
+    """Return the 48 columns of one uSkin, each (time,), uint16 counts, taxel by taxel."""
+    import pyarrow as pa
+
+    from tacpipe.formats.csv_table import read_csv
+
+    names = [f"txl{taxel}_{axis}" for taxel in range(1, channels.TAXELS + 1) for axis in channels.AXES]
+    table = read_csv(path, names, integers=pa.uint16())
+    return [table.column(name).to_numpy() for name in names]
+
+
+def read_floats(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
+    """Return the columns ``names`` as an array (time, channel)."""
+    from tacpipe.formats.csv_table import read_csv
+
+    table = read_csv(path, names)
+    return np.column_stack([table.column(name).to_numpy() for name in names])
+
+
+def read_marker(path: Path, name: str) -> tuple[NDArray[np.float64], float]:
+    """Return the pose of a marker (time, 7), NaN where the camera did not see it, and the share of such rows.
+
+    Raises `TacpipeError`, naming file and row, where the quaternion has not length 1.
+    """
+    columns = [f"{name}_position_{axis}" for axis in channels.AXES]
+    pose = read_floats(path, columns + [f"{name}_quaternion_{part}" for part in channels.COMPONENTS])
+    unseen = (pose == UNSEEN).all(axis=1)
+    pose[unseen] = np.nan
+    require_unit(path, pose[:, 3:], f"{name}_quaternion")
+    return pose, float(unseen.mean())
+
+
+def require_unit(path: Path, quaternions: NDArray[np.float64], name: str) -> None:
+    """Raise `TacpipeError`, naming file and row, where a quaternion (time, 4) has not length 1; NaN is let through."""
+    from tacpipe.formats.csv_table import file_row
+
+    length = np.linalg.norm(quaternions, axis=1)
+    bad = np.abs(length - 1) > UNIT_TOLERANCE
+    if bad.any():
+        row = int(bad.argmax())
+        raise TacpipeError(
+            f"{path}, row {file_row(path, row)}: {name} has length {length[row]:.4g}, a rotation has 1. "
+            f"Check that its columns are in the order x, y, z, w."
+        )
+
+
+def check_rows(trial: str, rows: Mapping[str, int], tactile: str, missing_allowed: int) -> None:
+    """Raise `TacpipeError` where a file has more rows than the tactile file, or lacks more than is known to happen."""
+    for name, count in rows.items():
+        difference = count - rows[tactile]
+        if difference > 0 or difference < -missing_allowed:
+            raise TacpipeError(
+                f"Trial {trial}: {name} has {count} rows and {tactile} {rows[tactile]}. They are written together, so "
+                f"at most {missing_allowed} row may be missing at the end. Copy the trial again or leave it out."
+            )
+
+
+class Meta:
+    """The line of text that describes a trial, read cell by cell with what each must hold."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file. Raises `TacpipeError` where it has not one row below its header."""
+        from tacpipe.formats.csv_table import read_record
+
+        self.path = path
+        self.cells = read_record(path)
+
+    def text(self, name: str) -> str:
+        """Return a cell. Raises `TacpipeError` if it is missing or empty."""
+        return self._read(name, str, "text")
+
+    def number(self, name: str) -> float:
+        """Return a cell as a positive number. Raises `TacpipeError` if it is none."""
+
+        def positive(cell: str) -> float:
+            value = float(cell)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(cell)
+            return value
+
+        return self._read(name, positive, "a positive number")
+
+    def flag(self, name: str) -> bool:
+        """Return a cell that is 0 or 1. Raises `TacpipeError` if it is neither."""
+        return self._read(name, {"0": False, "1": True, "0.0": False, "1.0": True}.__getitem__, "0 or 1")
+
+    def utc_ns(self, name: str) -> int:
+        """Return a moment like ``2021-11-24 15:20:42.172409``, read as UTC, in nanoseconds since 1970."""
+
+        def moment(cell: str) -> int:
+            since = datetime.fromisoformat(cell).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+            return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1_000
+
+        return self._read(name, moment, "a date and time as 2021-11-24 15:20:42.172409")
+
+    def _read(self, name: str, read: Callable[[str], T], wanted: str) -> T:
+        cell = self.cells.get(name, "")
+        try:
+            if cell:
+                return read(cell)
+        except (ValueError, KeyError):
+            pass
+        held = f"holds {cell!r}" if cell else "is missing or empty"
+        raise TacpipeError(f"{self.path}, column {name} {held}; it must be {wanted}. Put the file right and try again.")
+
+
+def tactile_streams(
+    columns: Mapping[str, Sequence[NDArray[np.uint16]]], t_ns: NDArray[np.int64], made: str | None
+) -> dict[str, pa.Table]:
+    """Return the tables of the sensors by stream name."""
+    fields = channels.uskin_fields()
+    return {name: channels.stream(t_ns[: len(found[0])], found, fields, made) for name, found in columns.items()}
+
+
+def authors_role(role: str) -> dict[str, Attribute]:
+    """Return the attribute of the authors' part that a folder is, or none. Raises `TacpipeError` for another word."""
+    if role and role not in ROLES:
+        raise TacpipeError(f"authors_role is {role!r}; it must be {', '.join(ROLES)}, or empty where there is none.")
+    return {"authors_role": role} if role else {}
+
+
+def _valid(name: str) -> str:
+    """Return a folder's name as that of a recording: letters, digits, dots, dashes and underscores."""
+    short = name.removeprefix(PREFIX) or name
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", short).strip("-.") or "trial"

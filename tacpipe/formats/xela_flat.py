@@ -1,0 +1,88 @@
+"""Trials of two XELA uSkin on a Franka arm that grasps, lifts and moves household objects (RSS 2022).
+
+Published as imanlab/tactile_prediction_flat_dataset. A trial is a folder of CSV files with one row a callback and no
+clock: only the mean rate is known, so the stamps are made from it and say so. Robot and marker files may lack one row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tacpipe.stage import Files, Recording, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ROBOT, MARKER = "robot_state.csv", "marker.csv"
+NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, "meta_data.csv")
+MADE = "from mean rate"
+
+
+@dataclass(frozen=True)
+class Params:
+    """How trials are read."""
+
+    authors_role: str = ""  # part of the authors' split that this folder is: train, val or test; empty if none
+
+
+def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
+    """Return the files of each trial below ``source`` by recording name. Raises `TacpipeError` if there is no trial."""
+    from tacpipe.formats import xela
+
+    return xela.trials(source, NAMES)
+
+
+@stage(version=1, discover=discover)
+def xela_flat(params: Params, files: Files) -> Recording:
+    """Return the streams xela1, xela2, robot, marker1 and marker2 of a trial; an unseen marker is NaN."""
+    import numpy as np
+
+    from tacpipe.formats import channels, xela
+    from tacpipe.signals.resampling import uniform_grid
+
+    trial = xela.require(files, NAMES)
+    meta = xela.Meta(files[xela.META])
+    rate_hz = meta.number("frequency_hz")
+    tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}
+    joints = [f"panda_joint{n}" for n in range(1, 8)]
+    robot = xela.read_floats(
+        files[ROBOT],
+        [f"position_{joint}" for joint in joints]
+        + ["position_panda_finger"]
+        + [f"velocity_{joint}" for joint in joints]
+        + [f"ee_state_position_{axis}" for axis in channels.AXES]
+        + [f"ee_state_orientation_{part}" for part in channels.COMPONENTS],
+    )  # (time, 22)
+    xela.require_unit(files[ROBOT], robot[:, -4:], "ee_state_orientation")
+    markers = {name: xela.read_marker(files[MARKER], name) for name in ("marker1", "marker2")}
+    rows = {name: len(tactile[stream][0]) for stream, name in xela.SENSORS.items()}
+    xela.check_rows(trial, rows, "xela_sensor1.csv", missing_allowed=0)
+    rows |= {ROBOT: len(robot), MARKER: len(markers["marker1"][0])}
+    xela.check_rows(trial, rows, "xela_sensor1.csv", missing_allowed=1)
+
+    last_ns = round((rows["xela_sensor1.csv"] - 1) * 1e9 / rate_hz)
+    t_ns = np.int64(meta.utc_ns("start_time")) + uniform_grid(0, last_ns, rate_hz)
+    angles, speeds = channels.joint_fields()
+    finger = channels.float_field("finger_m", "m", "finger_width")
+    fields = [*angles, finger, *speeds, *channels.pose_fields()]
+    streams: dict[str, pa.Table] = xela.tactile_streams(tactile, t_ns, MADE)
+    streams["robot"] = channels.stream(t_ns[: len(robot)], robot.T, fields, MADE)
+    for name, (pose, _) in markers.items():
+        streams[name] = channels.stream(t_ns[: len(pose)], pose.T, channels.pose_fields(), MADE)
+    return Recording(
+        streams,
+        {
+            "sensor": "xela-uskin",
+            "object": meta.text("object_name"),
+            "object_class": meta.text("object_class"),
+            "seen": meta.flag("seen"),
+            "dropped": meta.flag("dropped"),
+            "covering": meta.text("sensor_type"),
+            "rate_hz": rate_hz,
+            "trial": trial,
+            **{f"{name}_unseen_ratio": round(unseen, 4) for name, (_, unseen) in markers.items()},
+            **xela.authors_role(params.authors_role),
+        },
+    )

@@ -1,0 +1,140 @@
+"""Trials of two XELA uSkin on a Franka arm that moves a held object along a line, with slip labels (CoRL 2022).
+
+Published as imanlab/proactive-slip-control (MIT). A trial is a folder of CSV files with one row a callback; the stamps
+are the seconds in robot_state.csv. Trials begin and end in the grasp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Files, Recording, stage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+ROBOT, MARKER, LABELS = "robot_state.csv", "marker.csv", "slip_label.csv"
+NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, LABELS, "meta_data.csv")
+ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R Rᵀ - 1 that is let through; the recordings stay below 1e-5
+
+
+@dataclass(frozen=True)
+class Params:
+    """How trials are read."""
+
+    authors_role: str = ""  # part of the authors' split that this folder is: train, val or test; empty if none
+
+
+def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
+    """Return the files of each trial below ``source`` by recording name. Raises `TacpipeError` if there is no trial."""
+    from tacpipe.formats import xela
+
+    return xela.trials(source, NAMES)
+
+
+@stage(version=1, discover=discover)
+def xela_psc(params: Params, files: Files) -> Recording:
+    """Return the streams xela1, xela2, robot, marker and slip of a trial; an unseen marker is NaN."""
+    import numpy as np
+    import pyarrow as pa
+
+    from tacpipe.formats import channels, xela
+    from tacpipe.formats.csv_table import read_csv
+    from tacpipe.signals.holds import mean_rate_hz
+
+    trial = xela.require(files, NAMES)
+    meta = xela.Meta(files[xela.META])
+    tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}
+    joints = [f"joint{n}" for n in range(1, 8)]
+    moving = [f"position_{joint}" for joint in joints] + [f"velocity_{joint}" for joint in joints]
+    robot = xela.read_floats(files[ROBOT], [*moving, "v_x", "v_y", "time"])  # (time, 17)
+    pose = _poses(files[ROBOT])  # (time, 7)
+    marker, unseen = xela.read_marker(files[MARKER], "marker")
+    labels = read_csv(files[LABELS], ["slip", "fail"], integers=pa.int8())
+    rows = {name: len(tactile[stream][0]) for stream, name in xela.SENSORS.items()}
+    rows |= {ROBOT: len(robot), MARKER: len(marker), LABELS: labels.num_rows}
+    xela.check_rows(trial, rows, ROBOT, missing_allowed=1)
+
+    t_ns = np.int64(meta.utc_ns("start_time")) + _stamps_ns(files[ROBOT], robot[:, -1])
+    angles, speeds = channels.joint_fields()
+    planned = [
+        channels.float_field(f"commanded_velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in channels.AXES[:2]
+    ]
+    streams: dict[str, Any] = xela.tactile_streams(tactile, t_ns, None)
+    streams["robot"] = channels.stream(
+        t_ns, [*robot[:, :14].T, *pose.T, *robot[:, 14:16].T], [*angles, *speeds, *channels.pose_fields(), *planned]
+    )
+    streams["marker"] = channels.stream(t_ns[: len(marker)], marker.T, channels.pose_fields())
+    marks = [labels.column(name).to_numpy() for name in labels.column_names]
+    _require_flags(files[LABELS], labels.column_names, marks)
+    fields = [channels.label_field(name) for name in labels.column_names]
+    streams["slip"] = channels.stream(t_ns[: labels.num_rows], marks, fields)
+    return Recording(
+        streams,
+        {
+            "sensor": "xela-uskin",
+            "dropped": meta.flag("dropped"),
+            "slipped": bool(marks[0].any()),
+            "failed": bool(marks[1].any()),
+            "covering": meta.text("sensor_type"),
+            "rate_hz": round(mean_rate_hz(t_ns), 6),
+            "trial": trial,
+            "marker_unseen_ratio": round(unseen, 4),
+            **xela.authors_role(params.authors_role),
+        },
+    )
+
+
+def _poses(path: Path) -> NDArray[np.float64]:
+    """Return position and quaternion (time, 7) of the 4x4 transforms in a file, which are stored column by column."""
+    import numpy as np
+
+    from tacpipe.formats import xela
+    from tacpipe.formats.csv_table import file_row
+    from tacpipe.signals.rotations import continuous, quaternions_of
+
+    entries = [f"ee_T_{row}{column}" for row in range(4) for column in range(4)]  # named by row and column
+    transforms = xela.read_floats(path, entries).reshape(-1, 4, 4)
+    turned, moved = transforms[:, :3, :3], transforms[:, :3, 3]
+    error = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))  # (time,)
+    error = np.maximum(error, np.abs(np.linalg.det(turned) - 1))
+    error = np.maximum(error, np.abs(transforms[:, 3] - [0, 0, 0, 1]).max(axis=1))
+    if (error > ORTHONORMAL_TOLERANCE).any():
+        row = int((error > ORTHONORMAL_TOLERANCE).argmax())
+        raise TacpipeError(
+            f"{path}, row {file_row(path, row)}: ee_T is no rigid transform; it is off by {error[row]:.3g}, "
+            f"{ORTHONORMAL_TOLERANCE} is allowed. Check that ee_T_03, ee_T_13 and ee_T_23 hold the position."
+        )
+    return np.column_stack([moved, continuous(quaternions_of(turned))])
+
+
+def _stamps_ns(path: Path, time_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return seconds as whole nanoseconds (time,). Raises `TacpipeError` where they run backwards."""
+    import numpy as np
+
+    from tacpipe.formats.csv_table import file_row
+
+    back = np.diff(time_s) < 0
+    if back.any():
+        row = int(back.argmax()) + 1
+        raise TacpipeError(
+            f"{path}, row {file_row(path, row)}: time runs backwards from {time_s[row - 1]:.9g} s to "
+            f"{time_s[row]:.9g} s. Put the rows in order or leave the trial out."
+        )
+    return np.rint(time_s * 1e9).astype(np.int64)
+
+
+def _require_flags(path: Path, names: list[str], marks: list[NDArray[np.int8]]) -> None:
+    from tacpipe.formats.csv_table import file_row
+
+    for name, values in zip(names, marks, strict=True):
+        bad = (values < 0) | (values > 1)
+        if bad.any():
+            row = int(bad.argmax())
+            raise TacpipeError(
+                f"{path}, row {file_row(path, row)}, column {name} holds {values[row]}; it must be 0 or 1."
+            )

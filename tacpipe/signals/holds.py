@@ -1,0 +1,43 @@
+"""Frames that a logger wrote again because no new one had come, and the rate that is left without them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def held(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return where every channel of ``values`` (time, channel) equals the frame before (time,); the first never does.
+
+    >>> held(np.array([[1, 2], [1, 2], [1, 3]])).tolist()
+    [False, True, False]
+    """
+    return held_columns(list(values.T))
+
+
+def held_columns(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
+    """Return the same as `held` for channels that lie apart, each (time,); stops at the first that leaves none held."""
+    repeated = np.ones(len(columns[0]) if columns else 0, dtype=bool)
+    repeated[:1] = False
+    for column in columns:
+        repeated[1:] &= column[1:] == column[:-1]
+        if not repeated.any():
+            break
+    return repeated
+
+
+def mean_rate_hz(t_ns: NDArray[np.int64]) -> float:
+    """Return how many samples came a second; 0 for fewer than two samples or for stamps that are all equal."""
+    return fresh_rate_hz(t_ns, np.zeros(len(t_ns), dtype=bool))
+
+
+def fresh_rate_hz(t_ns: NDArray[np.int64], held: NDArray[np.bool_]) -> float:
+    """Return how many new frames came a second: those after the first that are not held, over the time they span.
+
+    0 for fewer than two samples or for stamps that are all equal.
+    """
+    span_ns = int(t_ns[-1] - t_ns[0]) if len(t_ns) else 0
+    return float(np.count_nonzero(~held[1:]) * 1e9 / span_ns) if span_ns > 0 else 0.0

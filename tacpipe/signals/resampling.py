@@ -1,0 +1,130 @@
+"""Where a signal stands between its samples: grids, interpolation, distance and gaps.
+
+Time is int64 nanoseconds throughout. Only differences of stamps become floats, so that stamps near 1.6e18 (UTC today)
+lose nothing: as float64 they would be rounded to 256 ns. Stamps must not run backwards; equal ones are allowed, and the
+last of them counts. Beyond the first and the last sample a signal keeps its end value; `in_gap` tells where that is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.signals.rotations import continuous
+
+Times = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+PARALLEL = 1e-6  # rad; below this angle the sine weights of slerp divide by zero and linear ones are exact to 1e-13
+
+
+def uniform_grid(first_ns: int, last_ns: int, rate_hz: float) -> Times:
+    """Return ``first_ns + round(k * 1e9 / rate_hz)`` for k = 0, 1, … as far as ``last_ns``, int64 (time,).
+
+    Empty if ``last_ns`` lies before ``first_ns``. Raises `TacpipeError` for a rate that is not positive.
+
+    >>> uniform_grid(0, 70_000_000, 30.0).tolist()
+    [0, 33333333, 66666667]
+    """
+    if not (np.isfinite(rate_hz) and 0 < rate_hz <= 1e9):
+        raise TacpipeError(f"A rate of {rate_hz} Hz gives no grid; it must lie above 0 and at most at 1e9 Hz.")
+    span_ns = int(last_ns) - int(first_ns)
+    steps = np.arange(max(0, int(span_ns * rate_hz / 1e9) + 2), dtype=np.float64)
+    offsets_ns = np.rint(steps * 1e9 / rate_hz).astype(np.int64)  # (time,)
+    return np.int64(first_ns) + offsets_ns[offsets_ns <= span_ns]
+
+
+def linear(t_ns: Times, values: NDArray[Any], grid_ns: Times) -> Floats:
+    """Return ``values`` (time, channel) at the times ``grid_ns``, interpolated linearly, as float64 (grid, channel).
+
+    A NaN spreads to the points between it and its neighbours and no further.
+    """
+    lower, upper, weight = _neighbours(t_ns, grid_ns)
+    start: Floats = np.take(values, lower, axis=0).astype(np.float64, copy=False)  # (grid, channel)
+    step: Floats = np.take(values, upper, axis=0) - start
+    step *= weight[:, None]
+    step += start
+    return step
+
+
+def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
+    """Return unit quaternions at ``grid_ns`` (grid, 4), turned at constant speed along the shorter arc between samples.
+
+    ``quaternions`` (time, 4) are xyzw; they are normalised and their signs made continuous first, so neither scale nor
+    sign of a sample matters, and the result has no jump of sign either.
+    """
+    ends = continuous(quaternions)
+    lower, upper, weight = _neighbours(t_ns, grid_ns)
+    start, stop = ends[lower], ends[upper]  # (grid, 4)
+    angle = np.arccos(np.clip((start * stop).sum(axis=1), -1.0, 1.0))  # (grid,)
+    near = ~(angle > PARALLEL)
+    sine = np.where(near, 1.0, np.sin(angle))
+    first = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * angle) / sine)
+    second = np.where(near, weight, np.sin(weight * angle) / sine)
+    turned: Floats = first[:, None] * start + second[:, None] * stop
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return turned
+
+
+def bracketing_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
+    """Return, sorted, the rows that `linear` and `slerp` look at: with those alone they give the same.
+
+    A stream of 1 kHz on a grid of 50 Hz is gathered from a tenth of its rows.
+    """
+    lower, upper, _ = _neighbours(t_ns, grid_ns)
+    wanted = np.zeros(len(t_ns), dtype=bool)
+    wanted[lower] = wanted[upper] = True
+    return np.flatnonzero(wanted)
+
+
+def nearest_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
+    """Return for each grid point the row of the nearest sample (grid,); the earlier one where two are as near."""
+    _require_samples(t_ns)
+    after = np.clip(np.searchsorted(t_ns, grid_ns, side="right"), 1, max(len(t_ns) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(t_ns) - 1)
+    return np.where(t_ns[after] - grid_ns < grid_ns - t_ns[before], after, before)
+
+
+def nearest(t_ns: Times, values: NDArray[Any], grid_ns: Times) -> NDArray[Any]:
+    """Return the nearest sample of ``values`` (time, …) at each grid point (grid, …), its type kept."""
+    return values[nearest_rows(t_ns, grid_ns)]
+
+
+def nearest_distance_ns(t_ns: Times, grid_ns: Times) -> Times:
+    """Return the distance from each grid point to the nearest sample, int64 nanoseconds (grid,), never negative."""
+    distance_ns: Times = np.abs(t_ns[nearest_rows(t_ns, grid_ns)] - grid_ns)
+    return distance_ns
+
+
+def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> NDArray[np.bool_]:
+    """Return where a grid point has no trustworthy value (grid,).
+
+    That is strictly between two samples further apart than ``gap_ns``, or outside the range of the samples.
+    """
+    lower, upper, _ = _neighbours(t_ns, grid_ns)
+    outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
+    found: NDArray[np.bool_] = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
+    return found
+
+
+def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Return the sample rows before and after each grid point and the weight of the latter, each (grid,).
+
+    At a sample both rows are that sample, so that what lies behind it has no say.
+    """
+    _require_samples(t_ns)
+    last = len(t_ns) - 1
+    lower = np.clip(np.searchsorted(t_ns, grid_ns, side="right") - 1, 0, last)
+    upper = np.where(grid_ns > t_ns[lower], np.minimum(lower + 1, last), lower)
+    span_ns = t_ns[upper] - t_ns[lower]
+    weight = (grid_ns - t_ns[lower]) / np.maximum(span_ns, 1)
+    return lower, upper, np.where(span_ns > 0, weight, 0.0)
+
+
+def _require_samples(t_ns: Times) -> None:
+    if not len(t_ns):
+        raise TacpipeError("A signal without samples has no value anywhere; leave the stream out or record it again.")

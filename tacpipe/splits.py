@@ -1,0 +1,201 @@
+"""Who is trained on, who is watched, who is tested: roles of whole recordings, never of windows.
+
+Windows of one recording overlap and resemble each other, so a split among them would test on what was trained on.
+Everything here follows from names, attributes and a seed; the order in which names are given does not matter.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import ROLES, Attribute
+
+SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
+Attributes = Mapping[str, Attribute]
+Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """How recordings are dealt out."""
+
+    name: str = "random"
+    val: float = 0.15  # share of the recordings, or of those left for training where the scheme picks the test ones
+    test: float = 0.15  # share of the recordings; of no effect where the scheme picks them
+    seed: int = 0
+    folds: int = 5  # of kfold
+    by: str = "object"  # attribute whose values leave-one-out leaves out one by one
+    stratify: str = ""  # attribute whose values are spread evenly over the roles; empty for none
+
+
+def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
+    """Return the role of each recording in each fold; ``attributes`` holds those of each recording by name.
+
+    ============== =====================================================================================
+    random         shares ``test`` and ``val`` drawn at random
+    kfold          in fold k the k-th of ``folds`` even parts is tested, ``val`` of the others drawn at random
+    blocked        in the order of names, which is that of time for most sets: train, then val, then test
+    leave-one-out  in fold k the recordings of the k-th value of ``by`` are tested
+    authors        what the attribute ``authors_role`` says; with no val among them, ``val`` of train is drawn
+    ============== =====================================================================================
+
+    ``keep`` holds roles of an older split: they stay, and only recordings without any are dealt out. Raises
+    `TacpipeError` for a scheme, share or attribute that cannot be, and where no recording is left to train on.
+    """
+    _check(attributes, scheme)
+    fresh = sorted(name for name in attributes if not any(kept == name for kept, _ in keep))
+    if scheme.name == "random":
+        folds = [_drawn(fresh, attributes, scheme, 0)]
+    elif scheme.name == "blocked":
+        folds = [_blocked(fresh, attributes, scheme)]
+    elif scheme.name == "authors":
+        folds = [_authors(fresh, attributes, scheme)]
+    elif scheme.name == "kfold":
+        folds = _kfold(fresh, attributes, scheme)
+    else:
+        folds = _leave_one_out(attributes, scheme, keep)
+    roles = {(name, fold): role for fold, found in enumerate(folds) for name, role in found.items()}
+    roles |= _kept(attributes, keep, len(folds), scheme)
+    for fold in range(len(folds)):
+        if not any(role == "train" for (_, at), role in roles.items() if at == fold):
+            raise TacpipeError(
+                f"Fold {fold} of the {scheme.name} split leaves none of {len(attributes)} recordings to train on. "
+                f"Lower val and test, or add recordings."
+            )
+    return dict(sorted(roles.items(), key=lambda item: (item[0][1], item[0][0])))
+
+
+def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
+    if scheme.name not in SCHEMES:
+        raise TacpipeError(f"There is no split scheme {scheme.name}; there are {', '.join(SCHEMES)}.")
+    if not attributes:
+        raise TacpipeError("A split of no recordings has no roles to give; give it a dataset with recordings.")
+    if not (0 <= scheme.val < 1 and 0 <= scheme.test < 1 and scheme.val + scheme.test < 1):
+        raise TacpipeError(
+            f"val {scheme.val} and test {scheme.test} leave nothing to train on; both must lie in [0, 1) "
+            f"and their sum below 1."
+        )
+    if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
+        raise TacpipeError(
+            f"{scheme.folds} folds cannot be made of {len(attributes)} recordings; folds must lie between 2 and that."
+        )
+
+
+def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
+    """Return roles with the shares ``test`` and ``val``, each value of ``stratify`` spread evenly over them.
+
+    Recordings are shuffled within their stratum and put at (rank + 1/2) / size of it; cutting that order anywhere cuts
+    every stratum at the same share, to within one recording.
+    """
+    rng = np.random.default_rng([scheme.seed, draw])
+    places: dict[str, float] = {}
+    for stratum in _strata(names, attributes, scheme).values():
+        shuffled = rng.permutation(len(stratum))
+        places |= {stratum[i]: (rank + 0.5) / len(stratum) for rank, i in enumerate(shuffled)}
+    ties = dict(zip(names, rng.random(len(names)), strict=True))
+    order = sorted(names, key=lambda name: (places[name], ties[name]))
+    tests, vals = round(scheme.test * len(names)), round(scheme.val * len(names))
+    return {name: "test" if i < tests else "val" if i < tests + vals else "train" for i, name in enumerate(order)}
+
+
+def _val_of(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
+    """Return roles of recordings that are not tested: the share ``val`` of them, the rest train."""
+    return _drawn(names, attributes, Scheme(val=scheme.val, test=0, seed=scheme.seed, stratify=scheme.stratify), draw)
+
+
+def _blocked(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
+    roles: dict[str, str] = {}
+    for stratum in _strata(names, attributes, scheme).values():
+        tests, vals = round(scheme.test * len(stratum)), round(scheme.val * len(stratum))
+        trains = len(stratum) - tests - vals
+        roles |= {n: "train" if i < trains else "val" if i < trains + vals else "test" for i, n in enumerate(stratum)}
+    return roles
+
+
+def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
+    roles = {}
+    for name in names:
+        role = attributes[name].get("authors_role")
+        if role not in ROLES:
+            held = f"has authors_role {role!r}" if role is not None else "has no attribute authors_role"
+            raise TacpipeError(
+                f"Recording {name} {held}; the scheme authors needs {', '.join(ROLES)} there. Ingest with "
+                f"--authors-role, set it with `tacpipe label`, or choose another scheme."
+            )
+        roles[name] = str(role)
+    if "val" not in roles.values():
+        roles |= _val_of([name for name in names if roles[name] == "train"], attributes, scheme, 0)
+    return roles
+
+
+def _kfold(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> list[dict[str, str]]:
+    """Deal the shuffled recordings out in turn, stratum after stratum, so that parts differ by one at most."""
+    rng = np.random.default_rng(scheme.seed)
+    strata = _strata(names, attributes, scheme).values()
+    order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
+    part = {name: i % scheme.folds for i, name in enumerate(order)}
+    folds = []
+    for fold in range(scheme.folds):
+        rest = _val_of([name for name in names if part[name] != fold], attributes, scheme, fold + 1)
+        folds.append(rest | {name: "test" for name in names if part[name] == fold})
+    return folds
+
+
+def _leave_one_out(
+    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
+) -> list[dict[str, str]]:
+    """One fold a value, sorted; values that an older split tested keep their fold."""
+    values = {name: _value(name, attributes, scheme.by) for name in sorted(attributes)}
+    old = {fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values}
+    left_out = [old[fold] for fold in sorted(old)]
+    left_out += [value for value in _ordered(set(values.values())) if value not in left_out]
+    if len(left_out) < 2:
+        raise TacpipeError(f"All recordings have {scheme.by} {left_out[0]}; leaving it out leaves none to train on.")
+    folds = []
+    for fold, value in enumerate(left_out):
+        rest = _val_of([name for name in values if values[name] != value], attributes, scheme, fold + 1)
+        folds.append(rest | {name: "test" for name in values if values[name] == value})
+    return folds
+
+
+def _kept(
+    attributes: Mapping[str, Attributes], keep: Mapping[tuple[str, int], str], folds: int, scheme: Scheme
+) -> Roles:
+    """Return the older roles of recordings that are still there. Raises where they do not fit the scheme."""
+    old = {fold for _, fold in keep}
+    grown = scheme.name == "leave-one-out" and len(old) <= folds  # a new value adds a fold
+    if keep and old != set(range(folds)) and not grown:
+        raise TacpipeError(
+            f"The older split has {len(old)} folds and the scheme {scheme.name} makes {folds}; they must be as many. "
+            f"Give the scheme and the folds of the older split."
+        )
+    return {(name, fold): role for (name, fold), role in keep.items() if name in attributes}
+
+
+def _strata(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, list[str]]:
+    """Return the recordings of each value of the attribute ``stratify``, values and names sorted."""
+    if not scheme.stratify:
+        return {"": sorted(names)}
+    values = {name: _value(name, attributes, scheme.stratify) for name in sorted(names)}
+    return {value: [name for name in values if values[name] == value] for value in _ordered(set(values.values()))}
+
+
+def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:
+    value = attributes[name].get(attribute)
+    if value is None:
+        known = ", ".join(sorted(attributes[name])) or "none"
+        raise TacpipeError(
+            f"Recording {name} has no attribute {attribute}; it has {known}. Name another one or set it with "
+            f"`tacpipe label`."
+        )
+    return str(value)
+
+
+def _ordered(values: set[str]) -> list[str]:
+    """Sort text, whole numbers by value: 4, 10, bottle."""
+    return sorted(values, key=lambda value: (0, int(value), "") if value.isdecimal() else (1, 0, value))

@@ -1,0 +1,30 @@
+"""Quaternions against scipy's Rotation."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tacpipe.signals.rotations import continuous, quaternions_of
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_matrix_gives_the_quaternion_that_scipy_gives(seed: int) -> None:
+    turned = Rotation.from_quat(np.random.default_rng(seed).normal(size=(20, 4)))
+    found = quaternions_of(turned.as_matrix())
+    np.testing.assert_allclose(found, turned.as_quat(canonical=True), atol=1e-12)
+
+
+def test_half_turns_about_each_axis_do_not_divide_by_zero() -> None:
+    found = quaternions_of(np.array([np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1]), np.eye(3)]))
+    np.testing.assert_allclose(np.abs(found), np.eye(4), atol=1e-15)
+
+
+def test_signs_follow_the_row_before_and_nan_stays_where_it_is() -> None:
+    rows = np.array([[0, 0, 0, -2.0], [0, 0, 0, 1.0], [np.nan] * 4, [0, 0, 0.1, 1.0]])
+    found = continuous(rows)
+    assert found[0].tolist() == found[1].tolist() == [0.0, 0.0, 0.0, -1.0]
+    assert np.isnan(found[2]).all()
+    np.testing.assert_allclose(np.linalg.norm(found[3]), 1.0)

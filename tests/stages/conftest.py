@@ -1,0 +1,33 @@
+"""A recording without a store, for stages that are called as plain functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import pyarrow as pa
+import pytest
+
+from tacpipe.stage import Attribute
+
+
+@dataclass(frozen=True)
+class FakeShard:
+    """What a stage sees of one recording."""
+
+    tables: Mapping[str, pa.Table]
+    name: str = "trial"
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        return tuple(sorted(self.tables))
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
+
+
+@pytest.fixture
+def shard() -> Callable[..., FakeShard]:
+    """Make a recording of tables by stream name."""
+    return FakeShard

@@ -1,0 +1,44 @@
+"""The table that the split stage writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.registry import load
+
+split = load("split")
+Shard = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class FakeDataset:
+    shards: dict[str, Any]
+
+
+def dataset(shard: Shard, count: int) -> FakeDataset:
+    return FakeDataset({f"t{i:02d}": shard({}, f"t{i:02d}", {"object": str(i % 4)}) for i in range(count)})
+
+
+def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Shard) -> None:
+    result = split(split.params(scheme="leave-one-out"), dataset(shard, 12))
+    assert set(result.recordings) == {"split"}
+    table = result.recordings["split"].tables
+    assert table.schema == pa.schema([("recording", pa.string()), ("fold", pa.int32()), ("role", pa.string())])
+    assert table.num_rows == 12 * 4
+    assert set(table.column("role").to_pylist()) == {"train", "val", "test"}
+
+
+def test_the_same_params_give_the_same_table(shard: Shard) -> None:
+    tables = [split(split.params(seed=3), dataset(shard, 20)).recordings["split"].tables for _ in range(2)]
+    assert tables[0].equals(tables[1])
+
+
+def test_a_missing_attribute_is_an_error_sentence(shard: Shard) -> None:
+    with pytest.raises(TacpipeError, match="has no attribute authors_role"):
+        split(split.params(scheme="authors"), dataset(shard, 3))

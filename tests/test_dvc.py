@@ -1,0 +1,270 @@
+"""Chains under real DVC: it tracks manifests alone, and tacpipe reads what these name."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+import tacpipe
+from tacpipe import registry
+from tests.conftest import Lab
+
+HERE = Path(__file__).parents[1]
+NEEDS_DVC = pytest.mark.skipif(
+    shutil.which("git") is None or not Path(sys.executable).with_name("dvc").exists(),
+    reason="git and DVC (the extra dev) are needed",
+)
+PARAMS = "toy:\n  offset: 1\n  scale:\n    factor: 2\n"
+CHAIN = """
+stages:
+  recordings:
+    cmd: tacpipe simulate toy --offset ${toy.offset} -o data/recordings
+    params: [toy.offset]
+    outs: [{data/recordings/manifest.json: {persist: true}}]
+  scaled:
+    cmd: tacpipe scale data/recordings -o data/scaled --block toy.scale
+    deps: [data/recordings/manifest.json]
+    params: [toy.scale]
+    outs: [data/scaled/manifest.json]
+  total:
+    cmd: tacpipe total data/scaled -o results/toy
+    deps: [data/scaled/manifest.json]
+    outs: [results/toy/manifest.json]
+    metrics: [{results/toy/metrics.json: {cache: false}}]
+"""
+
+
+@dataclass
+class Project:
+    """A git and DVC repository."""
+
+    folder: Path
+    environment: Mapping[str, str]
+
+    def run(self, command: str) -> str:
+        """Return what a command that must succeed printed."""
+        done = subprocess.run(
+            shlex.split(command), cwd=self.folder, env=self.environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, f"{command} ended with {done.returncode}: {done.stdout}{done.stderr}"
+        return done.stdout + done.stderr
+
+    def start(self) -> None:
+        """Make the folder a repository and commit what is in it."""
+        self.run("git init --quiet")
+        self.run("dvc init --quiet")
+        self.commit("start")
+
+    def commit(self, message: str) -> None:
+        """Commit everything that is not ignored."""
+        self.run("git add --all")
+        self.run(f"git commit --quiet --message {shlex.quote(message)}")
+
+    def change(self, old: str, new: str) -> None:
+        """Replace a text in the params file."""
+        text = (self.folder / "params.yaml").read_text()
+        assert old in text
+        (self.folder / "params.yaml").write_text(text.replace(old, new))
+
+    def values(self, dataset: str) -> dict[str, list[int]]:
+        """Return the values of each recording as tacpipe reads them."""
+        shards = tacpipe.open(self.folder / dataset).shards
+        return {name: shard.table()["x"].to_pylist() for name, shard in shards.items()}
+
+    def beside(self, dataset: str) -> dict[str, list[int]]:
+        """Return the values in the Parquet files that lie beside the manifest, whatever that names."""
+        return {path.stem: pq.read_table(path)["x"].to_pylist() for path in (self.folder / dataset).glob("*.parquet")}
+
+
+@pytest.fixture
+def environment(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """An environment in which neither git nor DVC knows who runs them."""
+    monkeypatch.delenv("TACPIPE_STORE", raising=False)
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_"))}
+    return {
+        **kept,
+        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
+        "PYTHONPATH": str(plugin),
+        "HOME": str(tmp_path),
+        "GIT_CONFIG_GLOBAL": os.devnull,
+        "GIT_AUTHOR_NAME": "lab",
+        "GIT_AUTHOR_EMAIL": "lab@example.org",
+        "GIT_COMMITTER_NAME": "lab",
+        "GIT_COMMITTER_EMAIL": "lab@example.org",
+        "DVC_NO_ANALYTICS": "1",
+        "DVC_GLOBAL_CONFIG_DIR": str(tmp_path / "dvc-global"),
+        "DVC_SYSTEM_CONFIG_DIR": str(tmp_path / "dvc-system"),
+        "DVC_SITE_CACHE_DIR": str(tmp_path / "dvc-site"),
+    }
+
+
+@pytest.fixture
+def toy(tmp_path: Path, environment: Mapping[str, str]) -> Project:
+    """A repository whose chain was run with a factor of 2, then of 3, each committed."""
+    project = Project(tmp_path / "toy", environment)
+    project.folder.mkdir()
+    (project.folder / "dvc.yaml").write_text(CHAIN)
+    (project.folder / "params.yaml").write_text(PARAMS)
+    (project.folder / ".gitignore").write_text(".tacpipe/\n*.parquet\n")
+    project.start()
+    project.run("dvc repro")
+    project.commit("factor 2")
+    project.change("factor: 2", "factor: 3")
+    project.run("dvc repro")
+    project.commit("factor 3")
+    return project
+
+
+def expected(factor: int) -> dict[str, list[int]]:
+    """What the toy chain gives with an offset of 1."""
+    return {f"trial-{trial:03d}": [factor * (row * (trial + 1) + 1) for row in range(20)] for trial in range(4)}
+
+
+def cached(folder: Path) -> list[bytes]:
+    """Return the content of every file in DVC's cache."""
+    return [path.read_bytes() for path in (folder / ".dvc" / "cache").rglob("*") if path.is_file()]
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
+def test_the_forward_chain_runs_once_and_dvc_shows_its_metrics_params_and_plots(
+    tmp_path: Path, environment: Mapping[str, str]
+) -> None:
+    project = Project(tmp_path / "forward", environment)
+    (project.folder / "docs" / "tasks").mkdir(parents=True)
+    for name in ("dvc.yaml", "params.yaml", "docs/tasks/horizons.json"):
+        shutil.copy(HERE / name, project.folder / name)
+    (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
+    params = yaml.safe_load((project.folder / "params.yaml").read_text())
+    params["forward"]["recordings"] = "simulate forward --trials 6 --duration-s 4"
+    params["forward"]["train"] |= {"epochs": 1, "hidden": 8}
+    (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
+    project.start()
+    project.run("dvc repro")
+    again = project.run("dvc repro")
+    project.commit("one epoch")
+
+    assert "Running stage" not in again
+    assert "up to date" in again
+    metrics = json.loads(project.run("dvc metrics show --json"))[""]["data"]["results/forward/metrics.json"]["data"]
+    assert metrics["model"]["mae_counts"]["all"]["t10"] > 0
+    assert metrics["persistence"]["mae_counts"]["all"]["t10"] > 0
+    project.change("components: 20", "components: 12")
+    changed = json.loads(project.run("dvc params diff --json"))["params.yaml"]
+    assert changed == {"forward.compress.components": {"old": 20, "new": 12, "diff": -8}}
+    project.run("dvc plots show --out plots")
+    page = (project.folder / "plots" / "index.html").read_text()
+    assert "persistence" in page
+    assert "mse_counts" in page
+    assert "<DVC_METRIC" not in page
+    contents = cached(project.folder)
+    assert sum(b'"format": 1' in content for content in contents) == 7  # a manifest a stage, one of which persists
+    assert not [content for content in contents if content.startswith(b"PAR1")]
+    assert max(map(len, contents)) < 5_000_000
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
+def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
+    assert toy.values("data/scaled") == expected(3)
+    toy.run("git checkout --quiet HEAD~1")
+    toy.run("dvc checkout")
+
+    assert toy.beside("data/scaled") == expected(3)  # stale: DVC knows nothing of them
+    assert toy.values("data/scaled") == expected(2)
+    toy.run("tacpipe store link data/scaled")
+    assert toy.beside("data/scaled") == expected(2)
+    assert "Running stage" not in toy.run("dvc repro")
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
+def test_after_a_restore_from_the_run_cache_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
+    toy.change("factor: 3", "factor: 2")
+    told = toy.run("dvc repro")
+
+    assert "Stage 'scaled' is cached" in told
+    assert toy.beside("data/scaled") == expected(3)  # stale: the stage did not run
+    assert toy.values("data/scaled") == expected(2)
+    metrics = json.loads((toy.folder / "results" / "toy" / "metrics.json").read_text())
+    assert metrics == {name: sum(values) for name, values in expected(2).items()}
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
+def test_a_second_clone_with_the_same_caches_gets_the_results_without_running_a_stage(
+    toy: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy.run(f"git clone --quiet . {tmp_path / 'clone'}")
+    store = str(toy.folder / ".tacpipe")
+    clone = Project(tmp_path / "clone", {**toy.environment, "TACPIPE_STORE": store})
+    monkeypatch.setenv("TACPIPE_STORE", store)
+    clone.run(f"dvc cache dir --local {toy.folder / '.dvc' / 'cache'}")
+    first = clone.run("dvc repro")
+    assert "0 ran, 4 reused" in first  # recordings have no input that DVC could look up, so they are asked for
+    assert "Stage 'scaled' is cached" in first
+    assert clone.values("data/scaled") == expected(3)
+
+    for folder in ("data/scaled", "results"):
+        shutil.rmtree(clone.folder / folder)
+    clone.change("factor: 3", "factor: 2")
+    assert "Stage 'scaled' is cached" in clone.run("dvc repro")
+    assert clone.values("data/scaled") == expected(2)
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
+def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:
+    toy.run("tacpipe label data/recordings trial-002 --set material=foam")
+    told = toy.run("dvc repro")
+
+    assert "Running stage 'scaled'" in told
+    assert "0 ran, 4 reused" in told  # no shard reads the label
+    assert tacpipe.open(toy.folder / "data/scaled").shards["trial-002"].attributes["material"] == "foam"
+    assert "Running stage" not in toy.run("dvc repro")
+
+
+def stages() -> Iterator[tuple[str, dict[str, Any], list[str]]]:
+    """Yield each stage of the project's own chain and the words of its command."""
+    params = yaml.safe_load((HERE / "params.yaml").read_text())
+    for name, value in yaml.safe_load((HERE / "dvc.yaml").read_text())["stages"].items():
+        command = value["cmd"].replace("${forward.recordings}", params["forward"]["recordings"])
+        yield name, value, shlex.split(command)
+
+
+@pytest.mark.parametrize(("name", "value", "words"), [pytest.param(*found, id=found[0]) for found in stages()])
+def test_every_step_of_the_chain_is_a_stage_whose_block_of_params_fits(
+    name: str, value: dict[str, Any], words: list[str], lab: Lab
+) -> None:
+    assert words[0] == "tacpipe"
+    known = registry.stages()
+    assert words[1] in known or f"{words[1]}.{words[2]}" in known
+    if "--block" in words:
+        assert words[words.index("--block") + 1] in value["params"]
+    shutil.copy(HERE / "params.yaml", lab.folder)
+
+    printed = json.loads(lab.run(shlex.join([*words[1:], "--print-params"])).out)
+
+    assert isinstance(printed, dict)
+
+
+def test_dvc_tracks_manifests_and_the_report_alone() -> None:
+    before: set[str] = set()
+    for name, value, words in stages():
+        outs = {out if isinstance(out, str) else next(iter(out)) for out in value["outs"]}
+        output = words[words.index("-o") + 1]
+        assert outs == {output if output.endswith(".html") else f"{output}/manifest.json"}, name
+        assert set(value.get("deps", ())) <= before, name
+        before |= outs

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tacpipe.errors import TacpipeError
+from tacpipe.training import checkpoint
+from tacpipe.training.loop import Loss, Part, Schedule, Trained, train
+
+SCHEDULE = Schedule(epochs=6, batch=8, learning_rate=0.01, patience=3, gradient_clip=1.0, seed=4)
+INPUTS = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
+TARGETS = INPUTS @ torch.tensor([[1.0], [-2.0], [0.5]])
+
+
+def build() -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.1), nn.Linear(8, 1))
+
+
+def loss(model: nn.Module, indices: Tensor) -> Tensor:
+    return nn.functional.mse_loss(model(INPUTS[indices]), TARGETS[indices])
+
+
+def run(folder: Path, training_loss: Loss = loss, schedule: Schedule = SCHEDULE) -> Trained:
+    return train(build, Part(32, training_loss), Part(40, loss), schedule, folder)
+
+
+def interrupted_after(calls: int) -> Loss:
+    left = iter(range(calls))
+
+    def once(model: nn.Module, indices: Tensor) -> Tensor:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return loss(model, indices)
+
+    return once
+
+
+def same(one: Trained, other: Trained) -> bool:
+    return one.history == other.history and all(torch.equal(one.weights[k], other.weights[k]) for k in one.weights)
+
+
+@pytest.mark.parametrize("batches", [1, 4, 5, 11, 23])
+def test_a_run_that_was_killed_and_resumed_gives_the_same_bits(tmp_path: Path, batches: int) -> None:
+    whole = run(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "killed", interrupted_after(batches))
+    assert same(run(tmp_path / "killed"), whole)
+
+
+def test_a_finished_run_is_not_trained_again(tmp_path: Path) -> None:
+    whole = run(tmp_path)
+    assert same(run(tmp_path, interrupted_after(0)), whole)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(tmp_path: Path) -> None:
+    first = run(tmp_path / "a")
+    assert same(first, run(tmp_path / "b"))
+    assert not same(first, run(tmp_path / "c", schedule=dataclasses.replace(SCHEDULE, seed=5)))
+
+
+def test_training_leaves_the_random_generator_as_it_was(tmp_path: Path) -> None:
+    before = torch.get_rng_state()
+    run(tmp_path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    whole = run(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "damaged", interrupted_after(9))
+    file = tmp_path / "damaged" / checkpoint.FILE
+    file.write_bytes(file.read_bytes()[:-10])
+    assert same(run(tmp_path / "damaged"), whole)
+    assert "training starts over" in caplog.text
+
+
+def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint.write(tmp_path, {"a": torch.zeros(2)}, {"epoch": 1})
+
+    def dies(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", dies)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint.write(tmp_path, {"a": torch.ones(2)}, {"epoch": 2})
+    found = checkpoint.read(tmp_path)
+    assert found is not None
+    assert found[1] == {"epoch": 1}
+    assert torch.equal(found[0]["a"], torch.zeros(2))
+
+
+def test_training_stops_when_validation_no_longer_improves_and_keeps_the_best(tmp_path: Path) -> None:
+    validation = iter([1.0, 0.5, 0.7, 0.6, 0.8, 0.1])
+    seen: list[dict[str, Tensor]] = []
+
+    def scripted(model: nn.Module, indices: Tensor) -> Tensor:
+        seen.append({name: value.clone() for name, value in model.state_dict().items()})
+        return torch.tensor(next(validation))
+
+    schedule = dataclasses.replace(SCHEDULE, epochs=50, batch=100)
+    found = train(build, Part(32, loss), Part(40, scripted), schedule, tmp_path)
+    assert [line["best"] for line in found.history] == [True, True, False, False, False]
+    assert all(torch.equal(found.weights[name], seen[1][name]) for name in seen[1])
+
+
+def test_the_loss_of_an_epoch_is_the_mean_over_windows_and_not_over_batches(tmp_path: Path) -> None:
+    def by_size(model: nn.Module, indices: Tensor) -> Tensor:
+        return loss(model, indices) * 0 + len(indices)
+
+    schedule = dataclasses.replace(SCHEDULE, epochs=1, batch=20)
+    found = train(build, Part(32, by_size), Part(32, by_size), schedule, tmp_path)
+    assert found.history[0]["val_loss"] == found.history[0]["train_loss"] == (20 * 20 + 12 * 12) / 32
+
+
+def test_gradients_are_clipped(tmp_path: Path) -> None:
+    norms: list[float] = []
+
+    def steep(model: nn.Module, indices: Tensor) -> Tensor:
+        grads = [weight.grad for weight in model.parameters() if weight.grad is not None]
+        norms.extend([float(torch.cat([grad.flatten() for grad in grads]).norm())] if grads else [])
+        return 1e4 * loss(model, indices)
+
+    run(tmp_path, steep)
+    assert norms
+    assert max(norms) <= 1.0 + 1e-4
+
+
+def test_a_loss_that_is_not_finite_ends_training_with_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="Lower the learning rate"):
+        run(tmp_path, lambda model, indices: loss(model, indices) * torch.inf)
+
+
+def test_parts_without_windows_and_schedules_without_steps_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="The validation recordings hold no window"):
+        train(build, Part(3, loss), Part(0, loss), SCHEDULE, tmp_path)
+    with pytest.raises(TacpipeError, match="epochs is 0"):
+        dataclasses.replace(SCHEDULE, epochs=0)
