@@ -48,7 +48,7 @@ def kill() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def killed_at(number: int, run: Callable[[], None]) -> bool:
+def killed_at(number: int, run: Callable[[], object]) -> bool:
     """Run in a forked process that dies at this call; return whether it died rather than finished."""
     child = os.fork()
     if child == 0:

@@ -103,6 +103,7 @@ def environment(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch) -
         "GIT_AUTHOR_EMAIL": "lab@example.org",
         "GIT_COMMITTER_NAME": "lab",
         "GIT_COMMITTER_EMAIL": "lab@example.org",
+        "OMP_NUM_THREADS": "1",
         "DVC_NO_ANALYTICS": "1",
         "DVC_GLOBAL_CONFIG_DIR": str(tmp_path / "dvc-global"),
         "DVC_SYSTEM_CONFIG_DIR": str(tmp_path / "dvc-system"),

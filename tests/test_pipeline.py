@@ -261,7 +261,7 @@ def test_check_says_whether_something_would_change_and_changes_nothing(lab: Lab)
 
 
 def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    import toy_stages
+    import toy_stages  # type: ignore[import-not-found]
 
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")

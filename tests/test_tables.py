@@ -57,7 +57,7 @@ def test_duckdb_pandas_and_pyarrow_open_a_shard_as_it_is(tmp_path: Path) -> None
     table = pa.table({"t_ns": pa.array([1, 2, 3]), "taxel01_x": pa.array([7, 7, 8], pa.uint16())})
     path = tmp_path / "shard.parquet"
     path.write_bytes(to_parquet(table))
-    assert duckdb.sql(f"select sum(taxel01_x) from '{path}'").fetchall() == [(22,)]
+    assert duckdb.execute(f"select sum(taxel01_x) from '{path}'").fetchall() == [(22,)]
     assert pd.read_parquet(path)["taxel01_x"].dtype == np.uint16
     assert pq.read_table(path).equals(table)
 

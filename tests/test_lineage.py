@@ -1,0 +1,60 @@
+import json
+from pathlib import Path
+
+from tests.conftest import Lab
+
+
+def explained(lab: Lab, path: str) -> dict[str, object]:
+    value: dict[str, object] = json.loads(lab.run(f"explain {path} --json").out)
+    return value
+
+
+def test_the_lineage_goes_down_to_the_raw_files(lab: Lab) -> None:
+    from tacpipe.hashing import file_digest
+
+    Path("src").mkdir()
+    Path("src/a.txt").write_text("1 2 3")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("scale data/r -o data/s --factor 4")
+    lab.run("total data/s -o data/t")
+    tree = json.loads(lab.run("explain data/t --json").out)
+    synced = tree["inputs"]["datasets"][0]
+    recordings = synced["inputs"]["datasets"][0]
+    assert (tree["stage"], synced["stage"], recordings["stage"]) == ("total", "scale", "ingest.numbers")
+    assert synced["params"]["factor"] == 4 and synced["path"].endswith("data/s")
+    assert recordings["sources"] == {"a": {"a.txt": file_digest("src/a.txt")}}
+    printed = lab.run("explain data/t").out
+    assert "factor=4" in printed and "1 raw files of 1 recordings" in printed and "numpy" in printed
+
+
+def test_the_part_of_the_key_that_changed_is_named(lab: Lab) -> None:
+    Path("src").mkdir()
+    Path("src/a.txt").write_text("1 2 3")
+    Path("src/b.txt").write_text("1 2 3")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("scale data/r -o data/s")
+    assert explained(lab, "data/s")["changes"] is None
+    lab.run("scale data/r -o data/s --factor 3")
+    assert explained(lab, "data/s")["changes"] == ["params.factor: 2 became 3"]
+    Path("src/a.txt").write_text("9")
+    Path("src/c.txt").write_text("7")
+    lab.run("ingest numbers src -o data/r")
+    assert explained(lab, "data/r")["changes"] == ["sources: 1 new (c)", "sources: 1 other (a)"]
+    lab.run("scale data/r -o data/s --factor 3")
+    assert explained(lab, "data/s")["changes"] == [
+        "inputs.datasets.shards: 1 new (c)",
+        "inputs.datasets.shards: 1 other (a)",
+    ]
+    lab.run("label data/r b --set material=foam")
+    assert explained(lab, "data/r")["changes"] == ["labels: 1 new (b)"]
+    lab.run("scale data/r -o data/s --factor 3")
+    assert explained(lab, "data/s")["changes"] == ["inputs.datasets.attributes: 1 other (b)"]
+
+
+def test_a_dataset_that_came_without_its_ancestors_is_explained_as_far_as_it_goes(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    for path in lab.store.root.glob("objects/*/*"):
+        if path.read_bytes()[:1] == b"{" and b'"simulate.toy"' in path.read_bytes():
+            path.unlink()
+    assert "not in this store" in lab.run("explain data/s").out
