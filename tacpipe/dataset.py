@@ -95,7 +95,7 @@ class Dataset:
         return self.source.digest
 
     def table(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return all recordings in one arrow table, after a first column ``recording``.
+        """Return all recordings in one arrow table, after a first column ``recording`` (but where it has one already).
 
         ``stream`` may be left out where the recordings have one table each.
         """
@@ -104,7 +104,10 @@ class Dataset:
         name = self._only_stream() if stream is None else stream
         tables = []
         for shard in self.shards.values():
-            table = shard.table(name, columns).replace_schema_metadata(None)
+            table = shard.table(name, columns)
+            if "recording" in table.column_names:  # of a split: the table says itself which recording a row is of
+                tables.append(table)
+                continue
             names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([shard.name]))
             tables.append(table.add_column(0, "recording", names))
         if not tables:

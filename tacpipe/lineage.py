@@ -142,19 +142,25 @@ def to_text(tree: dict[str, Any]) -> str:
     made = tree["provenance"]
     if made:
         libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
-        lines.append(f"Made on {made['host']} at commit {str(made['git_commit'])[:10]} with {libraries}.")
-    return "\n".join([*lines, "", *_lines(tree, 0)])
+        commit = f" at commit {made['git_commit'][:10]}" if made["git_commit"] else ""
+        lines.append(f"Made on {made['host']}{commit} with {libraries}.")
+    return "\n".join([*lines, "", *_lines(tree, 0, set())])
 
 
-def _lines(node: dict[str, Any], depth: int, argument: str = "") -> list[str]:
+def _lines(node: dict[str, Any], depth: int, told: set[str], argument: str = "") -> list[str]:
+    """Return the lines of a node and what it descends from; one that was ``told`` already is only named."""
     pad = "  " * depth
     label = f"{argument}: " if argument else ""
     if "lost" in node:
         return [f"{pad}{label}dataset {node['digest'][:12]}, whose manifest is not in this store"]
+    place = f"{pad}{label}{node['path'] or '(no longer at a path)'}  [{node['digest'][:12]}]"
+    if node["manifest"] in told:
+        return [f"{place}  as above"]
+    told.add(node["manifest"])
     what = f"{node['recordings']} recordings, {node['rows']} rows" if node["recordings"] else ", ".join(node["files"])
     params = ", ".join(f"{name}={value}" for name, value in node["params"].items())
     lines = [
-        f"{pad}{label}{node['path'] or '(no longer at a path)'}  [{node['digest'][:12]}]  {what}",
+        f"{place}  {what}",
         f"{pad}  {node['stage']} version {node['version']}" + (f" ({params})" if params else ""),
     ]
     if node["sources"]:
@@ -170,5 +176,5 @@ def _lines(node: dict[str, Any], depth: int, argument: str = "") -> list[str]:
         lines.append(f"{pad}  left out: {_few(sorted(node['skipped']))}")
     for name, several in node["inputs"].items():
         for given in several:
-            lines += _lines(given, depth + 1, name)
+            lines += _lines(given, depth + 1, told, name)
     return lines

@@ -1,0 +1,75 @@
+"""The values that each deterministic stage gives on simulated recordings, as digests: `python -m tests.golden_values`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+FILE = Path(__file__).parent / "golden" / "digests.json"
+DIGITS = {"double": 6, "float": 4}  # of a column's largest value: another machine may differ beyond
+COMMANDS = {
+    "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
+    "synchronize": "synchronize simulate.forward -o {0}",
+    "segment.contacts": "segment contacts synchronize -o {0}",
+    "split": "split segment.contacts --scheme random --val 0.34 --test 0.34 -o {0}",
+    "compress.pca": "compress pca segment.contacts --split split --components 4 -o {0}",
+}
+
+
+def values_digest(path: Path) -> str:
+    """Return the digest of a dataset's values: floats rounded, encodings and library versions left out."""
+    import numpy as np
+
+    import tacpipe
+    from tacpipe.hashing import bytes_digest, digest
+
+    found: dict[str, Any] = {}
+    for name, shard in tacpipe.open(path).shards.items():
+        for stream in shard.streams:
+            table = shard.table(stream)
+            for field, column in zip(table.schema, table.columns, strict=True):
+                if str(field.type) in DIGITS:
+                    values = column.to_numpy().astype(np.float64)
+                    largest = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+                    content = (np.nan_to_num(values / largest, nan=9.0).round(DIGITS[str(field.type)]) + 0.0).tobytes()
+                else:
+                    content = json.dumps(column.to_pylist()).encode()
+                found[f"{name}/{stream}/{field.name}"] = bytes_digest(content)
+    return digest(found)
+
+
+def current() -> dict[str, dict[str, Any]]:
+    """Return version and digest of each stage as the code stands."""
+    from tacpipe import registry
+    from tests.conftest import tacpipe
+
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / ".tacpipe").mkdir()
+        found = {}
+        for name, command in COMMANDS.items():
+            done = tacpipe(Path(folder), command.format(name))
+            assert done.returncode == 0, done.stderr
+            stage = registry.load(name)
+            version = [stage.version] + ([stage.fit.version] if stage.fit else [])
+            found[name] = {"version": version, "digest": values_digest(Path(folder) / name)}
+    return found
+
+
+def bless() -> None:
+    """Write the digests; refuse one that changed under an unchanged version."""
+    known = json.loads(FILE.read_text()) if FILE.exists() else {}
+    now = current()
+    for name, value in now.items():
+        before = known.get(name)
+        if before and before["version"] == value["version"] and before["digest"] != value["digest"]:
+            sys.exit(f"{name} gives other values under the same version {value['version']}: raise its version first.")
+    FILE.write_text(json.dumps(now, indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    os.environ.pop("TACPIPE_STORE", None)
+    bless()
