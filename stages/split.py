@@ -9,6 +9,7 @@ from tacpipe.stage import Recording, Result, stage
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
+    from tacpipe.stage import Roles
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,17 @@ class Params:
 
 
 @stage(version=1)
-def split(params: Params, recordings: Dataset) -> Result:
-    """Return one table, ``split``, with a row a recording and fold: recording, fold, role."""
+def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
+    """Return one table, ``split``, with a row a recording and fold: recording, fold, role.
+
+    Recordings that have a role in the older split ``extend`` keep it.
+    """
     import pyarrow as pa
 
     from tacpipe.splits import Scheme, assign
 
     scheme = Scheme(params.scheme, params.val, params.test, params.seed, params.folds, params.by, params.stratify)
-    roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme)
+    roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme, extend or {})
     table = pa.table(
         {
             "recording": pa.array([name for name, _ in roles], pa.string()),

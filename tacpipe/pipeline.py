@@ -33,6 +33,7 @@ class Outcome:
     seconds: float = 0.0
     bad: dict[str, str] = field(default_factory=dict)
     differs: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def open_dataset(path: Path | str) -> Dataset:
@@ -50,6 +51,7 @@ def run(request: Request) -> Outcome:
     hit = None if request.compare else _answer(store, outcome.key)
     if hit is None:
         made = _Run(request, store, inputs, outcome).make()
+        outcome.notes = sorted(set(inputs.notes))
     else:
         made, outcome.reused = hit, len(hit.recordings) or 1
     made = _keep_labels(request, made)
@@ -249,7 +251,8 @@ class _Run:
         return results
 
     def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
-        self.outcome.bad.update({recording: bad[recording].error for recording in sorted(bad)})
+        source = f"{self.request.source}/"  # where the files lay is no part of a manifest
+        self.outcome.bad.update({name: bad[name].error.replace(source, "") for name in sorted(bad)})
         damaged_only = all(done.exit_code == TacpipeError.exit_code for done in bad.values())
         if not bad or (self.request.skip_bad and damaged_only):
             return

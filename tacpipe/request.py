@@ -73,6 +73,7 @@ class Inputs:
             for name in ("model", "split", "codec", "extend")
             if (path := getattr(request, name)) is not None
         }
+        self.notes: list[str] = []  # what the user should know though nothing failed
         self.sources = _discover(self.stage, request)
         self.source_digests = _hash(self.sources)
 
@@ -142,6 +143,10 @@ class Inputs:
     def in_role(self, given: Manifest, role: str) -> dict[str, Entry]:
         """Return the recordings of ``given`` that have this role."""
         chosen = {name: entry for name, entry in given.included.items() if self.roles.get(name) == role}
+        unknown = sorted(set(given.included) - set(self.roles))
+        if unknown:
+            note = f"{len(unknown)} recordings have no role in the split and are left out, as {unknown[0]}"
+            self.notes.append(f"{note}: give them one with `tacpipe split --extend`.")
         if not chosen:
             raise UsageError(
                 f"No recording of the dataset has the role {role} in fold {self.request.fold} of the split. "

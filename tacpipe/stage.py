@@ -83,7 +83,7 @@ class Stage:
         """The stage's arguments after ``params``, and the kind of each."""
         found = {}
         for name, parameter in list(inspect.signature(self.function).parameters.items())[1:]:
-            kind = str(parameter.annotation).strip("'\"")
+            kind = str(parameter.annotation).strip("'\"").removesuffix(" | None")
             if kind not in _KINDS:
                 raise TacpipeError(
                     f"Stage {self.function.__name__} annotates {name} as {kind}; known are {', '.join(_KINDS)}."

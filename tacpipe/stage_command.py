@@ -93,6 +93,8 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
 
 
 def _report(outcome: pipeline.Outcome, *, as_json: bool) -> None:
+    for note in outcome.notes:
+        print(f"tacpipe: {note}", file=sys.stderr)
     for name, why in outcome.bad.items():
         print(f"tacpipe: left out {name}: {why}", file=sys.stderr)
     if not os.environ.get("TACPIPE_QUIET"):

@@ -96,6 +96,21 @@ def test_an_empty_clone_pulls_a_model_and_its_data_and_evaluates(lab: Path, tmp_
     assert upkeep.verify(Store(clone / ".tacpipe")).clean
 
 
+def test_a_new_recording_gets_a_role_and_the_others_keep_theirs(lab: Path) -> None:
+    more = "simulate forward -o data/more --trials 9 --duration-s 5"
+    for words in (more, "synchronize data/more -o data/more-s", "segment contacts data/more-s -o data/more-c"):
+        assert command(lab, words).returncode == 0
+    words = "compress pca data/more-c --split data/split -o data/more-z --components 6"
+    assert "1 recordings have no role" in command(lab, words).stderr
+    words = "split data/more-c -o data/more-split --extend data/split --seed 3 --val 0.25 --test 0.25"
+    done = command(lab, words)
+    assert done.returncode == 0, done.stderr
+    old, new = (tacpipe.open(lab / path).to_pandas() for path in ("data/split", "data/more-split"))
+    assert len(new) == 9 and set(zip(old["recording"], old["role"], strict=True)) < set(
+        zip(new["recording"], new["role"], strict=True)
+    )
+
+
 def test_duckdb_reads_the_shards_that_lie_beside_the_manifest(lab: Path) -> None:
     import duckdb
 
