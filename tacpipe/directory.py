@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.files import write_whole
 from tacpipe.hashing import bytes_digest, digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import Store
@@ -32,7 +33,7 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) ->
     if current and not stale:
         store.set_root(directory, bytes_digest(manifest.content))
         return
-    with store.lease(digest(["output", str(directory)])):
+    with store.leases.hold(digest(["output", str(directory)])):
         store.set_root(directory, bytes_digest(manifest.content))
         for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
             draft.unlink()  # of a process that was killed
@@ -40,7 +41,7 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) ->
             place(store, wanted[path], directory / path, copy=copy)
         _remove(directory, _named(directory) - set(wanted))
         if not current:
-            _write(directory / NAME, manifest.content)
+            write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
 
 
 def _remove(directory: Path, paths: set[str]) -> None:
@@ -121,17 +122,3 @@ def _named(directory: Path) -> set[str]:
         return {path for path, _ in parse((directory / NAME).read_bytes(), str(directory)).objects()}
     except (FileNotFoundError, TacpipeError):
         return set()
-
-
-def _write(path: Path, content: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}{_DRAFT}")
-    try:
-        with open(draft, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            draft.unlink()

@@ -57,7 +57,7 @@ def compute(task: Task) -> Done:
     try:
         if task.dry:
             return Done(task.recording, {"result": execute(task, store, _Scratch())})
-        with store.lease(key):
+        with store.leases.hold(key):
             record = store.record(key)
             if record is not None and complete(store, record):
                 return Done(task.recording, record, made=False)

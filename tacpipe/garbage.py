@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from tacpipe import manifest as manifest_of
-from tacpipe.errors import LockedError, TacpipeError
+from tacpipe.errors import TacpipeError
 from tacpipe.execution import named
+from tacpipe.files import read_json
 from tacpipe.hashing import bytes_digest
-from tacpipe.store import Store, _read_json, _try_lock
+from tacpipe.store import Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
@@ -54,7 +54,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS) -> tuple[set[str], set[st
         if here is None and not _expired(store, root, grace_days):
             wanted.append(root["manifest"])
     begun_s = time.time()
-    for note, started_s in store.runs():
+    for note, started_s in store.leases.runs():
         wanted += note["manifests"]
         begun_s = min(begun_s, started_s)
     objects, manifests = _closure(store, wanted, contents)
@@ -66,21 +66,8 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
     Raises `LockedError` if another collection runs.
     """
-    with _alone(store) if not dry_run else contextlib.nullcontext():
+    with store.leases.alone("gc") if not dry_run else contextlib.nullcontext():
         return _collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
-
-
-@contextlib.contextmanager
-def _alone(store: Store) -> Iterator[None]:
-    path = store.root / "leases" / "gc.lock"
-    handle = _try_lock(path)
-    if handle is None:
-        raise LockedError("Another `tacpipe store gc` is at work on this store. Wait for it.")
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        os.close(handle)
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
@@ -148,7 +135,7 @@ def _expired(store: Store, root: dict[str, Any], grace_days: float) -> bool:
         with contextlib.suppress(TacpipeError):
             store.write_file(file, json.dumps({**root, "missing_since_s": int(time.time())}, sort_keys=True).encode())
         return grace_days <= 0
-    since_s = float((_read_json(file) or root)["missing_since_s"])
+    since_s = float((read_json(file) or root)["missing_since_s"])
     return time.time() - since_s > grace_days * 86400 or grace_days <= 0
 
 

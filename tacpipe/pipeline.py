@@ -93,7 +93,7 @@ class _Run:
         self.store.prepare()
         if not self.request.single_file:
             directory.check_output(self.store, self.request.output)
-        with self.store.running([found.digest for found in self.inputs.used]):
+        with self.store.leases.running([found.digest for found in self.inputs.used]):
             for found in self.inputs.used:
                 found.manifest  # noqa: B018  (a manifest edited by hand is refused before anything is written)
                 self.store.put(found.content)  # explain and gc follow a dataset to the manifests it descends from

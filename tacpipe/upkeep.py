@@ -104,7 +104,7 @@ def status(store: Store) -> dict[str, Any]:
         files = [path for path in (store.root / name).rglob("*") if path.is_file()]
         folders[name] = {"files": len(files), "bytes": sum(path.stat().st_size for path in files)}
     roots = [{**root, "reachable": Path(root["path"]).exists()} for root in store.roots()]
-    return {"store": str(store.root), **folders, "roots": roots, "running": [note for note, _ in store.runs()]}
+    return {"store": str(store.root), **folders, "roots": roots, "running": [note for note, _ in store.leases.runs()]}
 
 
 def status_text(value: dict[str, Any]) -> str:

@@ -60,7 +60,7 @@ def test_young_objects_and_those_of_a_running_process_are_kept(lab: Lab) -> None
     age(lab)
     from tacpipe.hashing import bytes_digest
 
-    with lab.store.running([bytes_digest(manifest.content)]):
+    with lab.store.leases.running([bytes_digest(manifest.content)]):
         collected(lab)
     assert all(lab.store.has(name) for _, name in manifest.objects())
 
@@ -130,6 +130,6 @@ def test_whatever_happens_in_whatever_order_no_dataset_at_a_path_loses_anything(
 def test_two_collections_do_not_run_at_once(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tacpipe.garbage._try_lock", lambda path: None)
+        patch.setattr("tacpipe.leases._try_lock", lambda path: None)
         failed = lab.call("store gc")
     assert failed.code == 6

@@ -85,13 +85,13 @@ def test_a_record_that_was_tampered_with_counts_as_none_and_is_quarantined(store
 
 def test_a_lease_is_held_by_one_and_its_wait_times_out_with_its_own_exit_code(store: Store) -> None:
     with (
-        store.lease("ab" * 32),
+        store.leases.hold("ab" * 32),
         pytest.raises(LockedError, match="TACPIPE_LOCK_TIMEOUT_S") as caught,
-        store.lease("ab" * 32, timeout_s=0.05),
+        store.leases.hold("ab" * 32, timeout_s=0.05),
     ):
         pass
     assert caught.value.exit_code == 6
-    with store.lease("ab" * 32, timeout_s=0):
+    with store.leases.hold("ab" * 32, timeout_s=0):
         pass
     assert list((store.root / "leases").iterdir()) == []
 
@@ -102,7 +102,7 @@ def test_leases_let_one_at_a_time_through(store: Store) -> None:
     def work() -> None:
         nonlocal inside, most
         for _ in range(20):
-            with store.lease("cd" * 32):
+            with store.leases.hold("cd" * 32):
                 inside += 1
                 most = max(most, inside)
                 inside -= 1
@@ -118,24 +118,24 @@ def test_leases_let_one_at_a_time_through(store: Store) -> None:
 def test_a_process_that_died_holds_no_lease(store: Store) -> None:
     child = os.fork()
     if child == 0:
-        with store.lease("ef" * 32):
+        with store.leases.hold("ef" * 32):
             os._exit(9)
     os.waitpid(child, 0)
-    with store.lease("ef" * 32, timeout_s=0):
+    with store.leases.hold("ef" * 32, timeout_s=0):
         pass
 
 
 def test_runs_are_seen_while_they_last(store: Store) -> None:
     child = os.fork()
     if child == 0:
-        with store.running(["dead"]):
+        with store.leases.running(["dead"]):
             os._exit(9)
     os.waitpid(child, 0)
-    assert list(store.runs()) == []
-    with store.running(["m"]):
+    assert list(store.leases.runs()) == []
+    with store.leases.running(["m"]):
         handle = Store(store.root)
-        assert [note["manifests"] for note, _ in handle.runs()] == [["m"]]
-    assert list(store.runs()) == []
+        assert [note["manifests"] for note, _ in handle.leases.runs()] == [["m"]]
+    assert list(store.leases.runs()) == []
 
 
 def test_a_root_remembers_what_was_at_its_path_before(store: Store, tmp_path: Path) -> None:

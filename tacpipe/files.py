@@ -1,0 +1,93 @@
+"""Files that are there whole or not at all: draft, fsync, rename; and what the file system says, as sentences."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import TacpipeError
+
+
+def write_whole(path: str, content: bytes, draft: str, *, mode: int = 0o644, exclusive: bool = False) -> bool:
+    """Write ``content`` to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost the race.
+
+    Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made.
+    """
+    try:
+        _write_synced(draft, content, mode)
+        try:
+            return _move(draft, path, exclusive)
+        except FileNotFoundError:
+            os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+            return _move(draft, path, exclusive)
+    finally:
+        with contextlib.suppress(OSError):  # a draft that stays is swept up later
+            os.unlink(draft)  # noqa: PTH108
+
+
+def sync_folder(path: str) -> None:
+    """Make sure that the names in a folder outlast a loss of power."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """Return the mapping that a file holds; None if it is not there or holds none."""
+    try:
+        value = json.loads(path.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+@contextlib.contextmanager
+def readable_errors(root: Path) -> Iterator[None]:
+    """Turn what the file system says into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise TacpipeError(
+                f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
+                f"shows what the store could give back) and run the same command again."
+            ) from error
+        if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            raise TacpipeError(
+                f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
+                f"TACPIPE_STORE."
+            ) from error
+        raise
+
+
+def _write_synced(path: str, content: bytes, mode: int) -> None:
+    try:
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    except FileNotFoundError:
+        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    try:
+        view = memoryview(content)
+        while view:
+            view = view[os.write(handle, view) :]
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _move(draft: str, path: str, exclusive: bool) -> bool:
+    if not exclusive:
+        os.replace(draft, path)  # noqa: PTH105
+        return True
+    try:
+        os.link(draft, path)
+    except FileExistsError:
+        return False
+    return True
