@@ -18,7 +18,7 @@ class Params:
     robot_rate_hz: float = 1000.0  # states a second of the arm
     hold_probability: float = 0.07  # share of tactile frames that repeat the one before; 0.75 is like the 2021 rig
     drop_probability: float = 0.002  # share of samples that are lost
-    noise_count: float = 3.0  # device counts, standard deviation of a tactile channel
+    noise_scale: float = 1.0  # times the noise of a real uSkin at rest (1.35, 1.15, 3.4 counts in x, y, z)
     tactile_jitter_ms: float = 2.0  # milliseconds, standard deviation of a tactile frame's stamp
     robot_jitter_ms: float = 0.5  # milliseconds, standard deviation of an arm state's stamp
     clock_offset_ms: float = 0.0  # milliseconds, largest offset of a tactile clock; nothing downstream undoes it

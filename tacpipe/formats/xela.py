@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,59 +12,16 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import channels
-from tacpipe.stage import ROLES, Attribute, Files
+from tacpipe.stage import ROLES, Attribute
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 T = TypeVar("T")
-PREFIX = "data_sample_"
 SENSORS = {"xela1": "xela_sensor1.csv", "xela2": "xela_sensor2.csv"}
 META = "meta_data.csv"
 UNSEEN = 10.0  # in all seven columns of a marker that the camera did not see; found in the recordings
 UNIT_TOLERANCE = 1e-3  # by how much a quaternion's length may differ from 1; the recordings stay below 1e-6
-
-
-def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
-    """Return the trials below ``source``: recording name to file name to path, with only the files that are there.
-
-    A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
-    recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
-    Raises `TacpipeError` if ``source`` is no folder or holds no trial.
-    """
-    if not source.is_dir():
-        raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
-    folders = sorted(
-        folder
-        for folder in [source, *(path for path in source.rglob("*") if path.is_dir())]
-        if folder.name.startswith(PREFIX) or any((folder / name).is_file() for name in names)
-    )
-    folders = [folder for folder in folders if not any(other.parent == folder for other in folders)]
-    if not folders:
-        raise TacpipeError(
-            f"{source} holds no trial: no folder in it has {', '.join(names[:3])} or the like. "
-            f"Give the folder of the unpacked data set."
-        )
-    by_name: dict[str, list[Path]] = {}
-    for folder in folders:
-        by_name.setdefault(_valid(folder.name), []).append(folder)
-    found: dict[str, dict[str, Path]] = {}
-    for name, same in by_name.items():
-        for folder in same:
-            unique = name if len(same) == 1 else _valid("-".join([*folder.relative_to(source).parts[:-1], name]))
-            found[unique] = {file: folder / file for file in names if (folder / file).is_file()}
-    return dict(sorted(found.items()))
-
-
-def require(files: Files, names: Sequence[str]) -> str:
-    """Return the name of the trial's folder. Raises `TacpipeError` if it lacks one of the files ``names``."""
-    folder = next((path.parent for path in files.values()), None)
-    missing = [name for name in names if name not in files]
-    if missing:
-        place = str(folder) if folder else "A trial folder"
-        raise TacpipeError(f"{place} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
-    assert folder is not None
-    return folder.name
 
 
 def read_uskin(path: Path) -> list[NDArray[np.uint16]]:
@@ -187,9 +143,3 @@ def authors_role(role: str) -> dict[str, Attribute]:
     if role and role not in ROLES:
         raise TacpipeError(f"authors_role is {role!r}; it must be {', '.join(ROLES)}, or empty where there is none.")
     return {"authors_role": role} if role else {}
-
-
-def _valid(name: str) -> str:
-    """Return a folder's name as that of a recording: letters, digits, dots, dashes and underscores."""
-    short = name.removeprefix(PREFIX) or name
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", short).strip("-.") or "trial"

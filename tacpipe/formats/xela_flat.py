@@ -29,9 +29,9 @@ class Params:
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each trial below ``source`` by recording name. Raises `TacpipeError` if there is no trial."""
-    from tacpipe.formats import xela
+    from tacpipe.formats.folders import trials
 
-    return xela.trials(source, NAMES)
+    return trials(source, NAMES)
 
 
 @stage(version=1, discover=discover)
@@ -39,10 +39,10 @@ def xela_flat(params: Params, files: Files) -> Recording:
     """Return the streams xela1, xela2, robot, marker1 and marker2 of a trial; an unseen marker is NaN."""
     import numpy as np
 
-    from tacpipe.formats import channels, xela
+    from tacpipe.formats import channels, folders, xela
     from tacpipe.signals.resampling import uniform_grid
 
-    trial = xela.require(files, NAMES)
+    trial = folders.require(files, NAMES)
     meta = xela.Meta(files[xela.META])
     rate_hz = meta.number("frequency_hz")
     tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}

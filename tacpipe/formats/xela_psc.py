@@ -31,9 +31,9 @@ class Params:
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each trial below ``source`` by recording name. Raises `TacpipeError` if there is no trial."""
-    from tacpipe.formats import xela
+    from tacpipe.formats.folders import trials
 
-    return xela.trials(source, NAMES)
+    return trials(source, NAMES)
 
 
 @stage(version=1, discover=discover)
@@ -42,11 +42,11 @@ def xela_psc(params: Params, files: Files) -> Recording:
     import numpy as np
     import pyarrow as pa
 
-    from tacpipe.formats import channels, xela
+    from tacpipe.formats import channels, folders, xela
     from tacpipe.formats.csv_table import read_csv
     from tacpipe.signals.holds import mean_rate_hz
 
-    trial = xela.require(files, NAMES)
+    trial = folders.require(files, NAMES)
     meta = xela.Meta(files[xela.META])
     tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}
     joints = [f"joint{n}" for n in range(1, 8)]

@@ -47,6 +47,7 @@ GAIN_COUNT_N = (1500.0, 1500.0, 3000.0)  # x, y, z
 BULGE = 0.15  # of a taxel's pressure that pushes it outwards, for each taxel that it is off the centre
 BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)
 BASE_SPREAD_COUNT = 300.0
+NOISE_COUNT = (1.35, 1.15, 3.4)  # x, y, z; standard deviation of second differences / sqrt(6), quiet xela-psc frames
 OFF_AXIS = 0.05  # of a force that shows on the other axes
 
 
@@ -59,7 +60,7 @@ class Rig:
     robot_rate_hz: float = 1000.0
     hold_probability: float = 0.07
     drop_probability: float = 0.002
-    noise_count: float = 3.0
+    noise_scale: float = 1.0
     tactile_jitter_ms: float = 2.0
     robot_jitter_ms: float = 0.5
     clock_offset_ms: float = 0.0
@@ -112,7 +113,7 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
     for finger, stream in enumerate(("xela1", "xela2")):
         clock = _clock(rig, rig.tactile_jitter_ms, rig.clock_offset_ms, rng)
         true_ns = faults.sample_times(int(motion.t_ns[-1]), rig.tactile_rate_hz, rig.drop_probability, rng)
-        counts = tactile(motion, finger, true_ns, rig.noise_count, rng)
+        counts = tactile(motion, finger, true_ns, rig.noise_scale, rng)
         counts, _ = faults.hold(counts, rig.hold_probability, rng)
         t_ns = start_ns + faults.stamps(true_ns, clock, rng)
         streams[stream] = channels.stream(t_ns, counts.T, channels.uskin_fields())
@@ -158,7 +159,7 @@ def move(duration_s: float, rng: np.random.Generator) -> Motion:
 
 
 def tactile(
-    motion: Motion, finger: int, true_ns: NDArray[np.int64], noise_count: float, rng: np.random.Generator
+    motion: Motion, finger: int, true_ns: NDArray[np.int64], noise_scale: float, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
     """Return the counts of finger 0 or 1 at the times ``true_ns`` (time, channel), taxel by taxel, axes x, y, z.
 
@@ -188,7 +189,7 @@ def tactile(
     base = np.array(BASE_COUNT) + rng.uniform(-BASE_SPREAD_COUNT, BASE_SPREAD_COUNT, (channels.TAXELS, 3))
     steps_s = np.diff(at_s, prepend=at_s[:1])
     drift = np.cumsum(rng.normal(0, DRIFT_COUNT, signal.shape) * np.sqrt(steps_s)[:, None, None], axis=0)
-    noise = rng.normal(0, noise_count, signal.shape) if noise_count > 0 else 0.0
+    noise = rng.normal(0, 1.0, signal.shape) * NOISE_COUNT * noise_scale
     level = np.rint(base + signal + drift + noise).clip(0, 65_535)
     counts: NDArray[np.uint16] = level.reshape(len(true_ns), -1).astype(np.uint16)
     return counts

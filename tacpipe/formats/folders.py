@@ -1,0 +1,62 @@
+"""Trials as folders: finding them, naming their recordings, and what a folder must hold. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Files
+
+PREFIX = "data_sample_"
+
+
+def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
+    """Return the trials below ``source``: recording name to file name to path, with only the files that are there.
+
+    A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
+    recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
+    Raises `TacpipeError` if ``source`` is no folder or holds no trial.
+    """
+    if not source.is_dir():
+        raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
+    wanted = set(names)
+    holds: dict[Path, set[str]] = {}  # which of the wanted files each trial has
+    for place, _, files in os.walk(source):
+        there = wanted.intersection(files)
+        if there or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
+            holds[Path(place)] = there
+    folders = sorted(holds.keys() - {folder.parent for folder in holds})
+    if not folders:
+        raise TacpipeError(
+            f"{source} holds no trial: no folder in it has {', '.join(names[:3])} or the like. "
+            f"Give the folder of the unpacked data set."
+        )
+    by_name: dict[str, list[Path]] = {}
+    for folder in folders:
+        by_name.setdefault(_valid(folder.name), []).append(folder)
+    found: dict[str, dict[str, Path]] = {}
+    for name, same in by_name.items():
+        for folder in same:
+            unique = name if len(same) == 1 else _valid("-".join([*folder.relative_to(source).parts[:-1], name]))
+            found[unique] = {file: folder / file for file in names if file in holds[folder]}
+    return dict(sorted(found.items()))
+
+
+def require(files: Files, names: Sequence[str]) -> str:
+    """Return the name of the trial's folder. Raises `TacpipeError` if it lacks one of the files ``names``."""
+    folder = next((path.parent for path in files.values()), None)
+    missing = [name for name in names if name not in files]
+    if missing:
+        place = str(folder) if folder else "A trial folder"
+        raise TacpipeError(f"{place} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
+    assert folder is not None
+    return folder.name
+
+
+def _valid(name: str) -> str:
+    """Return a folder's name as that of a recording: letters, digits, dots, dashes and underscores."""
+    short = name.removeprefix(PREFIX) or name
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", short).strip("-.") or "trial"
