@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import platform
 import shutil
 import sys
@@ -18,6 +17,7 @@ from tacpipe import params as params_of
 from tacpipe import registry
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.executors import usable_cores
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import Manifest, shard_path
 from tacpipe.stage import Recording, Result, Stage
@@ -285,7 +285,7 @@ def _provenance() -> dict[str, Any]:
         "git_commit": commit or None,
         "host": platform.node(),
         "python": sys.version.split()[0],
-        "threads": len(os.sched_getaffinity(0)),
+        "threads": usable_cores(),
     }
 
 

@@ -19,7 +19,14 @@ _CHUNKS_A_JOB = 8  # how often a worker comes back for more: progress against ov
 
 def jobs_wanted(jobs: int) -> int:
     """Return the number of processes to use: ``jobs``, or one a usable core for 0."""
-    return jobs if jobs > 0 else len(os.sched_getaffinity(0))
+    return jobs if jobs > 0 else usable_cores()
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1  # macOS
 
 
 def run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:

@@ -92,7 +92,7 @@ class Project:
 def environment(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """An environment in which neither git nor DVC knows who runs them."""
     monkeypatch.delenv("TACPIPE_STORE", raising=False)
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_"))}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_", "TACPIPE_"))}
     return {
         **kept,
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),

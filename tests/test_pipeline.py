@@ -314,10 +314,3 @@ def test_a_pool_of_processes_gives_the_same_as_one(lab: Lab) -> None:
         path.unlink()
     assert counts(lab.run("scale data/r -o data/b --jobs 1 --json").out) == (20, 0)
     assert Path("data/b/manifest.json").read_bytes() == pooled
-
-
-def test_one_of_a_thousand_recordings_changed_costs_one_shard(lab: Lab) -> None:
-    lab.run("simulate toy -o data/r --trials 1000 --rows 3")
-    lab.run("scale data/r -o data/s")
-    replace_stream(lab, "data/r", "trial-500", "left", pa.table({"x": pa.array([4], pa.uint16())}))
-    assert counts(lab.run("scale data/r -o data/s --json").out) == (1, 999)
