@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.files import write_whole
-from tacpipe.hashing import bytes_digest, digest
+from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import Store
 
@@ -27,9 +27,7 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) ->
     check_output(store, directory)
     wanted = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    stale = [
-        path for path, name in wanted.items() if not (current and _matches(directory / path, store.object_path(name)))
-    ]
+    stale = [path for path, name in wanted.items() if not (current and _matches(directory / path, store, name))]
     if current and not stale:
         store.set_root(directory, bytes_digest(manifest.content))
         return
@@ -100,13 +98,14 @@ def _link(source: str, target: Path) -> bool:
     return False
 
 
-def _matches(path: Path, source: str) -> bool:
-    """Return whether ``path`` still looks like the object it was made from: the same inode, or the same size."""
+def _matches(path: Path, store: Store, name: str) -> bool:
+    """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
     try:
-        there, stored = os.stat(path), os.stat(source)  # noqa: PTH116  (twice a shard on every hit)
+        there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
+        stored = os.stat(store.object_path(name))  # noqa: PTH116
     except FileNotFoundError:
         return False
-    return there.st_ino == stored.st_ino or there.st_size == stored.st_size
+    return there.st_ino == stored.st_ino or (there.st_size == stored.st_size and file_digest(path) == name)
 
 
 def _current(directory: Path, content: bytes) -> bool:

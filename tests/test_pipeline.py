@@ -221,6 +221,18 @@ def test_files_beside_the_manifest_are_never_trusted(lab: Lab) -> None:
     assert file_digest(stale) == lab.manifest("data/s").recordings["trial-000"]["shards"][""]["digest"]
 
 
+def test_a_rerun_links_anew_what_does_not_match_though_it_has_the_same_size(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r --trials 1 --rows 2")
+    lab.run("scale data/r -o data/s --factor 1")
+    for path in (Path("data/s/trial-000.parquet"), Path("data/r/trial-000/left.parquet")):
+        wanted = path.read_bytes()
+        path.unlink()
+        path.write_bytes(wanted[:-9] + b"?" + wanted[-8:])
+        lab.run("simulate toy -o data/r --trials 1 --rows 2")
+        lab.run("scale data/r -o data/s --factor 1")
+        assert path.read_bytes() == wanted
+
+
 def test_a_dataset_copied_without_its_store_opens_and_is_adopted(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.run("simulate toy -o data/r --trials 2")
     monkeypatch.setenv("TACPIPE_STORE", str(lab.folder / "other"))
