@@ -1,0 +1,81 @@
+# `make demo` and `make test` are all the set-up: both make .venv and install what they need.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
+OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
+OLD_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+
+# Install Debian packages $(1), or say the one command where there are no rights.
+define debian
+if [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null; then \
+    echo "Installing the Debian packages $(1)"; \
+    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(1) > /dev/null; \
+else \
+    echo "The Debian packages $(1) are missing: run 'sudo apt-get install -y $(1)', then make again." >&2; exit 1; \
+fi
+endef
+
+.PHONY: help demo test lint types bless bench clean
+
+help: ## show the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 8
+
+demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with demo/report.html
+	@$(BIN)/tacpipe demo -o demo
+
+test: $(VENV)/.dev ## run all tests
+	@$(BIN)/pytest -q -n auto
+
+lint: $(VENV)/.dev ## check style
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev ## check types
+	@$(BIN)/mypy
+
+bless: $(VENV)/.dev ## pin the golden digests of stages whose version was raised
+	@$(BIN)/python -m tests.golden_values
+
+bench: $(VENV)/.dev ## measure, beside what a user would do instead; writes benchmarks/results.md
+	@$(BIN)/python benchmarks/run.py
+
+bless: $(VENV)/.dev ## pin the values of stages whose version was raised
+	@$(BIN)/python -m tests.golden_values
+
+clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there
+	@rm -rf $(VENV) demo build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@find . -name __pycache__ -not -path './.tacpipe/*' -prune -exec rm -rf {} +
+
+# A stamp in .venv says what is installed there, so a second call installs nothing.
+$(VENV)/.python:
+	@python=; for name in python3.11 python3; do \
+	    if "$$name" -c '$(OLD_ENOUGH)' 2> /dev/null; then python=$$name; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	    echo "Python 3.11 or newer is missing: run 'sudo apt-get install -y python3 python3-venv', then make again." >&2; \
+	    exit 1; \
+	fi; \
+	if ! "$$python" -c 'import ensurepip, venv' 2> /dev/null; then $(call debian,python3-venv); fi; \
+	echo "Making $(VENV) with $$("$$python" --version)"; \
+	"$$python" -m venv --clear $(VENV)
+	@touch $@
+
+$(VENV)/.learn: $(VENV)/.python pyproject.toml constraints.txt
+	@echo "Installing tacpipe[learn] into $(VENV)"
+	@$(PIP) install -c constraints.txt -e '.[learn]'
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
+	@echo "Installing tacpipe[all,dev] into $(VENV)"
+	@$(PIP) install -c constraints.txt -e '.[all,dev]'
+	@if ! $(BIN)/python -c 'import open3d' 2> /dev/null; then \
+	    $(call debian,$(OPEN3D_LIBRARIES)); \
+	    $(BIN)/python -c 'import open3d'; \
+	fi
+	@touch $(VENV)/.learn $@

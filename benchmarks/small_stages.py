@@ -1,0 +1,50 @@
+"""Stages that do next to nothing, so that what remains is the cost of being a stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.stage import Recording, Trial, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Shard
+
+
+@dataclass(frozen=True)
+class Make:
+    """How much to make."""
+
+    trials: int = 1000  # recordings
+    rows: int = 200  # rows of each
+
+
+@stage(version=1)
+def make(params: Make, trial: Trial) -> Recording:
+    """Make a small table."""
+    import numpy as np
+    import pyarrow as pa
+
+    t_ns = np.arange(params.rows, dtype=np.int64) * 10_000_000  # (time,)
+    channels = {f"x{i}": ((t_ns // 10_000_000 + trial * i) % 4093).astype(np.uint16) for i in range(8)}
+    return Recording(pa.table({"t_ns": t_ns, **channels}), {"trial": trial})
+
+
+@dataclass(frozen=True)
+class Add:
+    """What to add."""
+
+    count: int = 1  # added to the first channel; another value is another result
+
+
+@stage(version=1)
+def add(params: Add, recording: Shard) -> pa.Table:
+    """Add a count to the first channel."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    table = recording.table()
+    raised = pc.add(table["x0"], pa.scalar(params.count, pa.uint16()))
+    return table.set_column(table.column_names.index("x0"), "x0", raised)

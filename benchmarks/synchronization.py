@@ -1,0 +1,136 @@
+"""Bringing streams onto one clock, beside pandas.merge_asof on the same streams.
+
+Two tactile streams of 48 channels at 100 Hz and an arm's 22 channels at 1 kHz, all with jitter. merge_asof takes the
+nearest sample; linear interpolation does more, and what does the same in pandas stands beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import timing
+from numpy.typing import NDArray
+
+from tacpipe.registry import load
+from tacpipe.signals import holds, resampling
+
+RATE_HZ, GAP_NS = 50.0, 50_000_000
+START_NS = 1_600_000_000_000_000_000
+STREAMS = {"tactile1": (48, 100.0, np.uint16), "tactile2": (48, 100.0, np.uint16), "robot": (22, 1000.0, np.float64)}
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Stamps and samples of one sensor, and the same as a frame."""
+
+    t_ns: NDArray[np.int64]  # (time,)
+    values: NDArray[Any]  # (time, channel)
+    frame: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A recording that lies in memory, as the stage reads one."""
+
+    name: str
+    tables: dict[str, pa.Table]
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        return tuple(self.tables)
+
+    def table(self, stream: str) -> pa.Table:
+        return self.tables[stream]
+
+
+def streams(seconds: int, seed: int = 0) -> dict[str, Stream]:
+    """Return streams that jitter by a tenth of their period."""
+    random = np.random.default_rng(seed)
+    found = {}
+    for name, (channels, rate_hz, kind) in STREAMS.items():
+        count = int(seconds * rate_hz)
+        jitter_ns = np.rint(random.normal(0, 0.1e9 / rate_hz, count)).astype(np.int64)
+        t_ns = np.sort(START_NS + np.rint(np.arange(count) * 1e9 / rate_hz).astype(np.int64) + jitter_ns)
+        walk = np.cumsum(random.normal(0, 5, (count, channels)), axis=0) + 30_000
+        values = walk.astype(kind)
+        columns = {f"{name}_{i}": values[:, i].copy() for i in range(channels)}
+        found[name] = Stream(t_ns, values, pd.DataFrame({"t_ns": t_ns, **columns}))
+    return found
+
+
+def measure(folder: Path, rounds: int) -> list[timing.Line]:
+    """Return how many times as long pandas takes, on a usual recording and on a long one."""
+    return [line for seconds in (60, 600) for line in _measure(seconds, rounds)]
+
+
+def _measure(seconds: int, rounds: int) -> list[timing.Line]:
+    given = streams(seconds)
+    first = max(stream.t_ns[0] for stream in given.values())
+    last = min(stream.t_ns[-1] for stream in given.values())
+    grid_ns = resampling.uniform_grid(int(first), int(last), RATE_HZ)
+    grid = pd.DataFrame({"t_ns": grid_ns})
+
+    def linear() -> None:
+        for stream in given.values():
+            resampling.linear(stream.t_ns, stream.values, grid_ns)
+
+    def linear_with_masks() -> None:
+        for stream in given.values():
+            resampling.linear(stream.t_ns, stream.values, grid_ns)
+            resampling.nearest(stream.t_ns, holds.held(stream.values), grid_ns)
+            resampling.in_gap(stream.t_ns, grid_ns, GAP_NS)
+            resampling.nearest_distance_ns(stream.t_ns, grid_ns)
+
+    def merge_asof() -> None:
+        merged = grid
+        for stream in given.values():
+            merged = pd.merge_asof(merged, stream.frame, on="t_ns", direction="nearest")
+
+    def reindex_and_interpolate() -> None:
+        for stream in given.values():
+            indexed = stream.frame.set_index("t_ns")
+            both = indexed.index.union(pd.Index(grid_ns))
+            indexed.reindex(both).interpolate(method="index").loc[grid_ns]
+
+    tables = {name: _table(name, stream) for name, stream in given.items()}
+    stage = load("synchronize")
+    params, recording = stage.params(rate_hz=RATE_HZ, master="tactile1"), Memory("benchmark", tables)
+    times = timing.interleaved(
+        {
+            "linear": linear,
+            "with masks": linear_with_masks,
+            "stage": lambda: stage(params, recording),
+            "merge_asof": merge_asof,
+            "reindex, interpolate": reindex_and_interpolate,
+        },
+        rounds,
+    )
+    return [
+        _faster(f"{seconds} s of three streams to {RATE_HZ:g} Hz: linear", times, "linear", "merge_asof", 10.0),
+        _faster("linear, the same maths in pandas", times, "linear", "reindex, interpolate"),
+        _faster("linear with held, gap and distance", times, "with masks", "merge_asof"),
+        _faster("the whole stage, tables with metadata in and out", times, "stage", "merge_asof"),
+    ]
+
+
+def _faster(what: str, times: timing.Times, ours: str, beside: str, bar: float | None = None) -> timing.Line:
+    """Return the line of what must be at least ``bar`` times as fast as pandas."""
+    line, found = timing.at_most(what, times, ours, beside), timing.ratio(times, beside, ours)
+    told = "" if bar is None else f"{bar:g} times as fast"
+    reached = None if bar is None else found >= bar
+    return timing.Line(what, line.ours, f"pandas: {line.beside}", f"{found:.1f} times as fast", told, reached)
+
+
+def _table(name: str, stream: Stream) -> pa.Table:
+    quantity = "tactile" if name.startswith("tactile") else "position"
+    fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
+    fields += [
+        pa.field(column, pa.from_numpy_dtype(stream.values.dtype), metadata={"quantity": quantity, "unit": "count"})
+        for column in stream.frame.columns[1:]
+    ]
+    return pa.table(list(stream.frame.to_dict("series").values()), schema=pa.schema(fields))
