@@ -45,9 +45,6 @@ bless: $(VENV)/.dev ## pin the golden digests of stages whose version was raised
 bench: $(VENV)/.dev ## measure, beside what a user would do instead; writes benchmarks/results.md
 	@$(BIN)/python benchmarks/run.py
 
-bless: $(VENV)/.dev ## pin the values of stages whose version was raised
-	@$(BIN)/python -m tests.golden_values
-
 clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there
 	@rm -rf $(VENV) demo build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -not -path './.tacpipe/*' -prune -exec rm -rf {} +
