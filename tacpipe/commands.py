@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,6 +72,7 @@ def _store(program: typer.Typer) -> None:
 
 
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `tacpipe show DATASET | head` ends as it does for any Unix tool
     print(json.dumps(value) if as_json else to_text(value, **options))
 
 

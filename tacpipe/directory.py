@@ -58,11 +58,12 @@ def check_output(store: Store, directory: Path) -> None:
         raise UsageError(f"{directory} is a file; give -o a directory.")
     if not directory.is_dir() or (directory / NAME).exists() or store.get_root(directory) is not None:
         return
-    foreign = [entry.name for entry in directory.iterdir() if entry.name != ".gitignore"]
-    if foreign:
-        raise UsageError(
-            f"{directory} holds {foreign[0]} and no {NAME}, so tacpipe did not write it. Give -o a new directory."
-        )
+    for path in directory.rglob("*"):  # a project that was moved: its shards are known, its path is not
+        if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):
+            raise UsageError(
+                f"{directory} has no {NAME} and holds {path.relative_to(directory)}, which tacpipe did not write. "
+                f"Give -o a new directory."
+            )
 
 
 def place(store: Store, name: str, path: Path, *, copy: bool) -> None:

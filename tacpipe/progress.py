@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+_quiet = False
+
+
+def set_quiet(quiet: bool) -> None:
+    """Show no bar from now on, even on a terminal, or show them again."""
+    global _quiet
+    _quiet = quiet
+
 
 def wanted() -> bool:
-    """Return whether somebody is looking: stderr is a terminal and ``--quiet`` was not given."""
-    return sys.stderr.isatty() and not os.environ.get("TACPIPE_QUIET")
+    """Return whether somebody is looking: stderr is a terminal and nobody asked for quiet."""
+    return sys.stderr.isatty() and not _quiet
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any, get_origin
 import typer
 
 from tacpipe import params as params_of
-from tacpipe import pipeline, registry
+from tacpipe import pipeline, progress, registry
 from tacpipe.errors import FAILED, INTERRUPTED
 from tacpipe.request import Request
 from tacpipe.stage import Stage
@@ -54,8 +53,7 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 
 
 def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) -> None:
-    if given["quiet"]:
-        os.environ["TACPIPE_QUIET"] = "1"
+    progress.set_quiet(given["quiet"])
     params = params_of.build(
         name,
         stage,
@@ -89,15 +87,15 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
     except KeyboardInterrupt:
         print("tacpipe: interrupted; what was finished is kept.", file=sys.stderr)
         raise typer.Exit(INTERRUPTED) from None
-    _report(outcome, as_json=given["json_"])
+    _report(outcome, as_json=given["json_"], quiet=given["quiet"])
 
 
-def _report(outcome: pipeline.Outcome, *, as_json: bool) -> None:
+def _report(outcome: pipeline.Outcome, *, as_json: bool, quiet: bool) -> None:
     for note in outcome.notes:
         print(f"tacpipe: {note}", file=sys.stderr)
     for name, why in outcome.bad.items():
         print(f"tacpipe: left out {name}: {why}", file=sys.stderr)
-    if not os.environ.get("TACPIPE_QUIET"):
+    if not quiet:
         print(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s", file=sys.stderr)
     if as_json:
         value = {"schema_version": 1, **vars(outcome), "output": str(outcome.output)}

@@ -86,7 +86,6 @@ def lab(
     """An empty project, its commands run in this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TACPIPE_STORE", raising=False)
-    monkeypatch.delenv("TACPIPE_QUIET", raising=False)
     monkeypatch.syspath_prepend(plugin)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")]))
     (tmp_path / ".tacpipe").mkdir()

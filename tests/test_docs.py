@@ -76,7 +76,6 @@ def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> Non
 
 
 def test_the_commands_of_the_readme_print_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TACPIPE_QUIET", raising=False)
     text = (ROOT / "README.md").read_text()
     sixty, own = section(text, "Sixty seconds on simulated recordings"), section(text, "Your own stage")
     (tmp_path / "own.egg-info").mkdir()

@@ -261,6 +261,15 @@ def test_an_output_that_tacpipe_did_not_write_is_left_alone(lab: Lab) -> None:
     assert [path.name for path in Path("thesis").iterdir()] == ["chapter1.tex"]
 
 
+def test_a_project_that_was_moved_and_lost_a_manifest_is_still_known(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    Path("data").rename("moved")
+    Path("moved/s/manifest.json").unlink()
+    lab.run("scale moved/r -o moved/s --factor 3")
+    assert tacpipe.open("moved/s").to_numpy()["trial-001"][1].tolist() == [6]
+
+
 def test_check_says_whether_something_would_change_and_changes_nothing(lab: Lab) -> None:
     assert lab.call("simulate toy -o data/r --check").code == 3
     assert not Path("data").exists()
