@@ -10,6 +10,7 @@ from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
+    from multiprocessing.connection import Connection
 
 Task = TypeVar("Task")
 Done = TypeVar("Done")
@@ -46,15 +47,36 @@ def run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prelo
         context.set_forkserver_preload(list(preload))
     size = max(1, len(tasks) // (jobs * _CHUNKS_A_JOB))
     chunks = [tasks[start : start + size] for start in range(0, len(tasks), size)]
-    pool = ProcessPoolExecutor(jobs, mp_context=context)
+    alive, life = context.Pipe(duplex=False)  # its writing end is this process's alone, and closes when it dies
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_live_with, initargs=(alive,))
     try:
         pending: set[Future[list[Done]]] = {pool.submit(_compute_chunk, compute, chunk) for chunk in chunks}
         while pending:
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in finished:
                 yield from _result(future)
+    except BaseException:
+        life.close()  # an interrupt does not wait for the shards that are being made: nothing is half written
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+        life.close()
+        alive.close()
+
+
+def _live_with(alive: Connection) -> None:
+    """End this worker as soon as the process that started it is gone, however it went; leave Ctrl-C to that one."""
+    import signal
+    import threading
+
+    def watch() -> None:
+        try:
+            alive.recv()
+        except (EOFError, OSError):
+            os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _compute_chunk(compute: Callable[[Any], Done], chunk: Sequence[Any]) -> list[Done]:

@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -142,6 +143,45 @@ def test_an_interrupt_ends_with_130_and_keeps_what_was_finished(lab: Lab) -> Non
     ran = json.loads(lab.run("scale data/r -o data/s --pause-s 0.5 --json").out)
     assert ran["reused"] >= 1 and ran["ran"] + ran["reused"] == 3
     assert upkeep.verify(lab.store).clean
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="processes are told apart by /proc")
+def test_workers_end_with_the_process_that_started_them_however_it_ends(lab: Lab) -> None:
+    lab.run("simulate toy --trials 40 -o data/r")
+    words = "scale data/r -o data/s --pause-s 0.2 --jobs 2"
+    for end in (signal.SIGKILL, signal.SIGINT):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tacpipe.cli", *shlex.split(words)],
+            cwd=lab.folder,
+            env={**os.environ, "TACPIPE_TEST_MARK": lab.folder.name},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        before = len(list(lab.store.root.glob("records/*/*")))
+        deadline = time.monotonic() + 30
+        while len(list(lab.store.root.glob("records/*/*"))) < before + 4 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(end)
+        _, err = process.communicate()
+        assert process.returncode == (130 if end == signal.SIGINT else -9)
+        assert "Traceback" not in err
+        while marked(lab.folder.name) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert marked(lab.folder.name) == []
+        assert upkeep.verify(lab.store).clean
+    assert json.loads(lab.run("scale data/r -o data/s --pause-s 0.2 --json").out)["reused"] >= 8
+
+
+def marked(name: str) -> list[int]:
+    """Return the processes that carry this mark in their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"TACPIPE_TEST_MARK={name}".encode() in (folder / "environ").read_bytes():
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
 
 
 def test_a_worker_that_dies_is_a_sentence_and_what_was_finished_is_kept(lab: Lab) -> None:
