@@ -111,8 +111,8 @@ def stage_of(name: str) -> Stage:
 
 
 def complete(store: Store, record: Mapping[str, Any]) -> bool:
-    """Return whether every object that the record names is in the store."""
-    return all(store.has(name) for name in named(record["result"]))
+    """Return whether every object that the record names is in the store; those that are there are freshened."""
+    return all(store.keep(name) for name in named(record["result"]))
 
 
 def named(result: Mapping[str, Any]) -> Iterator[str]:
@@ -169,10 +169,7 @@ def _adopt(store: Store, name: str, path: str, beside: tuple[str, ...]) -> bytes
 
 
 def _remake(store: Store, name: str, path: str, why: str) -> bytes:
-    for _, record in store.records():
-        identity = record["identity"]
-        if "stage" not in identity or name not in set(named(record["result"])):
-            continue
+    for identity in _makers(store, name):
         stage = stage_of(identity["stage"])
         if stage.source:
             raise DamagedError(
@@ -181,12 +178,27 @@ def _remake(store: Store, name: str, path: str, why: str) -> bytes:
             )
         if stage.version != identity["version"]:
             continue
-        result = execute(Task(str(store.root), identity["stage"], identity), store, store)
-        if name in set(named(result)):
+        execute(Task(str(store.root), identity["stage"], identity), store, store)
+        if store.has(name):
             return store.read(name)
     raise DamagedError(
         f"{why} Nothing in the store says how {path} was made: bring it with `tacpipe store pull`, or run the stage again."
     )
+
+
+_known: dict[str, dict[str, list[Any]]] = {}  # store, digest, identities of what gave it
+
+
+def _makers(store: Store, name: str) -> list[Any]:
+    """Return the identities of the keys that gave an object; all records are read once for many lost objects."""
+    root = str(store.root)
+    if name not in _known.get(root, {}):
+        _known[root] = {}
+        for _, record in store.records():
+            if "stage" in record["identity"]:
+                for found in set(named(record["result"])):
+                    _known[root].setdefault(found, []).append(record["identity"])
+    return _known[root].get(name, [])
 
 
 @contextmanager

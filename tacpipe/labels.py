@@ -43,6 +43,11 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
     """
     directory, content = manifest_of.read_manifest(path)
     manifest = manifest_of.parse(content, str(directory / manifest_of.NAME))
+    if manifest.inputs:
+        raise UsageError(
+            f"{directory} was made by {manifest.stage} from other datasets, and the next run would undo its labels. "
+            f"Label the recordings that it comes from; `tacpipe explain {directory}` names them."
+        )
     names: set[str] = set()
     for pattern in patterns:
         found = {name for name in manifest.recordings if fnmatchcase(name, pattern)}

@@ -43,6 +43,7 @@ def test_help_lists_every_command(lab: Lab) -> None:
         ("scale data/r -o x --block a.b", 2, "params.yaml"),
         ("label data/r nobody --set a=1", 2, "no recording nobody"),
         ("label data/r trial-000", 2, "Nothing to change"),
+        ("label data/s trial-000 --set a=1", 2, "next run would undo"),
         ("explain nowhere", 2, "nowhere"),
         ("store pull nowhere data/r", 2, "no store"),
     ],
@@ -51,6 +52,7 @@ def test_a_mistake_is_a_sentence_with_the_documented_code_and_leaves_nothing_beh
     lab: Lab, command: str, code: int, sentence: str
 ) -> None:
     lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
     Path("empty").mkdir()
     failed = lab.call(command)
     assert failed.code == code, failed.err

@@ -65,6 +65,19 @@ def test_young_objects_and_those_of_a_running_process_are_kept(lab: Lab) -> None
     assert all(lab.store.has(name) for _, name in manifest.objects())
 
 
+def test_what_a_run_reuses_is_young_again(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s --factor 2")
+    manifest = lab.manifest("data/s")
+    lab.run("scale data/r -o data/s --factor 3")
+    age(lab)
+    for _, name in manifest.objects():
+        assert lab.store.keep(name)
+    collected(lab)
+    assert all(lab.store.has(name) for _, name in manifest.objects())
+    assert not lab.store.keep("0" * 64)
+
+
 def test_recordings_that_nothing_names_are_kept_unless_asked_for(lab: Lab) -> None:
     Path("src").mkdir()
     Path("src/a.txt").write_text("1 2 3")
