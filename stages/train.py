@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from tacpipe.stage import stage
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.dataset import Dataset, Model
     from tacpipe.stage import Result, Workspace
 
 
@@ -25,14 +26,21 @@ class Params:
     seed: int = 0  # of first weights and shuffles
     context: int = 10  # rows of the past that the model reads
     horizon: int = 10  # rows ahead that it predicts
+    PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {
+        "paper": {"hidden": 200, "epochs": 50, "batch": 32, "patience": 5, "context": 10, "horizon": 10},
+        "quick": {"hidden": 32, "epochs": 3},
+    }
 
 
 @stage(version=1)
-def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace) -> Result:
-    """Train the forecast of touch: past latents and arm states and the planned motion give the latents to come."""
+def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
+    """Train the forecast of touch: past latents and arm states and the planned motion give the latents to come.
+
+    ``init`` is a model to begin with: its weights and scalings are taken over.
+    """
     from dataclasses import asdict
 
     from tacpipe.stage import Result
     from tacpipe.tasks import forward as task
 
-    return Result(files=task.train(asdict(params), train, val, workspace))
+    return Result(files=task.train(asdict(params), train, val, workspace, init.files if init else None))

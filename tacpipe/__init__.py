@@ -9,7 +9,7 @@ from tacpipe.stage import Recording, Result, Stage, stage
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
-__all__ = ["Recording", "Result", "Stage", "open", "stage"]
+__all__ = ["Recording", "Result", "Stage", "load", "open", "stage"]
 
 
 def open(path: Any) -> Dataset:
@@ -17,3 +17,19 @@ def open(path: Any) -> Dataset:
     from tacpipe.pipeline import open_dataset
 
     return open_dataset(path)
+
+
+def load(path: Any) -> Any:
+    """Return the model at ``path``, ready to ``predict``: what its task makes of the files that `tacpipe train` wrote.
+
+    Raises `UsageError` if ``path`` holds no model.
+    """
+    import json
+
+    from tacpipe import registry
+    from tacpipe.errors import UsageError
+
+    files = open(path).files
+    if "config.json" not in files:
+        raise UsageError(f"{path} is no model: it has no config.json. Give what `tacpipe train` wrote with -o.")
+    return registry.load_task(json.loads(files["config.json"])["task"]).load(files)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import platform
 import shutil
@@ -70,6 +71,8 @@ def compute(task: Task) -> Done:
             shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
             return Done(task.recording, record)
     except TacpipeError as error:
+        with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
+            (store.root / "checkpoints" / key).rmdir()
         return Done(task.recording, None, str(error), error.exit_code)
 
 
@@ -211,7 +214,7 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
         if kind == "Shard":
             found[name] = Shard(task.recording, inputs[name], read)
         elif kind in ("Dataset", "Model"):
-            found[name] = _dataset(inputs[name], read)
+            found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
             found[name] = tuple(_dataset(value, read) for value in inputs[name])
         elif kind == "Fitted":

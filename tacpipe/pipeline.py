@@ -147,6 +147,9 @@ class _Run:
 
     def _whole_input(self, name: str, kind: str) -> Any:
         inputs, reads = self.inputs, self.stage.reads
+        if kind == "Model" and name == "init":
+            init = inputs.named.get("init")
+            return keys.of_dataset(init.manifest, None, {}) if init else None
         if kind == "Model":
             return keys.of_dataset(inputs.model, None, {})
         if kind == "Datasets":

@@ -32,6 +32,7 @@ class Request:
     role: str | None = None
     codec: Path | None = None
     extend: Path | None = None
+    init: Path | None = None
     jobs: int = 0
     skip_bad: bool = False
     check: bool = False
@@ -70,7 +71,7 @@ class Inputs:
         self.datasets = [read(path) for path in request.datasets]
         self.named: dict[str, Input] = {
             name: read(path)
-            for name in ("model", "split", "codec", "extend")
+            for name in ("model", "split", "codec", "extend", "init")
             if (path := getattr(request, name)) is not None
         }
         self.notes: list[str] = []  # what the user should know though nothing failed

@@ -6,7 +6,7 @@ The first parameter is ``params``, a frozen dataclass. Each further one says by 
 ``Shard``       one recording at a time; the stage is run, keyed and stored for each recording alone
 ``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone
 ``Datasets``    several datasets side by side, as a tuple
-``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration
+``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
 ``Fitted``      the files that the stage's ``fit`` made of the training recordings
 ``Files``       the files of one recording of a published source; the stage's ``discover`` finds them
 ``Trial``       the number of one recording to simulate, from 0 to ``params.trials``
@@ -102,6 +102,11 @@ class Stage:
         found = self.function.__globals__[name] if isinstance(name, str) else name
         assert isinstance(found, type)
         return found
+
+    @property
+    def reads_model(self) -> bool:
+        """Whether the stage works with a trained model, rather than beginning with one if it is given (``init``)."""
+        return any(kind == "Model" and name != "init" for name, kind in self.arguments.items())
 
     @property
     def mapped(self) -> bool:

@@ -68,7 +68,7 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
-    paths = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend")}
+    paths = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend", "init")}
     request = Request(
         name,
         params,
@@ -119,7 +119,7 @@ def _arguments(stage: Stage) -> list[inspect.Parameter]:
     found = []
     if "Files" in kinds:
         found.append(_parameter("source", Path, typer.Argument(help="Folder of the published recordings.")))
-    if "Model" in kinds:
+    if stage.reads_model:
         found.append(_parameter("model", Path, typer.Argument(help="A trained model.")))
     if kinds & {"Shard", "Dataset", "Datasets"}:
         found.append(
@@ -131,20 +131,23 @@ def _arguments(stage: Stage) -> list[inspect.Parameter]:
 def _shared(stage: Stage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
     found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
-    if stage.needs_split or "Model" in kinds:
+    if stage.needs_split or stage.reads_model:
         found += [
             _parameter(
                 "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
             ),
             _parameter("fold", int, typer.Option(0, "--fold", help="Fold of the split.")),
         ]
-    if "Model" in kinds:
+    if stage.reads_model:
         found.append(
             _parameter("role", str | None, typer.Option(None, "--role", help="Role to read: train, val or test."))
         )
     if stage.fit is not None:
         text = "A dataset whose fitted codec to apply."
         found.append(_parameter("codec", Path | None, typer.Option(None, "--codec", help=text)))
+    if "init" in stage.arguments:
+        text = "A model to begin with."
+        found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
     if "Roles" in kinds:
         text = "An older split whose roles to keep."
         found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
@@ -210,8 +213,8 @@ def example(name: str, stage: Stage) -> str:
     words = ["tacpipe", *name.split(".")]
     kinds = set(stage.arguments.values())
     words += ["published/recordings"] if "Files" in kinds else []
-    words += ["models/forward"] if "Model" in kinds else []
+    words += ["models/forward"] if stage.reads_model else []
     words += [f"data/{_BEFORE.get(group, 'recordings')}"] if kinds & {"Shard", "Dataset"} else []
     words += ["results/forward"] if "Datasets" in kinds else []
-    words += ["--split", "data/split"] if stage.needs_split or "Model" in kinds else []
+    words += ["--split", "data/split"] if stage.needs_split or stage.reads_model else []
     return " ".join([*words, "-o", _PLACES.get(group, "data/out")])

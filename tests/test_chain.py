@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import tacpipe
+from tacpipe import errors as tacpipe_errors
 from tacpipe import upkeep
 from tacpipe.store import Store
 from tests import chain
@@ -94,6 +95,34 @@ def test_an_empty_clone_pulls_a_model_and_its_data_and_evaluates(lab: Path, tmp_
     assert done.returncode == 0, done.stderr
     assert metrics(clone) == metrics(lab)
     assert upkeep.verify(Store(clone / ".tacpipe")).clean
+
+
+def test_a_model_can_begin_with_another_and_remembers_what_that_has_seen(lab: Path) -> None:
+    train = "train forward data/latents --split data/split --hidden 16 --epochs 1"
+    done = command(lab, f"{train} --init models/forward -o models/tuned --learning-rate 0.0001")
+    assert done.returncode == 0, done.stderr
+    first, tuned = (
+        [json.loads(line) for line in (lab / f"models/{name}/history.jsonl").read_text().splitlines()]
+        for name in ("forward", "tuned")
+    )
+    assert tuned[0]["val_loss"] < first[0]["val_loss"]
+    assert json.loads((lab / "models/tuned/config.json").read_text())["trained_on"]
+    done = command(lab, f"{train} --init models/forward -o models/wrong --hidden 8")
+    assert done.returncode == 1 and "hidden 16" in done.stderr
+
+
+def test_a_model_is_loaded_and_predicts_from_python(lab: Path) -> None:
+    model = tacpipe.load(lab / "models/forward")
+    latents, states = 6, 7
+    predicted = model.predict(np.zeros((3, 10, latents + states)), np.zeros((3, 10, states)))
+    assert predicted.shape == (3, 10, latents) and np.isfinite(predicted).all()
+    with pytest.raises(tacpipe_errors.UsageError, match="no model"):
+        tacpipe.load(lab / "data/latents")
+
+
+def test_a_preset_changes_what_would_run(lab: Path) -> None:
+    printed = command(lab, "train forward data/latents --preset paper --print-params").stdout
+    assert json.loads(printed)["batch"] == 32
 
 
 def test_a_new_recording_gets_a_role_and_the_others_keep_theirs(lab: Path) -> None:

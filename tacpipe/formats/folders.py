@@ -24,7 +24,13 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
     wanted = set(names)
     holds: dict[Path, set[str]] = {}  # which of the wanted files each trial has
-    for place, _, files in os.walk(source):
+    seen: set[str] = set()  # links are followed, circles of them are not
+    for place, folders_below, files in os.walk(source, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            folders_below.clear()
+            continue
+        seen.add(real)
         there = wanted.intersection(files)
         if there or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
             holds[Path(place)] = there

@@ -110,11 +110,23 @@ class Forecaster:
         return self.predict(np.concatenate([track.latent[past], state[past]], axis=-1), state[future])
 
 
-def train(params: Mapping[str, Any], training: Dataset, validation: Dataset, workspace: Path) -> dict[str, bytes]:
+def load(files: Mapping[str, bytes]) -> Forecaster:
+    """Return the forecaster among a model's files: what `tacpipe.load` gives."""
+    return Forecaster.load(files)
+
+
+def train(
+    params: Mapping[str, Any],
+    training: Dataset,
+    validation: Dataset,
+    workspace: Path,
+    init: Mapping[str, bytes] | None = None,
+) -> dict[str, bytes]:
     """Return the files of a model trained on ``training`` and stopped by its error on ``validation``.
 
     ``params`` has hidden, context, horizon and what `tacpipe.training.loop.Schedule` has. Scalings are fitted on the
-    training recordings alone. Raises `TacpipeError` where recordings lack columns or windows.
+    training recordings alone, or taken over from the model ``init`` with its weights. Raises `TacpipeError` where
+    recordings lack columns or windows, and where ``init`` has another shape or codec.
     """
     if not training.shards:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
@@ -124,16 +136,20 @@ def train(params: Mapping[str, Any], training: Dataset, validation: Dataset, wor
         "val": [tracks.track(shard, codec) for _, shard in sorted(validation.shards.items())],
     }
     rate_hz = tracks.rate_hz([one for part in parts.values() for one in part])
-    reference = _reference([one.state[one.usable, 3:] for one in parts["train"]])
+    start = _start(init, params, training.files) if init else None
+    reference = start.orientation if start else _reference([one.state[one.usable, 3:] for one in parts["train"]])
     for name, part in parts.items():
         parts[name] = [dataclasses.replace(one, state=tracks.aligned(one.state, reference)) for one in part]
-    latent_scale = scaling.fit(np.concatenate([one.latent[one.usable] for one in parts["train"]]))
-    state_scale = scaling.fit(np.concatenate([one.state[one.usable] for one in parts["train"]]))
+    if start:
+        latent_scale, state_scale = start.latent_scale, start.state_scale
+    else:
+        latent_scale = scaling.fit(np.concatenate([one.latent[one.usable] for one in parts["train"]]))
+        state_scale = scaling.fit(np.concatenate([one.state[one.usable] for one in parts["train"]]))
     context, horizon = params["context"], params["horizon"]
     windows = {name: _windows(part, context, horizon, latent_scale, state_scale) for name, part in parts.items()}
     schedule = loop.Schedule(**{field.name: params[field.name] for field in dataclasses.fields(loop.Schedule)})
     trained = loop.train(
-        lambda: RecurrentForward(len(codec.latents), len(tracks.STATE), params["hidden"]),
+        lambda: start.model if start else RecurrentForward(len(codec.latents), len(tracks.STATE), params["hidden"]),
         windows["train"].part,
         windows["val"].part,
         schedule,
@@ -155,7 +171,10 @@ def train(params: Mapping[str, Any], training: Dataset, validation: Dataset, wor
             "orientation_reference": reference.tolist(),
         },
         "scaling": {"latent": latent_scale.to_json(), "state": state_scale.to_json()},
-        "trained_on": {shard.name: shard.digest for part in (training, validation) for shard in part.shards.values()},
+        "trained_on": {
+            **(start.config["trained_on"] if start else {}),
+            **{shard.name: shard.digest for part in (training, validation) for shard in part.shards.values()},
+        },
         "counts": {name: {"recordings": len(parts[name]), "windows": len(one.starts)} for name, one in windows.items()},
     }
     kept = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
@@ -296,6 +315,20 @@ def _prediction_table(forecaster: Forecaster, track: Track, starts: NDArray[np.i
             fields.append(pa.field(f"{name}_t{step}" if step else name, pa.float32(), metadata=about))
     arrays = [pa.array(values, field.type) for values, field in zip(columns, fields, strict=True)]
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def _start(init: Mapping[str, bytes], params: Mapping[str, Any], recordings: Mapping[str, bytes]) -> Forecaster:
+    """Return the model to begin with. Raises `TacpipeError` where it does not fit what is to be trained."""
+    start = Forecaster.load(init)
+    for name in ("hidden", "context", "horizon"):
+        found = start.config["params"][name]
+        if found != params[name]:
+            raise TacpipeError(
+                f"The model of --init has {name} {found} and the one to train {params[name]}; they must be equal. "
+                f"Give --{name} {found}, or begin without --init."
+            )
+    _check_codec(init, recordings)
+    return start
 
 
 def _check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:
