@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import platform
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,16 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import params as params_of
-from tacpipe import registry
+from tacpipe import provenance, registry
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.executors import usable_cores
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import Manifest, shard_path
 from tacpipe.stage import Recording, Result, Stage
 from tacpipe.store import MissingError, Object, Store
-
-_LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
 
 @dataclass(frozen=True)
@@ -66,7 +60,7 @@ def compute(task: Task) -> Done:
             replace = task.replace or record is not None
             result = execute(task, store, store)
             stage = stage_of(task.name)
-            made = {**provenance(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+            made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
             record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
             shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
             return Done(task.recording, record)
@@ -277,35 +271,3 @@ def _entry(recording: Recording, sink: Store | _Scratch, *, durable: bool) -> di
         for stream, table in sorted(recording.streams.items())
     }
     return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
-
-
-@functools.cache
-def _provenance() -> dict[str, Any]:
-    import subprocess
-    from importlib.metadata import PackageNotFoundError, version
-
-    libraries = {}
-    for name in _LIBRARIES:
-        try:
-            libraries[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    git = ["git", "rev-parse", "HEAD"]
-    try:
-        commit = subprocess.run(git, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
-    except OSError:
-        commit = ""
-    return {
-        "libraries": libraries,
-        "git_commit": commit or None,
-        "host": platform.node(),
-        "python": sys.version.split()[0],
-        "threads": usable_cores(),
-    }
-
-
-def provenance(seconds: float) -> dict[str, Any]:
-    """Return where and with what something was made; no part of any key or digest."""
-    torch = sys.modules.get("torch")
-    device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
-    return {**_provenance(), "device": device, "seconds": seconds}

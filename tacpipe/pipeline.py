@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe import directory, execution, executors, keys, manifest, progress, registry
+from tacpipe import directory, execution, executors, keys, manifest, progress, provenance, registry
 from tacpipe import params as params_of
 from tacpipe import request as request_of
 from tacpipe.dataset import Dataset
@@ -322,7 +322,7 @@ def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome
     stored = vars(store.put(made.content))
     if not outcome.bad:
         result = {"recordings": {}, "files": {manifest.NAME: stored}}
-        store.commit(identity, result, execution.provenance(0.0), replace=True)
+        store.commit(identity, result, provenance.of(0.0), replace=True)
 
 
 def _publish(store: Store, request: Request, made: Manifest) -> None:

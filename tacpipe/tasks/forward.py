@@ -140,11 +140,7 @@ def train(
     reference = start.orientation if start else _reference([one.state[one.usable, 3:] for one in parts["train"]])
     for name, part in parts.items():
         parts[name] = [dataclasses.replace(one, state=tracks.aligned(one.state, reference)) for one in part]
-    if start:
-        latent_scale, state_scale = start.latent_scale, start.state_scale
-    else:
-        latent_scale = scaling.fit(np.concatenate([one.latent[one.usable] for one in parts["train"]]))
-        state_scale = scaling.fit(np.concatenate([one.state[one.usable] for one in parts["train"]]))
+    latent_scale, state_scale = (start.latent_scale, start.state_scale) if start else _scales(parts["train"])
     context, horizon = params["context"], params["horizon"]
     windows = {name: _windows(part, context, horizon, latent_scale, state_scale) for name, part in parts.items()}
     schedule = loop.Schedule(**{field.name: params[field.name] for field in dataclasses.fields(loop.Schedule)})
@@ -171,10 +167,7 @@ def train(
             "orientation_reference": reference.tolist(),
         },
         "scaling": {"latent": latent_scale.to_json(), "state": state_scale.to_json()},
-        "trained_on": {
-            **(start.config["trained_on"] if start else {}),
-            **{shard.name: shard.digest for part in (training, validation) for shard in part.shards.values()},
-        },
+        "trained_on": _trained_on((training, validation), start),
         "counts": {name: {"recordings": len(parts[name]), "windows": len(one.starts)} for name, one in windows.items()},
     }
     kept = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
@@ -315,6 +308,21 @@ def _prediction_table(forecaster: Forecaster, track: Track, starts: NDArray[np.i
             fields.append(pa.field(f"{name}_t{step}" if step else name, pa.float32(), metadata=about))
     arrays = [pa.array(values, field.type) for values, field in zip(columns, fields, strict=True)]
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def _scales(part: list[Track]) -> tuple[MinMax, MinMax]:
+    """Return the scalings of latents and states, fitted on usable rows."""
+    latent, state = ([getattr(one, name)[one.usable] for one in part] for name in ("latent", "state"))
+    return scaling.fit(np.concatenate(latent)), scaling.fit(np.concatenate(state))
+
+
+def _trained_on(parts: tuple[Dataset, ...], start: Forecaster | None) -> dict[str, str]:
+    """Return the digests of all recordings that the model has seen by name, those of the one it began with included."""
+    digests = {shard.name: shard.digest for part in parts for shard in part.shards.values()}
+    before = (
+        {f"{name} of the model before": digest for name, digest in start.config["trained_on"].items()} if start else {}
+    )
+    return {**{name: digest for name, digest in before.items() if digest not in digests.values()}, **digests}
 
 
 def _start(init: Mapping[str, bytes], params: Mapping[str, Any], recordings: Mapping[str, bytes]) -> Forecaster:

@@ -1,0 +1,44 @@
+"""Where and with what something was made: kept beside results, no part of any key or digest."""
+
+from __future__ import annotations
+
+import functools
+import platform
+import sys
+from typing import Any
+
+from tacpipe.executors import usable_cores
+
+_LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
+
+
+@functools.cache
+def _here() -> dict[str, Any]:
+    import subprocess
+    from importlib.metadata import PackageNotFoundError, version
+
+    libraries = {}
+    for name in _LIBRARIES:
+        try:
+            libraries[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    git = ["git", "rev-parse", "HEAD"]
+    try:
+        commit = subprocess.run(git, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
+    except OSError:
+        commit = ""
+    return {
+        "libraries": libraries,
+        "git_commit": commit or None,
+        "host": platform.node(),
+        "python": sys.version.split()[0],
+        "threads": usable_cores(),
+    }
+
+
+def of(seconds: float) -> dict[str, Any]:
+    """Return libraries, git commit, host, device and threads of this process, and the ``seconds`` that something took."""
+    torch = sys.modules.get("torch")
+    device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
+    return {**_here(), "device": device, "seconds": seconds}
