@@ -40,6 +40,7 @@ class Track:
     latent: Floats  # (time, latent)
     state: Floats  # (time, state), position in metres and unit quaternion
     tactile: Floats  # (time, channel)
+    logged: bool = False  # whether the rows are as they were logged, rather than on a uniform grid
 
     def starts(self, context: int, horizon: int) -> NDArray[np.int64]:
         """Return the first rows of all windows of ``context + horizon`` rows, shape (window,)."""
@@ -105,7 +106,8 @@ def track(shard: Shard, codec: codecs.Codec) -> Track:
     finite = np.isfinite(latent).all(axis=1) & np.isfinite(state).all(axis=1) & np.isfinite(above_rest).all(axis=1)
     usable = finite & ~tactile.gaps(table) & (contact >= 0)
     latent, state = latent.astype(np.float32), state.astype(np.float32)
-    return Track(shard.name, t_ns, contact, _groups(t_ns, contact), usable, latent, state, above_rest)
+    logged = shard.attributes.get("grid") == "logged"
+    return Track(shard.name, t_ns, contact, _groups(t_ns, contact), usable, latent, state, above_rest, logged)
 
 
 def whole_numbers(table: pa.Table, name: str) -> NDArray[np.int64]:
@@ -130,13 +132,19 @@ def aligned(state: Floats, reference: Floats) -> Floats:
 def rate_hz(tracks: Sequence[Track]) -> float:
     """Return the median rate of the tracks' grids in Hz; 0 where none has two rows.
 
-    Raises `TacpipeError` where the rates differ by more than 1 %.
+    On the rows as logged a step is a row, however long it takes; so rates may differ there. Else raises `TacpipeError`
+    where they do by more than 1 %, and where only some of the tracks are as logged.
     """
+    if len({one.logged for one in tracks}) > 1:
+        logged = next(one.name for one in tracks if one.logged)
+        raise TacpipeError(
+            f"{logged} has its rows as logged and others a uniform grid. Synchronize all with one --grid."
+        )
     rates = {one.name: 1e9 / float(np.median(np.diff(one.t_ns))) for one in tracks if len(one.t_ns) > 1}
     if not rates:
         return 0.0
     slow, fast = min(rates, key=lambda name: rates[name]), max(rates, key=lambda name: rates[name])
-    if rates[fast] > 1.01 * rates[slow]:
+    if rates[fast] > 1.01 * rates[slow] and not tracks[0].logged:
         raise TacpipeError(
             f"{slow} runs at {rates[slow]:.2f} Hz and {fast} at {rates[fast]:.2f} Hz, so a step is not the same time. "
             "Synchronize all recordings with one --rate-hz."
