@@ -45,7 +45,7 @@ h1 { font-size: 1.4rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; } h3 { fo
 figure { margin: 1rem 0; } figcaption { color: var(--note); font-size: .9rem; } svg { max-width: 100%; height: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { text-align: right; padding: .25rem .8rem; border-bottom: 1px solid var(--panel); }
-th:first-child, td:first-child { text-align: left; } .scroll { overflow-x: auto; }
+th:first-child, td:first-child, .words th, .words td { text-align: left; } .scroll { overflow-x: auto; }
 code { font-size: .85rem; overflow-wrap: anywhere; }
 """
 
@@ -335,15 +335,15 @@ def _provenance(manifest: Tree) -> str:
     rows = []
     for step in steps:
         params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in (step.get("params") or {}).items())
-        fitted = step.get("fitted")
-        rows.append([str(step.get("stage")), str(step.get("version")), params, json.dumps(fitted) if fitted else ""])
+        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
+        rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
     table = _table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows)
     named = [("this result", str(manifest.get("digest", "")))]
     for argument, inputs in manifest.get("inputs", {}).items():
         several = inputs if isinstance(inputs, list) else [inputs]
         named += [(argument, one["dataset"] if isinstance(one, dict) else str(one)) for one in several]
     items = "".join(f"<li>{escape(name)}: <code>{escape(digest)}</code></li>" for name, digest in named if digest)
-    return f"<h3>Where it comes from</h3>{table}<ul>{items}</ul>"
+    return f'<h3>Where it comes from</h3><div class="words">{table}</div><ul>{items}</ul>'
 
 
 def _number(value: float) -> str:
