@@ -7,14 +7,13 @@ import json
 import shutil
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
 from tacpipe.execution import named
-from tacpipe.files import read_json
 from tacpipe.hashing import bytes_digest
 from tacpipe.store import Store
 
@@ -34,10 +33,6 @@ class Collected:
     checkpoints: int = 0
     kept_recordings: int = 0  # ingested or acquired ones that nothing names any more
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the counts by name."""
-        return asdict(self)
-
 
 def live(store: Store, grace_days: float = GRACE_DAYS) -> tuple[set[str], set[str], float]:
     """Return the digests of needed objects, those of needed manifests, and the time from which everything is kept.
@@ -47,11 +42,14 @@ def live(store: Store, grace_days: float = GRACE_DAYS) -> tuple[set[str], set[st
     contents: dict[str, bytes] = {}
     wanted: list[str] = []
     for root in store.roots():
-        here = _content(Path(root["path"]))
+        path = Path(root["path"])
+        here = _content(path)
         if here is not None:
             contents[bytes_digest(here)] = here
             wanted.append(bytes_digest(here))
-        if here is None and not _expired(store, root, grace_days):
+        reached = here is not None or path.is_file()  # a report: its manifest lies in the store alone
+        expired = _expired(store, root, grace_days, reached=reached)
+        if here is None and not expired:
             wanted.append(root["manifest"])
     begun_s = time.time()
     for note, started_s in store.leases.runs():
@@ -125,18 +123,20 @@ def _content(path: Path) -> bytes | None:
         return None
 
 
-def _expired(store: Store, root: dict[str, Any], grace_days: float) -> bool:
-    """Return whether a root's path has been out of reach for the whole grace; the first look starts the clock."""
-    path = Path(root["path"])
-    if path.is_file():  # a report: its manifest lies in the store alone
-        return False
-    file = store.root_path(path)
-    if "missing_since_s" not in root:
+def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool) -> bool:
+    """Return whether a root's path has been out of reach for the whole grace.
+
+    The first look that does not reach it starts the clock, and one that reaches it stops the clock.
+    """
+    since_s = None if reached else root.get("missing_since_s", int(time.time()))
+    if since_s != root.get("missing_since_s"):
+        kept = {key: value for key, value in root.items() if key != "missing_since_s"}
+        noted = kept if since_s is None else {**kept, "missing_since_s": since_s}
         with contextlib.suppress(TacpipeError):
-            store.write_file(file, json.dumps({**root, "missing_since_s": int(time.time())}, sort_keys=True).encode())
-        return grace_days <= 0
-    since_s = float((read_json(file) or root)["missing_since_s"])
-    return time.time() - since_s > grace_days * 86400 or grace_days <= 0
+            store.write_file(store.root_path(Path(root["path"])), json.dumps(noted, sort_keys=True).encode())
+    if since_s is None:
+        return False
+    return grace_days <= 0 or time.time() - since_s > grace_days * 86400
 
 
 def _remove(path: Path, kept_from_s: float, collected: Collected, *, dry_run: bool) -> None:

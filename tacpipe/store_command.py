@@ -85,7 +85,7 @@ def gc(
     )
     if found.kept_recordings:
         text += f"; kept {found.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
-    _print(found.to_json(), as_json=as_json, text=text)
+    _print(asdict(found), as_json=as_json, text=text)
 
 
 def link(datasets: Paths) -> None:

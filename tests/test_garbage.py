@@ -106,6 +106,22 @@ def test_a_root_that_cannot_be_reached_counts_for_fourteen_days(lab: Lab) -> Non
     assert collected(lab)["objects"] > 0
 
 
+def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    Path("data/s").rename("elsewhere")
+    age(lab)
+    collected(lab)
+    file = lab.store.root_path(lab.folder / "data/s")
+    root = json.loads(file.read_text())
+    file.write_text(json.dumps({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400}))
+    Path("elsewhere").rename("data/s")
+    collected(lab)
+    assert "missing_since_s" not in json.loads(file.read_text())
+    Path("data/s").rename("elsewhere")
+    assert collected(lab)["objects"] == 0
+
+
 def test_what_git_brought_back_to_a_path_is_live_though_the_root_names_another(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s --factor 2")
