@@ -76,12 +76,12 @@ def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: l
         stage_command.add(program, group, group)
         return
     methods = typer.Typer(help=SUMMARIES.get(group), no_args_is_help=True, rich_markup_mode=None)
-    for name in names:
-        method = name.partition(".")[2]
-        if method in arguments:
-            stage_command.add(methods, name, method)
-        else:  # a broken method spoils itself alone
-            methods.command(method, help=registry.summary(name))(_nothing)
+    by_method = {name.partition(".")[2]: name for name in names}
+    asked = [method for method in by_method if method in arguments]
+    for method in asked:  # and no other: a broken method spoils itself alone
+        stage_command.add(methods, by_method[method], method)
+    for method in () if asked else by_method:
+        methods.command(method, help=registry.summary(by_method[method]))(_nothing)
     program.add_typer(methods, name=group)
 
 
