@@ -1,16 +1,24 @@
-"""Trials as folders: finding them, naming their recordings, and what a folder must hold. Imports nothing heavy."""
+"""Trials as folders: how they are read, found and named, and what one must hold. Imports nothing heavy."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Files
 
 PREFIX = "data_sample_"
+
+
+@dataclass(frozen=True)
+class Params:
+    """How trials are read."""
+
+    authors_role: str = ""  # part of the authors' split that this folder is: train, val or test; empty if none
 
 
 def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:

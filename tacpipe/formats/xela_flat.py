@@ -6,10 +6,10 @@ clock: only the mean rate is known, so the stamps are made from it and say so. R
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.formats.folders import Params, trials
 from tacpipe.stage import Files, Recording, stage
 
 if TYPE_CHECKING:
@@ -20,17 +20,8 @@ NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, "meta_data.csv")
 MADE = "from mean rate"
 
 
-@dataclass(frozen=True)
-class Params:
-    """How trials are read."""
-
-    authors_role: str = ""  # part of the authors' split that this folder is: train, val or test; empty if none
-
-
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each trial below ``source`` by recording name. Raises `TacpipeError` if there is no trial."""
-    from tacpipe.formats.folders import trials
-
     return trials(source, NAMES)
 
 

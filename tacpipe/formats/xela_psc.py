@@ -6,11 +6,11 @@ are the seconds in robot_state.csv. Trials begin and end in the grasp.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.folders import Params, trials
 from tacpipe.stage import Files, Recording, stage
 
 if TYPE_CHECKING:
@@ -22,17 +22,8 @@ NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, LABELS, "meta_da
 ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R Rᵀ - 1 that is let through; the recordings stay below 1e-5
 
 
-@dataclass(frozen=True)
-class Params:
-    """How trials are read."""
-
-    authors_role: str = ""  # part of the authors' split that this folder is: train, val or test; empty if none
-
-
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each trial below ``source`` by recording name. Raises `TacpipeError` if there is no trial."""
-    from tacpipe.formats.folders import trials
-
     return trials(source, NAMES)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.xela_flat import Params, discover, xela_flat
+from tacpipe.formats.folders import Params
+from tacpipe.formats.xela_flat import discover, xela_flat
 from tacpipe.stage import Recording
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))

@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.xela_psc import Params, discover, xela_psc
+from tacpipe.formats.folders import Params
+from tacpipe.formats.xela_psc import discover, xela_psc
 from tacpipe.stage import Recording
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
