@@ -16,8 +16,8 @@ from tacpipe.store import Store
 _DRAFT = ".draft"
 
 
-def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) -> None:
-    """Make ``directory`` show ``manifest``: a root in the store, then shards linked, the manifest last.
+def publish(store: Store, manifest: Manifest, directory: Path) -> None:
+    """Make ``directory`` show ``manifest``: a root in the store, then shards linked (recordings copied), the manifest last.
 
     The root comes first so that what a killed run left behind is known to be ours.
     What an earlier manifest named and this one does not is removed. Raises `UsageError` if the directory holds
@@ -36,7 +36,7 @@ def publish(store: Store, manifest: Manifest, directory: Path, *, copy: bool) ->
         for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
             draft.unlink()  # of a process that was killed
         for path in stale:
-            place(store, wanted[path], directory / path, copy=copy)
+            place(store, wanted[path], directory / path, copy=manifest.recorded)
         _remove(directory, _named(directory) - set(wanted))
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))

@@ -41,8 +41,8 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
 
     Raises `UsageError` if a pattern matches no recording.
     """
-    directory, content = manifest_of.read_manifest(path)
-    manifest = manifest_of.parse(content, str(directory / manifest_of.NAME))
+    found = manifest_of.find(path)
+    manifest, directory = found.manifest, found.directory
     if manifest.inputs:
         raise UsageError(
             f"{directory} was made by {manifest.stage} from other datasets, and the next run would undo its labels. "
@@ -50,15 +50,15 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
         )
     names: set[str] = set()
     for pattern in patterns:
-        found = {name for name in manifest.recordings if fnmatchcase(name, pattern)}
-        if not found:
+        matching = {name for name in manifest.recordings if fnmatchcase(name, pattern)}
+        if not matching:
             some = ", ".join(sorted(manifest.recordings)[:5])
             raise UsageError(f"{directory} has no recording {pattern}; it has {len(manifest.recordings)}: {some} …")
-        names |= found
+        names |= matching
     store = locate(directory)
     store.prepare()
-    store.put(content)
+    store.put(found.content)
     changed = manifest.labelled({name: dict(labels) for name in sorted(names)})
     store.put(changed.content)
-    directory_of.publish(store, changed, directory, copy=not changed.chain)
+    directory_of.publish(store, changed, directory)
     return directory

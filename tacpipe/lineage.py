@@ -7,7 +7,6 @@ from typing import Any
 
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.hashing import bytes_digest
 from tacpipe.manifest import Manifest
 from tacpipe.store import Store, locate
 
@@ -21,13 +20,13 @@ def of(path: Path) -> dict[str, Any]:
     if path.is_file() and path.name != manifest_of.NAME:
         if root is None:
             raise UsageError(f"{path} was not written by tacpipe, or into another store than {store.root}.")
-        content = store.read(root["manifest"])
+        found = manifest_of.Found(path.parent, store.read(root["manifest"]))
     else:
-        _, content = manifest_of.read_manifest(path)
-    manifest = manifest_of.parse(content, str(path))
-    places = {found["manifest"]: found["path"] for found in store.roots()}
-    tree = _node(store, manifest, bytes_digest(content), places)
-    return {**tree, "provenance": _provenance(store, bytes_digest(content)), "changes": _changes(store, root, manifest)}
+        found = manifest_of.find(path)
+    places = {other["manifest"]: other["path"] for other in store.roots()}
+    tree = _node(store, found.manifest, found.digest, places)
+    changed = _changes(store, root, found.manifest)
+    return {**tree, "provenance": _provenance(store, found.digest), "changes": changed}
 
 
 def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, UsageError
-from tacpipe.hashing import digest
+from tacpipe.hashing import bytes_digest, digest
 from tacpipe.stage import Attribute
 
 FORMAT = 1
@@ -51,6 +51,11 @@ class Manifest:
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
         value = {"format": FORMAT, "digest": self.digest, **fields}
         return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode() + b"\n"
+
+    @property
+    def recorded(self) -> bool:
+        """Whether this is a dataset of recordings: it was made from no other dataset."""
+        return bool(self.recordings) and not self.inputs
 
     @property
     def included(self) -> dict[str, Entry]:
@@ -117,12 +122,30 @@ def shard_path(recording: str, stream: str) -> str:
     return f"{recording}/{stream}.parquet" if stream else f"{recording}.parquet"
 
 
-def read_manifest(path: Path | str) -> tuple[Path, bytes]:
-    """Return the directory of the dataset at ``path`` (it or its manifest) and the bytes of its manifest."""
+@dataclass(frozen=True)
+class Found:
+    """A manifest as it was found: the directory of its dataset, and its bytes."""
+
+    directory: Path
+    content: bytes
+
+    @cached_property
+    def digest(self) -> str:
+        """The digest of the manifest file."""
+        return bytes_digest(self.content)
+
+    @cached_property
+    def manifest(self) -> Manifest:
+        """The manifest, checked. Raises `DamagedError` if it was edited by hand."""
+        return parse(self.content, str(self.directory / NAME))
+
+
+def find(path: Path | str) -> Found:
+    """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself)."""
     given = Path(path)
     file = given if given.name == NAME else given / NAME
     try:
-        return file.parent, file.read_bytes()
+        return Found(file.parent, file.read_bytes())
     except (FileNotFoundError, NotADirectoryError):
         what = "is empty or not there" if not given.exists() else f"has no {NAME}"
         raise UsageError(

@@ -38,7 +38,7 @@ class Outcome:
 
 def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
-    found = request_of.read(Path(path))
+    found = manifest.find(path)
     return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),)))
 
 
@@ -256,8 +256,8 @@ class _Run:
     def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
         source = f"{self.request.source}/"  # where the files lay is no part of a manifest
         self.outcome.bad.update({name: bad[name].error.replace(source, "") for name in sorted(bad)})
-        damaged_only = all(done.exit_code == TacpipeError.exit_code for done in bad.values())
-        if not bad or (self.request.skip_bad and damaged_only):
+        ordinary = all(done.exit_code == TacpipeError.exit_code for done in bad.values())
+        if not bad or (self.request.skip_bad and ordinary):
             return
         lines = "\n".join(f"  {recording}: {bad[recording].error}" for recording in sorted(bad))
         plural = "recordings" if len(bad) > 1 else "recording"
@@ -302,10 +302,10 @@ def _error(exit_code: int, sentence: str) -> TacpipeError:
 
 def _keep_labels(request: Request, made: Manifest) -> Manifest:
     """Return recordings with the labels that were set by hand on those they replace."""
-    if request.datasets or not made.recordings or request.single_file:
+    if not made.recorded:
         return made
     try:
-        labels = request_of.read(request.output).manifest.labels
+        labels = manifest.find(request.output).manifest.labels
     except TacpipeError:
         return made
     return made.labelled(labels) if labels else made
@@ -330,8 +330,7 @@ def _publish(store: Store, request: Request, made: Manifest) -> None:
         if request.single_file:
             _publish_file(store, request, made)
         else:
-            recordings = not request.datasets and bool(made.recordings)
-            directory.publish(store, made, request.output, copy=recordings)
+            directory.publish(store, made, request.output)
     except OSError as error:
         raise TacpipeError(
             f"{request.output} cannot be written: {error.strerror or error}. The result is kept in the store: run the same "

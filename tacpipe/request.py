@@ -11,8 +11,8 @@ from typing import Any
 from tacpipe import execution, manifest, registry
 from tacpipe import params as params_of
 from tacpipe.errors import UsageError
-from tacpipe.hashing import bytes_digest, file_digest
-from tacpipe.manifest import Entry, Manifest
+from tacpipe.hashing import file_digest
+from tacpipe.manifest import Entry, Found, Manifest
 from tacpipe.stage import Stage
 from tacpipe.store import locate
 
@@ -44,33 +44,15 @@ class Request:
         return self.output.suffix == ".html"
 
 
-@dataclass(frozen=True)
-class Input:
-    """A dataset as it was found: its directory and the bytes of its manifest."""
-
-    directory: Path
-    content: bytes
-
-    @cached_property
-    def digest(self) -> str:
-        """The digest of the manifest file."""
-        return bytes_digest(self.content)
-
-    @cached_property
-    def manifest(self) -> Manifest:
-        """The manifest, checked."""
-        return manifest.parse(self.content, str(self.directory / manifest.NAME))
-
-
 class Inputs:
     """All that a request reads."""
 
     def __init__(self, request: Request) -> None:
         self.request = request
         self.stage = registry.load(request.name)
-        self.datasets = [read(path) for path in request.datasets]
-        self.named: dict[str, Input] = {
-            name: read(path)
+        self.datasets = [manifest.find(path) for path in request.datasets]
+        self.named: dict[str, Found] = {
+            name: manifest.find(path)
             for name in ("model", "split", "codec", "extend", "init")
             if (path := getattr(request, name)) is not None
         }
@@ -102,7 +84,7 @@ class Inputs:
         }
 
     @property
-    def used(self) -> list[Input]:
+    def used(self) -> list[Found]:
         """All datasets that were given."""
         return [*self.datasets, *self.named.values()]
 
@@ -156,12 +138,7 @@ class Inputs:
         return chosen
 
 
-def read(path: Path) -> Input:
-    """Return the dataset at ``path`` as it was found."""
-    return Input(*manifest.read_manifest(path))
-
-
-def split_digest(split: Input) -> str:
+def split_digest(split: Found) -> str:
     """Return the digest of the table of a split."""
     recordings = split.manifest.recordings
     if set(recordings) != {"split"}:

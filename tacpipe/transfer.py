@@ -10,7 +10,6 @@ from tacpipe import directory as directory_of
 from tacpipe import execution, garbage
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.hashing import bytes_digest
 from tacpipe.store import MissingError, Store, locate, project
 
 
@@ -33,12 +32,12 @@ def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
     there.prepare()
     for path in paths:
         here = locate(path)
-        directory, content = manifest_of.read_manifest(path)
-        manifest_of.parse(content, str(directory))
+        found = manifest_of.find(path)
+        found.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
         here.prepare()
-        here.put(content)
-        _copy(here, there, bytes_digest(content), done, beside=(str(directory.absolute()),), ancestors=ancestors)
-        there.set_root(_name(directory), bytes_digest(content))
+        here.put(found.content)
+        _copy(here, there, found.digest, done, beside=(str(found.directory.absolute()),), ancestors=ancestors)
+        there.set_root(_name(found.directory), found.digest)
     return done
 
 
@@ -52,18 +51,17 @@ def pull(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
         here = locate(directory if directory.exists() else None)
         here.prepare()
         if (directory / manifest_of.NAME).exists():
-            content = (directory / manifest_of.NAME).read_bytes()
-            manifest_of.parse(content, str(directory))
-            here.put(content)
+            found = manifest_of.find(directory)
+            found.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
+            here.put(found.content)
         else:
             root = there.get_root(_name(directory))
             if root is None:
-                known = ", ".join(sorted(found["path"] for found in there.roots())) or "nothing"
+                known = ", ".join(sorted(other["path"] for other in there.roots())) or "nothing"
                 raise UsageError(f"{remote} has no dataset {_name(directory)}; it has {known}.")
-            content = there.read(root["manifest"])
-        _copy(there, here, bytes_digest(content), done, beside=(), ancestors=ancestors)
-        manifest = manifest_of.parse(content, str(directory))
-        directory_of.publish(here, manifest, directory, copy=bool(manifest.sources))
+            found = manifest_of.Found(directory, there.read(root["manifest"]))
+        _copy(there, here, found.digest, done, beside=(), ancestors=ancestors)
+        directory_of.publish(here, found.manifest, directory)
     return done
 
 

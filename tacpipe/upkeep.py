@@ -79,21 +79,21 @@ def repair(store: Store) -> Soundness:
 
 def link(path: Path) -> int:
     """Link the shards of the dataset at ``path`` anew where they do not match its manifest; return how many."""
-    directory, content = manifest_of.read_manifest(path)
-    manifest = manifest_of.parse(content, str(directory / manifest_of.NAME))
+    found = manifest_of.find(path)
+    manifest, directory = found.manifest, found.directory
     store = locate(directory)
     store.prepare()
     read = execution.reader(store, (str(directory.absolute()),))
     count = 0
     for name, digest in manifest.objects():
-        if not store.has(digest):
-            read(digest, name)
-        if not (directory / name).exists() or file_digest(directory / name) != digest:
-            read(digest, name)
-            directory_of.place(store, digest, directory / name, copy=bool(manifest.sources))
+        matches = (directory / name).exists() and file_digest(directory / name) == digest
+        if not (matches and store.has(digest)):
+            read(digest, name)  # heals the store first
+        if not matches:
+            directory_of.place(store, digest, directory / name, copy=manifest.recorded)
             count += 1
-    store.put(content)
-    directory_of.publish(store, manifest, directory, copy=bool(manifest.sources))
+    store.put(found.content)
+    store.set_root(directory.absolute(), found.digest)
     return count
 
 
@@ -127,8 +127,7 @@ def _wanted(store: Store) -> dict[str, str]:
     wanted = {}
     for root in store.roots():
         try:
-            _, content = manifest_of.read_manifest(Path(root["path"]))
-            objects = list(manifest_of.parse(content, root["path"]).objects())
+            objects = list(manifest_of.find(root["path"]).manifest.objects())
         except TacpipeError:
             continue
         wanted.update({name: path for path, name in objects if not store.has(name)})

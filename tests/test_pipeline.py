@@ -29,7 +29,7 @@ def replace_stream(lab: Lab, path: str, recording: str, stream: str, table: pa.T
     recordings = {**manifest.recordings, recording: {**entry, "shards": shards}}
     changed = Manifest(manifest.stage, manifest.version, manifest.params, recordings=recordings)
     lab.store.put(changed.content)
-    directory.publish(lab.store, changed, lab.folder / path, copy=True)
+    directory.publish(lab.store, changed, lab.folder / path)
 
 
 def test_a_chain_gives_what_the_functions_give(lab: Lab) -> None:
@@ -62,7 +62,7 @@ def test_a_new_recording_costs_one_recording(lab: Lab) -> None:
     fewer = {name: entry for name, entry in manifest.recordings.items() if name != "trial-004"}
     small = Manifest(manifest.stage, manifest.version, manifest.params, recordings=fewer)
     lab.store.put(small.content)
-    directory.publish(lab.store, small, Path("data/few"), copy=True)
+    directory.publish(lab.store, small, Path("data/few"))
     lab.run("scale data/few -o data/sf --factor 7")
     assert counts(lab.run("scale data/r -o data/sf --factor 7 --json").out) == (1, 4)
 

@@ -46,7 +46,7 @@ def record_anew(folder: Path, name: str, entry: dict[str, object]) -> None:
     changed = Manifest(before.stage, before.version, before.params, recordings={**before.recordings, name: entry})
     store = Store(folder / ".tacpipe")
     store.put(changed.content)
-    directory.publish(store, changed, folder / "data/recordings", copy=True)
+    directory.publish(store, changed, folder / "data/recordings")
 
 
 def test_one_changed_recording_costs_one_shard_in_every_stage(lab: Path) -> None:
