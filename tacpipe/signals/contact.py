@@ -1,4 +1,4 @@
-"""When something is touched: the load on a sensor and the intervals in which there is some."""
+"""When something is touched: the level without load, the load on a sensor and the intervals in which there is some."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
+from tacpipe.signals.runs import latched, runs
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -26,6 +27,23 @@ def rest_level(values: NDArray[Any], t_ns: Times, rest_s: float) -> Floats:
     return level
 
 
+def axis_mean_level(values: NDArray[Any], axes: int = 3) -> Floats:
+    """Return what to take off each channel of ``values`` (time, channel) so that all taxels of an axis begin alike.
+
+    In the first row they then have the whole part of that axis' mean over the taxels, not 0, as in the authors'
+    notebooks; (channel,). The channels go taxel by taxel, ``axes`` to a taxel.
+
+    >>> axis_mean_level(np.array([[10, 1, 13, 2]]), axes=2).tolist()
+    [-1.0, 0.0, 2.0, 1.0]
+    """
+    _require_taxels(values, axes)
+    if not len(values):
+        raise TacpipeError("The level at rest cannot be told from a recording without rows.")
+    first = values[0].astype(np.float64).reshape(-1, axes)  # (taxel, axis)
+    level: Floats = (first - np.trunc(first.mean(axis=0))).ravel()
+    return level
+
+
 def load(values: NDArray[Any], rest: Floats, axes: int = 3) -> Floats:
     """Return how far the taxels are from ``rest`` on average (time,), in the unit of ``values``.
 
@@ -35,9 +53,8 @@ def load(values: NDArray[Any], rest: Floats, axes: int = 3) -> Floats:
     >>> load(np.array([[3.0, 4.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros(6)).tolist()
     [3.0]
     """
+    _require_taxels(values, axes)
     time, channels = values.shape
-    if not channels or channels % axes:
-        raise TacpipeError(f"{channels} tactile channels are not whole taxels of {axes} axes; check the columns.")
     taxels = (values - rest).reshape(time, channels // axes, axes)  # (time, taxel, axis)
     distance: Floats = np.sqrt(np.einsum("tna,tna->tn", taxels, taxels)).mean(axis=1)
     return distance
@@ -54,7 +71,7 @@ def contact_intervals(
     """
     if not 0 <= off <= on:
         raise TacpipeError(f"Contact that starts at {on} and ends below {off} flickers; off must lie between 0 and on.")
-    starts, stops = _runs(_hysteresis(load, on, off))
+    starts, stops = runs(latched(load >= on, load < off))
     if not len(starts):
         return np.zeros((0, 2), dtype=np.int64)
     apart = t_ns[starts[1:]] - t_ns[stops[:-1] - 1] > round(merge_s * 1e9)  # (contact - 1,)
@@ -70,15 +87,7 @@ def contact_intervals(
     return np.stack([first, last], axis=1).astype(np.int64)
 
 
-def _hysteresis(load: Floats, on: float, off: float) -> NDArray[np.bool_]:
-    """Return where the state is on (time,): each row takes the state of the last row that decided one."""
-    decided = (load >= on) | (load < off)
-    rows = np.maximum.accumulate(np.where(decided, np.arange(len(load)), -1))
-    state: NDArray[np.bool_] = (rows >= 0) & (load[rows] >= on)
-    return state
-
-
-def _runs(state: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first rows and the stops, exclusive, of the runs of True."""
-    edges = np.diff(np.concatenate([[False], state, [False]]).astype(np.int8))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+def _require_taxels(values: NDArray[Any], axes: int) -> None:
+    channels = values.shape[1]
+    if not channels or channels % axes:
+        raise TacpipeError(f"{channels} tactile channels are not whole taxels of {axes} axes; check the columns.")

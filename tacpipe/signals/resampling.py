@@ -69,6 +69,21 @@ def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
     return turned
 
 
+def median_around(t_ns: Times, values: NDArray[Any], grid_ns: Times, half_ns: int) -> Floats:
+    """Return the median of the samples at most ``half_ns`` from each grid point, float64 (grid, channel).
+
+    ``values`` are (time, channel). Where no sample is that near, the value is that of `linear`.
+    """
+    found = linear(t_ns, values, grid_ns)
+    first = np.searchsorted(t_ns, grid_ns - half_ns, side="left")
+    count = np.searchsorted(t_ns, grid_ns + half_ns, side="right") - first
+    for samples in np.unique(count[count > 0]).tolist():  # few different ones: about as many come in each window
+        points = np.flatnonzero(count == samples)
+        windows = values[first[points, None] + np.arange(samples)]  # (point, sample, channel)
+        found[points] = np.median(windows, axis=1)
+    return found
+
+
 def bracketing_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
     """Return, sorted, the rows that `linear` and `slerp` look at: with those alone they give the same.
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.contact import contact_intervals, load, rest_level
+from tacpipe.signals.contact import axis_mean_level, contact_intervals, load, rest_level
 
 MS = 1_000_000
 loads = hnp.arrays(np.float64, st.integers(1, 80), elements=st.floats(0, 10))
@@ -37,6 +37,18 @@ def test_the_load_is_the_mean_length_of_the_taxels_vectors() -> None:
 def test_channels_that_are_no_whole_taxels_are_refused() -> None:
     with pytest.raises(TacpipeError, match="4 tactile channels are not whole taxels of 3 axes"):
         load(np.zeros((1, 4)), np.zeros(4))
+
+
+def test_by_the_axis_mean_all_taxels_begin_at_its_whole_part() -> None:
+    values = np.random.default_rng(0).integers(14_000, 51_000, (5, 48)).astype(np.uint16)
+    tared = values - axis_mean_level(values)
+    means = values[0].reshape(16, 3).mean(axis=0)
+    assert tared[0].reshape(16, 3).tolist() == [[int(mean) for mean in means]] * 16
+    np.testing.assert_array_equal(np.diff(tared, axis=0), np.diff(values.astype(float), axis=0))
+    with pytest.raises(TacpipeError, match="not whole taxels of 5 axes"):
+        axis_mean_level(values, axes=5)
+    with pytest.raises(TacpipeError, match="without rows"):
+        axis_mean_level(values[:0])
 
 
 def test_between_off_and_on_the_state_stays() -> None:

@@ -130,3 +130,17 @@ def test_a_signal_without_samples_is_refused(signal: object) -> None:
 def test_one_sample_is_its_value_everywhere() -> None:
     assert resampling.linear(np.array([5]), np.array([[2.0]]), np.array([0, 5, 9]))[:, 0].tolist() == [2.0, 2.0, 2.0]
     assert resampling.nearest_rows(np.array([5]), np.array([0, 9])).tolist() == [0, 0]
+
+
+@given(stamps, st.data())
+def test_the_median_around_a_point_is_that_of_all_samples_so_near(t_ns: np.ndarray, data: st.DataObject) -> None:
+    t_ns = np.sort(np.concatenate([t_ns, t_ns[::3]]))  # some stamps twice
+    values = np.random.default_rng(0).normal(size=(len(t_ns), 2))
+    grid_ns = np.array(data.draw(st.lists(st.integers(-10, int(t_ns[-1]) + 10), min_size=1)))
+    half_ns = data.draw(st.integers(0, 2 * 10**9))
+    found = resampling.median_around(EPOCH_NS + t_ns, values, EPOCH_NS + grid_ns, half_ns)
+    between = resampling.linear(t_ns, values, grid_ns)
+    for point, row, line in zip(grid_ns, found, between, strict=True):
+        near = np.abs(t_ns - point) <= half_ns
+        wanted = np.median(values[near], axis=0) if near.any() else line
+        np.testing.assert_array_equal(row, wanted)

@@ -1,0 +1,233 @@
+"""Whether a forecast warns of a change before it begins, and how often it warns of nothing.
+
+A curve of forecasts drawn at the time they are made always looks early if it is any good, and also if it overshoots;
+so warnings are counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) in row t the forecast, made at t, of
+``truth`` k rows later, k being the ``horizon``; NaN where there is none. ``groups`` (time,) numbers recordings or
+contacts, equal neighbours belong together, and nothing is told across them. Each feature is judged by itself.
+
+- A *change* is a run of rows t in which |z_t - z_{t-k}| is beyond 3 times its standard deviation sd in calibration data,
+  until it is below 1.5 times. A run that begins within 2 k rows of the end of the last belongs to it: a difference over
+  k rows repeats a short push with the other sign k rows later, and what warns of a change needs k rows of quiet before.
+- An *event* is the onset of a change: where the run begins, at t, the row after the last of t - k, ..., t - 1 that is
+  within a twentieth of z_t - z_{t-k} from z_{t-k}. Were it t itself, a forecast that merely follows would look early,
+  because a change that takes time has begun before it is beyond 3 sd.
+- An *alarm* is on in a row in which |ahead_t - z_t| > theta. It *leads* an event at T if it is on in one of the rows
+  T - k, ..., T - 1, by T less the first of them: what k rows foretell is never known more than k rows before.
+- A *false alarm* is one in a row that is free of events: with a forecast whose k rows are in the group, and before
+  T - k - k/5 or from the end of the change on for every event T. An alarm stands for the k rows that it foretells: one
+  that is still on after these is the next, so that an alarm that never ends is no rare one.
+
+Events that do not have a forecast in each of the k rows before are not counted: they could not be led by k rows.
+Persistence forecasts no change, hence never alarms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.signals.runs import latched, runs
+
+Floats = NDArray[np.floating[Any]]
+Flags = NDArray[np.bool_]
+Rows = NDArray[np.intp]
+
+ON_SD, OFF_SD = 3.0, 1.5  # of the differences, between which a change begins and ends
+ONSET_SHARE = 0.05  # of a change, up to which it has not begun
+EARLY_SHARE = 0.2  # of the horizon, by which an alarm may come too early and still not be false
+FALSE_ALARMS_PER_MINUTE = 1.0  # of each feature, where nothing happens
+
+
+@dataclass(frozen=True)
+class Anticipation:
+    """How well changes were foretold, over all features; NaN where nothing tells."""
+
+    events: int
+    recall: float  # share of the events that an alarm leads
+    median_lead_rows: float  # of the events that an alarm leads
+    median_lead_frames: float  # new frames from alarm to event, the event's own included
+    false_alarms_per_minute: float  # and feature, in rows free of events
+
+
+def difference_sd(truth: Floats, groups: NDArray[Any], *, horizon: int) -> Floats:
+    """Return the standard deviation of z_t - z_{t-k} of each feature (feature,), over the rows that have one; else 0."""
+    _check(truth, horizon, groups=groups)
+    moved = _moved(truth.astype(np.float64), _stretches(groups), horizon)
+    known = np.isfinite(moved)
+    count = np.maximum(known.sum(axis=0), 1)
+    moved = np.where(known, moved, 0)
+    mean = moved.sum(axis=0) / count
+    found: Floats = np.sqrt(np.square(np.where(known, moved - mean, 0)).sum(axis=0) / count)
+    return found
+
+
+def changes(truth: Floats, groups: NDArray[Any], *, horizon: int, sd: Floats) -> list[NDArray[np.intp]]:
+    """Return the onset and the end, exclusive, of the changes of each feature, each (change, 2).
+
+    ``sd`` (feature,) is that of `difference_sd`; a feature whose is 0 never changes.
+    """
+    _check(truth, horizon, groups=groups, sd=sd)
+    stretches = _stretches(groups)
+    spaced = _spaced(stretches, horizon)
+    moved = _moved(truth.astype(np.float64), stretches, horizon)
+    return [
+        _changes_of(truth[:, feature], moved[:, feature], spaced, horizon, float(sd[feature]))
+        for feature in range(truth.shape[1])
+    ]
+
+
+def calibrate(
+    truth: Floats, ahead: Floats, groups: NDArray[Any], *, horizon: int, sd: Floats, rate_hz: float
+) -> Floats:
+    """Return theta (feature,): the least that gives no more than one false alarm a minute in this data.
+
+    ``rate_hz`` is the rate of rows. Infinite for a feature without a row that is free of events: no alarm is known to be
+    rare enough there.
+    """
+    _check(truth, horizon, groups=groups, ahead=ahead, sd=sd)
+    stretches = _stretches(groups)
+    spaced = _spaced(stretches, horizon)
+    found = np.full(truth.shape[1], np.inf)
+    for feature, those in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
+        deviation = np.abs(ahead[:, feature] - truth[:, feature])
+        free = _free(deviation, those, stretches, horizon)
+        if not free.any():
+            continue
+        allowed = FALSE_ALARMS_PER_MINUTE * _minutes(free, rate_hz)
+        levels = np.unique(deviation[free])
+        low, high = 0, len(levels) - 1  # the highest level is never passed, and what passes a lower one passes it too
+        while low < high:
+            middle = (low + high) // 2
+            if _count(spaced[free & (deviation > levels[middle])], horizon, allowed) > allowed:
+                low = middle + 1
+            else:
+                high = middle
+        found[feature] = levels[low]
+    return found
+
+
+def score(
+    truth: Floats,
+    ahead: Floats,
+    groups: NDArray[Any],
+    *,
+    horizon: int,
+    sd: Floats,
+    theta: Floats,
+    rate_hz: float,
+    held: Flags | None = None,
+) -> Anticipation:
+    """Return how well ``ahead`` foretells the changes of ``truth`` with alarms beyond ``theta`` (feature,).
+
+    ``held`` (time,) marks rows that repeat the frame before; None: every row is a new frame.
+    """
+    _check(truth, horizon, groups=groups, ahead=ahead, sd=sd, theta=theta)
+    stretches = _stretches(groups)
+    spaced = _spaced(stretches, horizon)
+    fresh_so_far = np.cumsum(np.ones(len(truth), dtype=bool) if held is None else ~held)
+    events, false_alarms, minutes = 0, 0, 0.0
+    leads: list[tuple[int, int]] = []  # in rows and in frames
+    for feature, those in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
+        deviation = np.abs(ahead[:, feature] - truth[:, feature])
+        alarm = deviation > theta[feature]
+        for onset in those[:, 0]:
+            first = onset - horizon
+            if first < 0 or stretches[first] != stretches[onset] or not np.isfinite(deviation[first:onset]).all():
+                continue
+            events += 1
+            if alarm[first:onset].any():
+                row = first + int(alarm[first:onset].argmax())
+                leads.append((int(onset - row), int(fresh_so_far[onset] - fresh_so_far[row])))
+        free = _free(deviation, those, stretches, horizon)
+        false_alarms += _count(spaced[free & alarm], horizon)
+        minutes += _minutes(free, rate_hz)
+    rows, frames = (float(one) for one in np.median(leads, axis=0)) if leads else (np.nan, np.nan)
+    return Anticipation(
+        events,
+        len(leads) / events if events else np.nan,
+        rows,
+        frames,
+        false_alarms / minutes if minutes else np.nan,
+    )
+
+
+def _stretches(groups: NDArray[Any]) -> Rows:
+    """Return the number of the group of each row (time,), so that no number comes twice."""
+    begins = np.ones(len(groups), dtype=bool)
+    begins[1:] = groups[1:] != groups[:-1]
+    return np.cumsum(begins)
+
+
+def _spaced(stretches: Rows, horizon: int) -> Rows:
+    """Return row numbers (time,) between which groups lie so far apart that nothing of one is near another."""
+    return np.arange(len(stretches)) + stretches * 2 * horizon
+
+
+def _moved(truth: Floats, stretches: Rows, horizon: int) -> Floats:
+    """Return z_t - z_{t-k} (time, feature), NaN in the first k rows of each group."""
+    moved = np.full(truth.shape, np.nan)
+    within = stretches[horizon:] == stretches[:-horizon]
+    moved[horizon:][within] = (truth[horizon:] - truth[:-horizon])[within]
+    return moved
+
+
+def _changes_of(truth: Floats, moved: Floats, spaced: Rows, horizon: int, sd: float) -> Rows:
+    """Return onset and end of the changes (change, 2) of one feature, ``truth`` and ``moved`` each (time,)."""
+    size = np.abs(moved)
+    on = (size > ON_SD * sd) & (sd > 0)
+    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # where nothing is known, nothing goes on
+    if not len(starts):
+        return np.zeros((0, 2), dtype=np.intp)
+    apart = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
+    starts, stops = starts[np.append(True, apart)], stops[np.append(apart, True)]
+    before = starts[:, None] + np.arange(-horizon, 0)  # (change, row)
+    begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_SHARE * size[starts][:, None]
+    lasts = np.argmin(begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
+    return np.stack([starts - lasts, stops], axis=1)
+
+
+def _free(deviation: Floats, those: Rows, stretches: Rows, horizon: int) -> Flags:
+    """Return which rows (time,) have a forecast that its group holds and are not near a change of ``those``."""
+    free: Flags = np.isfinite(deviation)
+    free[max(len(free) - horizon, 0) :] = False
+    free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
+    early = horizon + round(EARLY_SHARE * horizon)
+    for onset, stop in those:
+        near = slice(max(onset - early, 0), stop)
+        free[near] &= stretches[near] != stretches[onset]
+    return free
+
+
+def _count(alarms: Rows, horizon: int, enough: float = np.inf) -> int:
+    """Return how many alarms the rows ``alarms`` are, sorted: each stands for the k rows after it, too.
+
+    No choice of rows more than k apart is larger, so that more rows never make fewer alarms. Counts no further than one
+    beyond ``enough``.
+    """
+    count, at = 0, 0
+    while at < len(alarms) and count <= enough:
+        count += 1
+        at = int(np.searchsorted(alarms, alarms[at] + horizon, side="right"))
+    return count
+
+
+def _minutes(rows: Flags, rate_hz: float) -> float:
+    return float(rows.sum()) / rate_hz / 60
+
+
+def _check(truth: Floats, horizon: int, *, groups: NDArray[Any], **others: Floats) -> None:
+    """Refuse what cannot be judged."""
+    if horizon < 1:
+        raise TacpipeError(f"A forecast of {horizon} rows foretells nothing; the horizon must be 1 or more.")
+    if truth.ndim != 2 or len(groups) != len(truth):
+        raise TacpipeError(
+            f"Features of {truth.shape} and {len(groups)} group numbers do not fit; there must be one a row."
+        )
+    for name, values in others.items():
+        expected = truth.shape if name == "ahead" else truth.shape[1:]
+        if values.shape != expected:
+            raise TacpipeError(f"{name} of {values.shape} does not fit features of {truth.shape}; give {expected}.")

@@ -1,0 +1,100 @@
+"""Smoothing of evenly spaced samples, with the whole of a signal or with what came so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.float64]
+
+PAD_ROWS = 9  # scipy.signal.filtfilt's default for a filter of second order: three times its three coefficients
+
+
+@dataclass(frozen=True)
+class Biquad:
+    """A filter of second order: ``y[n] = b0 x[n] + b1 x[n-1] + b2 x[n-2] - a1 y[n-1] - a2 y[n-2]``."""
+
+    b: tuple[float, float, float]
+    a: tuple[float, float]  # a1 and a2; a0 is 1
+
+    def causal(self, values: NDArray[Any]) -> Floats:
+        """Return ``values`` (time,) filtered with what came so far, as if the first value had always been there.
+
+        The recursion is the transposed direct form II, its state at first that of a constant input.
+        """
+        (b0, b1, b2), (a1, a2) = self.b, self.a
+        first = float(values[0]) if len(values) else 0.0
+        gain = (b0 + b1 + b2) / (1 + a1 + a2)
+        second_state = (b2 - a2 * gain) * first
+        first_state = (b1 - a1 * gain) * first + second_state
+        found = []
+        for value in values.tolist():  # a recursion; plain numbers are faster than numpy's here
+            smooth = b0 * value + first_state
+            first_state = b1 * value - a1 * smooth + second_state
+            second_state = b2 * value - a2 * smooth
+            found.append(smooth)
+        return np.array(found, dtype=np.float64)
+
+    def both_ways(self, values: NDArray[Any]) -> Floats:
+        """Return ``values`` (time,) filtered forwards and backwards, which shifts nothing in time.
+
+        Both ends are continued by the values before them, turned about the end (odd padding, as scipy.signal.filtfilt).
+        """
+        pad = min(PAD_ROWS, len(values) - 1)
+        if pad < 1:
+            return values.astype(np.float64)
+        before = 2.0 * values[0] - values[pad:0:-1]
+        after = 2.0 * values[-1] - values[-2 : -pad - 2 : -1]
+        forwards = self.causal(np.concatenate([before, values, after]))
+        backwards = self.causal(forwards[::-1])[::-1]
+        return backwards[pad:-pad].copy()
+
+
+def butterworth(cutoff_hz: float, rate_hz: float) -> Biquad:
+    """Return the Butterworth low-pass of second order: gain 1 at rest, 1/sqrt(2) at ``cutoff_hz``.
+
+    By the bilinear transform with the cutoff prewarped (Oppenheim and Schafer, "Discrete-Time Signal Processing", 7.2).
+    Raises `TacpipeError` for a cutoff that is not between 0 and half the rate.
+    """
+    if not 0 < cutoff_hz < rate_hz / 2:
+        raise TacpipeError(
+            f"A cutoff of {cutoff_hz:g} Hz cannot be had at {rate_hz:g} samples a second; it must lie above 0 and below "
+            f"half the rate, {rate_hz / 2:g} Hz."
+        )
+    warped = float(np.tan(np.pi * cutoff_hz / rate_hz))
+    scale = 1 / (1 + np.sqrt(2.0) * warped + warped**2)
+    b0 = float(warped**2 * scale)
+    a1, a2 = 2 * (warped**2 - 1) * scale, (1 - np.sqrt(2.0) * warped + warped**2) * scale
+    return Biquad((b0, 2 * b0, b0), (float(a1), float(a2)))
+
+
+def median(values: NDArray[Any], rows: int) -> Floats:
+    """Return the median of the ``rows`` (odd) around each row of ``values`` (time,); end values go on beyond the ends.
+
+    >>> median(np.array([1, 9, 1, 1, 2]), 3).tolist()
+    [1.0, 1.0, 1.0, 1.0, 2.0]
+    """
+    return _medians(values, rows // 2, rows // 2)
+
+
+def median_so_far(values: NDArray[Any], rows: int) -> Floats:
+    """Return the median of each row of ``values`` (time,) and the ``rows - 1`` before it.
+
+    >>> median_so_far(np.array([1, 9, 1, 2, 2]), 3).tolist()
+    [1.0, 1.0, 1.0, 2.0, 2.0]
+    """
+    return _medians(values, rows - 1, 0)
+
+
+def _medians(values: NDArray[Any], before: int, after: int) -> Floats:
+    if not len(values):
+        return np.zeros(0)
+    padded = np.pad(values.astype(np.float64), (before, after), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, before + after + 1)  # (time, rows)
+    found: Floats = np.median(windows, axis=1)
+    return found

@@ -1,0 +1,103 @@
+"""How fast a serial arm's hand moves, from its joints: exact where differences of logged poses are rough.
+
+A chain is given by its modified Denavit-Hartenberg parameters (Craig, Introduction to Robotics, 1986, section 3.4). Each
+revolute joint adds ``axis × (hand - joint)`` times its speed to the hand's velocity and ``axis`` to its angular one: the
+columns of the geometric Jacobian (Siciliano et al., Robotics, 2009, section 3.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+
+TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Modified Denavit-Hartenberg parameters of revolute joints, each (joint,): lengths in metres, twists in radians."""
+
+    length_m: tuple[float, ...]
+    offset_m: tuple[float, ...]
+    twist_rad: tuple[float, ...]
+
+
+_QUARTER = np.pi / 2
+PANDA = Chain(  # Franka Emika, Panda documentation, "Denavit-Hartenberg parameters"
+    (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088),
+    (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0),
+    (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, _QUARTER, _QUARTER),
+)
+
+
+def joint_frames(chain: Chain, joint_rad: Floats) -> Floats:
+    """Return the pose of each joint's frame in the base's, (time, joint, 4, 4), at angles ``joint_rad`` (time, joint)."""
+    frames = np.empty((*joint_rad.shape, 4, 4))
+    reached = np.broadcast_to(np.eye(4), (len(joint_rad), 4, 4))
+    for joint, (length, offset, twist) in enumerate(zip(chain.length_m, chain.offset_m, chain.twist_rad, strict=True)):
+        cos, sin = np.cos(joint_rad[:, joint]), np.sin(joint_rad[:, joint])
+        tilt_cos, tilt_sin = np.cos(twist), np.sin(twist)
+        step = np.zeros((len(joint_rad), 4, 4))
+        step[:, 0, 0], step[:, 0, 1], step[:, 0, 3] = cos, -sin, length
+        step[:, 1, 0], step[:, 1, 1], step[:, 1, 2], step[:, 1, 3] = (
+            sin * tilt_cos,
+            cos * tilt_cos,
+            -tilt_sin,
+            -offset * tilt_sin,
+        )
+        step[:, 2, 0], step[:, 2, 1], step[:, 2, 2], step[:, 2, 3] = (
+            sin * tilt_sin,
+            cos * tilt_sin,
+            tilt_cos,
+            offset * tilt_cos,
+        )
+        step[:, 3, 3] = 1.0
+        reached = reached @ step
+        frames[:, joint] = reached
+    return frames
+
+
+def carries(chain: Chain, joint_rad: Floats, hand_m: Floats) -> bool:
+    """Return whether a hand at ``hand_m`` (time, 3) hangs rigidly on the chain's last link: whether it is this arm.
+
+    Rows that are not finite do not tell.
+    """
+    known = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
+    last, hand_m = joint_frames(chain, joint_rad[known])[:, -1], hand_m[known]
+    tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])  # (time, 3), in the last link's frame
+    return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
+
+
+def hand_velocity(chain: Chain, joint_rad: Floats, joint_rad_s: Floats, hand_m: Floats) -> Floats:
+    """Return linear (m/s) and angular (rad/s) velocity of the hand in the base's frame, (time, 6).
+
+    ``joint_rad`` and ``joint_rad_s`` are (time, joint), ``hand_m`` (time, 3).
+    """
+    frames = joint_frames(chain, joint_rad)
+    axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
+    linear = np.einsum("tja,tj->ta", np.cross(axes, hand_m[:, None] - places), joint_rad_s)
+    angular = np.einsum("tja,tj->ta", axes, joint_rad_s)
+    return np.hstack([linear, angular])
+
+
+def differences(t_ns: NDArray[np.int64], position_m: Floats, quaternions: Floats) -> Floats:
+    """Return linear (m/s) and angular (rad/s) velocity from each row and the one before, (time, 6); 0 in the first.
+
+    ``quaternions`` (time, 4) are x, y, z, w, of unit length and continuous sign. Between neighbours the rotation is
+    small, so its vector is twice the vector part of their ratio. Only rows up to the own one are read.
+    """
+    velocity = np.zeros((len(t_ns), 6))
+    step_s = np.diff(t_ns) / 1e9
+    step_s = np.where(step_s > 0, step_s, np.inf)[:, None]
+    velocity[1:, :3] = np.diff(position_m, axis=0) / step_s
+    before, after = quaternions[:-1], quaternions[1:]
+    turned = (
+        before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] - np.cross(after[:, :3], before[:, :3])
+    )  # (time - 1, 3), the vector part of after times the inverse of before
+    velocity[1:, 3:] = 2 * turned / step_s
+    return velocity

@@ -1,0 +1,144 @@
+"""The fit of a device's clock, on links whose clock and delays are known."""
+
+from __future__ import annotations
+
+import timeit
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tacpipe.errors import TacpipeError
+from tacpipe.signals.clocks import STEP_NS, clock_steps, fit_clock, host_times
+
+S, MS = 1_000_000_000, 1_000_000
+HOST_NS = 1_637_771_974_778_354_001  # odd: as float64 it would be rounded to a multiple of 256
+BOOT_NS = 7_000_000_123
+Link = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def link(rate_hz: float, seconds: float, delay_ms: float, *, ppm: float = 50.0, stalls: int = 0, seed: int = 0) -> Link:
+    """Return when samples were taken, the device's stamps and the arrivals: delays are exponential, and in order."""
+    rng = np.random.default_rng(seed)
+    taken_ns = np.rint(np.arange(int(rate_hz * seconds)) * 1e9 / rate_hz).astype(np.int64)
+    arrival_ns = taken_ns + rng.exponential(delay_ms * MS, len(taken_ns)).astype(np.int64)
+    for begins, lasts in zip(rng.uniform(0, seconds, stalls), rng.uniform(0.05, 1.0, stalls), strict=True):
+        ends_ns = int((begins + lasts) * S)  # nothing comes through, and then everything at once
+        stalled = (arrival_ns > begins * S) & (arrival_ns < ends_ns)
+        arrival_ns[stalled] = ends_ns
+    device_ns = BOOT_NS + taken_ns + np.rint(taken_ns * ppm * 1e-6).astype(np.int64)
+    return HOST_NS + taken_ns, device_ns, HOST_NS + np.maximum.accumulate(arrival_ns)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "seconds", "delay_ms", "drift_ppm", "error_ms"),
+    [(50, 10, 2.0, 15.0, 0.2), (400, 10, 0.5, 1.0, 0.02), (1000, 60, 0.5, 0.1, 0.01), (50, 600, 20.0, 0.5, 0.2)],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_clock_and_times_are_recovered_through_delays_and_stalls(
+    rate_hz: float, seconds: float, delay_ms: float, drift_ppm: float, error_ms: float, seed: int
+) -> None:
+    taken_ns, device_ns, arrival_ns = link(rate_hz, seconds, delay_ms, stalls=int(seconds / 10) + 1, seed=seed)
+    fit = fit_clock(device_ns, arrival_ns)
+    assert len(fit.segments) == 1
+    assert fit.drift_ppm == pytest.approx(-50.0, abs=drift_ppm)
+    assert fit.offset_ns == pytest.approx(HOST_NS - BOOT_NS, abs=error_ms * MS)
+    assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns).max() < error_ms * MS
+
+
+def test_without_delay_the_times_are_exact_to_the_rounding_of_nanoseconds() -> None:
+    taken_ns, device_ns, arrival_ns = link(1000, 600, 0.0, ppm=-73.0)
+    fit = fit_clock(device_ns, arrival_ns)
+    assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns).max() <= 2
+    assert fit.median_residual_ns <= 1
+
+
+def test_the_residual_is_the_delay_beyond_the_least() -> None:
+    _, device_ns, arrival_ns = link(1000, 60, 0.5)
+    fit = fit_clock(device_ns, arrival_ns)
+    assert fit.median_residual_ns == pytest.approx(np.median(np.diff(fit.residual_ns[:3]).sum()), rel=1e-6)
+    assert fit.median_residual_ns > 0.5 * np.log(2) * MS  # a link in order only adds to the delays drawn
+    assert fit.residual_ns[0] == 0.0
+
+
+def test_a_device_that_restarts_has_a_line_before_and_one_after() -> None:
+    taken_ns, device_ns, arrival_ns = link(400, 20, 0.5, stalls=3)
+    device_ns[5000:] -= device_ns[5000] - 1000
+    fit = fit_clock(device_ns, arrival_ns)
+    assert [(one.start, one.stop) for one in fit.segments] == [(0, 5000), (5000, 8000)]
+    assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns).max() < 0.05 * MS
+
+
+def test_after_a_restart_too_short_to_show_a_drift_that_of_the_long_segment_holds() -> None:
+    taken_ns, device_ns, arrival_ns = link(50, 60, 1.0, ppm=200.0)
+    device_ns[-20:] -= device_ns[-20]
+    fit = fit_clock(device_ns, arrival_ns)
+    assert [one.stop - one.start for one in fit.segments] == [2980, 20]
+    assert fit.segments[1].drift == fit.segments[0].drift
+    assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns)[-20:].max() < 1.0 * MS
+
+
+def test_stalls_gaps_and_packets_out_of_order_are_no_steps() -> None:
+    _, device_ns, arrival_ns = link(50, 60, 2.0, stalls=10)
+    kept = np.r_[0:500, 1200:3000]  # fourteen seconds are missing in both clocks
+    device_ns = device_ns[kept]
+    device_ns[[100, 101]] = device_ns[[101, 100]]
+    assert clock_steps(device_ns, arrival_ns[kept]) == []
+
+
+def test_a_few_wrong_stamps_move_neither_the_line_nor_what_follows_them() -> None:
+    taken_ns, device_ns, arrival_ns = link(50, 60, 2.0)
+    device_ns[[300, 1500]] += 3600 * S
+    device_ns[[700, 2200]] -= 3600 * S
+    fit = fit_clock(device_ns, arrival_ns)
+    found = host_times(fit, device_ns, arrival_ns)
+    assert len(fit.segments) == 1
+    assert np.abs(np.delete(found - taken_ns, [300, 700, 1500, 2200])).max() < 25 * MS
+    assert np.median(np.abs(found - taken_ns)) < 0.2 * MS
+    assert np.array_equal(found[[300, 1500]], arrival_ns[[300, 1500]])
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.tuples(st.integers(-5 * MS, 60 * MS), st.integers(0, 50 * MS)), min_size=1, max_size=80))
+def test_mapped_times_never_run_backwards_nor_far_ahead_of_their_arrival(steps: list[tuple[int, int]]) -> None:
+    device_ns, delay_ns = np.cumsum([step for step, _ in steps]), np.array([delay for _, delay in steps])
+    arrival_ns = HOST_NS + np.maximum.accumulate(device_ns + delay_ns)
+    if len(steps) > 1 and not np.any(device_ns != device_ns[0]):
+        return
+    try:
+        found = host_times(fit_clock(device_ns, arrival_ns), device_ns, arrival_ns)
+    except TacpipeError:
+        return  # a clock that is none
+    assert found.dtype == np.int64
+    assert (np.diff(found) >= 0).all()
+    assert (found - arrival_ns <= STEP_NS).all()
+
+
+@given(st.integers(-(10**18), 10**18), st.integers(-(10**18), 10**18))
+def test_where_the_two_clocks_begin_changes_nothing_but_the_offset(host_ns: int, boot_ns: int) -> None:
+    _, device_ns, arrival_ns = link(50, 5, 2.0)
+    fit, moved = fit_clock(device_ns, arrival_ns), fit_clock(device_ns + boot_ns, arrival_ns + host_ns)
+    assert moved.offset_ns == fit.offset_ns + host_ns - boot_ns
+    assert moved.drift_ppm == fit.drift_ppm
+
+
+def test_one_sample_is_where_it_came() -> None:
+    fit = fit_clock(np.array([5]), np.array([HOST_NS]))
+    assert host_times(fit, np.array([5]), np.array([HOST_NS])).tolist() == [HOST_NS]
+    assert (fit.offset_ns, fit.drift_ppm) == (HOST_NS - 5, 0.0)
+
+
+def test_clocks_that_are_none_are_refused() -> None:
+    _, device_ns, arrival_ns = link(50, 10, 2.0)
+    with pytest.raises(TacpipeError, match="stands still at 3 ns in all 500 rows"):
+        fit_clock(np.full(500, 3), arrival_ns)
+    with pytest.raises(TacpipeError, match=r"runs at 0\.001 times the host's over 0\.009\d* s; .* in nanoseconds"):
+        fit_clock(device_ns // 1000, arrival_ns)
+    with pytest.raises(TacpipeError, match="499 device stamps and 500 arrivals"):
+        fit_clock(device_ns[1:], arrival_ns)
+
+
+def test_ten_minutes_at_1_khz_take_a_fraction_of_a_second() -> None:
+    _, device_ns, arrival_ns = link(1000, 600, 0.5, stalls=60)
+    assert min(timeit.repeat(lambda: fit_clock(device_ns, arrival_ns), number=1, repeat=5)) < 0.3  # 0.06 where idle

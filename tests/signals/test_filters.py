@@ -1,0 +1,57 @@
+"""Filters against scipy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import ndimage, signal
+
+from tacpipe.errors import TacpipeError
+from tacpipe.signals.filters import butterworth, median, median_so_far
+
+signals = hnp.arrays(np.float64, st.integers(10, 120), elements=st.floats(-1e4, 1e4))
+
+
+@pytest.mark.parametrize(("cutoff_hz", "rate_hz"), [(5.0, 50.0), (24.9, 50.0), (0.01, 1000.0)])
+def test_the_coefficients_are_those_of_scipy(cutoff_hz: float, rate_hz: float) -> None:
+    b, a = signal.butter(2, cutoff_hz, fs=rate_hz)
+    found = butterworth(cutoff_hz, rate_hz)
+    np.testing.assert_allclose(found.b, b, rtol=1e-9)
+    np.testing.assert_allclose((1.0, *found.a), a, rtol=1e-9)
+
+
+@given(signals)
+def test_forwards_it_is_lfilter_that_starts_from_a_constant(values: np.ndarray) -> None:
+    b, a = signal.butter(2, 5.0, fs=50.0)
+    wanted, _ = signal.lfilter(b, a, values, zi=signal.lfilter_zi(b, a) * values[0])
+    np.testing.assert_allclose(butterworth(5.0, 50.0).causal(values), wanted, atol=1e-8)
+
+
+@given(signals)
+def test_both_ways_it_is_filtfilt(values: np.ndarray) -> None:
+    wanted = signal.filtfilt(*signal.butter(2, 5.0, fs=50.0), values)
+    np.testing.assert_allclose(butterworth(5.0, 50.0).both_ways(values), wanted, atol=1e-7)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2, 5])
+def test_few_rows_that_are_alike_stay_as_they_are(rows: int) -> None:
+    filtered = butterworth(5.0, 50.0)
+    for found in (filtered.causal(np.full(rows, 3.0)), filtered.both_ways(np.full(rows, 3.0))):
+        np.testing.assert_allclose(found, np.full(rows, 3.0))
+
+
+@given(signals, st.sampled_from([1, 3, 5, 9]))
+def test_the_median_is_that_of_ndimage(values: np.ndarray, rows: int) -> None:
+    np.testing.assert_array_equal(median(values, rows), ndimage.median_filter(values, rows, mode="nearest"))
+    so_far = [np.median(np.r_[np.full(rows, values[0]), values[: i + 1]][-rows:]) for i in range(len(values))]
+    np.testing.assert_array_equal(median_so_far(values, rows), so_far)
+    assert median(values[:0], rows).tolist() == []
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.0, 25.0, -1.0, float("nan")])
+def test_a_cutoff_beyond_half_the_rate_is_refused(cutoff_hz: float) -> None:
+    with pytest.raises(TacpipeError, match="below half the rate, 25 Hz"):
+        butterworth(cutoff_hz, 50.0)

@@ -1,0 +1,116 @@
+"""How the hand moves: against products of elementary motions and against differences of what they give."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tacpipe.signals import kinematics
+from tacpipe.signals.kinematics import PANDA
+
+Floats = NDArray[np.floating[Any]]
+
+TOOL = np.array([0.01, -0.02, 0.2])  # of the hand in the last link's frame, m
+STEP_S = 1e-4
+
+
+def joints(rows: int = 200) -> tuple[Floats, Floats]:
+    """A smooth path: angles and speeds, (time, joint)."""
+    time_s = np.arange(rows)[:, None] * STEP_S
+    size, rate, phase = np.linspace(0.3, 0.9, 7), np.linspace(4, 11, 7), np.linspace(0, 5, 7)
+    return size * np.sin(rate * time_s + phase), size * rate * np.cos(rate * time_s + phase)
+
+
+def elementary(joint_rad: Floats) -> list[Floats]:
+    """The frames of one row as Craig has them: turn and shift along x, then turn and shift along z."""
+    reached: Floats = np.eye(4)
+    found: list[Floats] = []
+    for angle, length, offset, twist in zip(joint_rad, PANDA.length_m, PANDA.offset_m, PANDA.twist_rad, strict=True):
+        for axis, turn, shift in (("x", twist, [length, 0, 0]), ("z", angle, [0, 0, offset])):
+            step = np.eye(4)
+            step[:3, :3], step[:3, 3] = Rotation.from_euler(axis, turn).as_matrix(), shift
+            reached = reached @ step
+        found.append(reached)
+    return found
+
+
+def hand(joint_rad: Floats) -> Floats:
+    last = kinematics.joint_frames(PANDA, joint_rad)[:, -1]
+    found: Floats = last[:, :3, :3] @ TOOL + last[:, :3, 3]
+    return found
+
+
+def test_frames_are_the_product_of_elementary_motions() -> None:
+    angles = np.random.default_rng(0).uniform(-3, 3, (20, 7))
+    found = kinematics.joint_frames(PANDA, angles)
+    assert found.shape == (20, 7, 4, 4)
+    assert np.allclose(found, [elementary(row) for row in angles], atol=1e-12)
+
+
+def test_a_panda_that_stands_upright_is_as_long_as_its_data_sheet_says() -> None:
+    reached = kinematics.joint_frames(PANDA, np.zeros((1, 7)))[0, -1]
+    assert np.allclose(reached[:3, 3], [0.088, 0.0, 0.333 + 0.316 + 0.384])
+
+
+def test_velocity_is_what_differences_of_the_hand_s_path_tell() -> None:
+    angles, speeds = joints()
+    place = hand(angles)
+    found = kinematics.hand_velocity(PANDA, angles, speeds, place)
+    linear = (place[2:] - place[:-2]) / (2 * STEP_S)
+    turned = Rotation.from_matrix(kinematics.joint_frames(PANDA, angles)[:, -1, :3, :3])
+    angular = (turned[2:] * turned[:-2].inv()).as_rotvec() / (2 * STEP_S)
+    assert np.abs(found[:, :3]).max() > 0.5
+    assert np.allclose(found[1:-1, :3], linear, atol=1e-4)
+    assert np.allclose(found[1:-1, 3:], angular, atol=1e-4)
+
+
+def test_a_rigid_tool_is_carried_and_another_arm_is_told_apart() -> None:
+    angles, _ = joints()
+    place = hand(angles)
+    assert kinematics.carries(PANDA, angles, place)
+    assert kinematics.carries(PANDA, angles, place + np.random.default_rng(0).normal(0, 1e-3, place.shape))
+    assert not kinematics.carries(PANDA, angles + np.linspace(0, 0.4, 200)[:, None], place)
+    assert not kinematics.carries(PANDA, angles, place + np.linspace(0, 0.1, 200)[:, None])
+    assert not kinematics.carries(PANDA, angles[:0], place[:0])
+
+
+def test_rows_that_are_not_finite_do_not_make_it_another_arm() -> None:
+    angles, _ = joints()
+    place = hand(angles)
+    place[7], angles[9, 2] = np.nan, np.nan
+    assert kinematics.carries(PANDA, angles, place)
+    assert not kinematics.carries(PANDA, angles, np.full_like(place, np.nan))
+
+
+@pytest.mark.parametrize("steps_ms", [np.full(49, 20), np.tile([10, 20, 30, 15, 25, 20, 20], 7)])
+def test_differences_of_steady_motion_are_its_velocity(steps_ms: NDArray[Any]) -> None:
+    t_ns = np.concatenate([[0], np.cumsum(steps_ms)]) * 1_000_000
+    time_s = t_ns[:, None] / 1e9
+    velocity, turning = np.array([0.1, -0.2, 0.05]), np.array([0.3, 0.6, -0.9])
+    start = Rotation.from_rotvec([0.2, -0.4, 1.0])
+    quaternions = (Rotation.from_rotvec(time_s * turning) * start).as_quat()
+    found = kinematics.differences(t_ns, 1.0 + time_s * velocity, quaternions)
+    assert not found[0].any()
+    assert np.allclose(found[1:, :3], velocity)
+    assert np.allclose(found[1:, 3:], turning, rtol=1e-4)  # the sine of a small half angle for the angle
+
+
+def test_differences_read_no_later_row() -> None:
+    rng = np.random.default_rng(1)
+    t_ns, place = np.arange(30) * 20_000_000, rng.normal(size=(30, 3))
+    quaternions = Rotation.random(30, rng=rng).as_quat()
+    before = kinematics.differences(t_ns, place, quaternions)
+    place[18:], quaternions[18:] = 5.0, [0.0, 0.0, 0.0, 1.0]
+    after = kinematics.differences(t_ns, place, quaternions)
+    assert np.array_equal(after[:18], before[:18])
+    assert not np.allclose(after[18], before[18])
+
+
+def test_rows_of_the_same_time_have_no_velocity_instead_of_an_infinite_one() -> None:
+    found = kinematics.differences(np.array([0, 0, 10]), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
+    assert np.isfinite(found).all()
+    assert not found[1].any()
