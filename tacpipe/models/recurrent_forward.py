@@ -11,6 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from tacpipe.models.lstm import lstm
+
 
 class RecurrentForward(nn.Module):
     """Encoder and decoder LSTM of one layer each and a linear head; always free running, in training too."""
@@ -32,18 +34,13 @@ class RecurrentForward(nn.Module):
         W + U V and a bias U b. So the decoder is an ordinary LSTM over the plan, which one call computes for all
         steps; only its first step differs, because what is fed back there is measured and not predicted.
         """
-        _, (hidden, cell) = self.encoder(past)  # (1, window, hidden)
-        from_input, from_state, input_bias, state_bias = self.decoder.parameters()
-        feedback = from_input[:, : self.latents]  # (gate, latent)
-        measured = past[-1:, :, : self.latents] - self.head(hidden)  # (1, window, latent)
-        later = measured.new_zeros(len(plan) - 1, *measured.shape[1:])
-        inputs = torch.cat([torch.cat([measured, later]), plan], dim=-1)  # (horizon, window, latent + state)
-        weights = [
-            from_input,
-            from_state + feedback @ self.head.weight,
-            input_bias,
-            state_bias + feedback @ self.head.bias,
-        ]
-        states, _, _ = torch.lstm(inputs, (hidden, cell), weights, True, 1, 0.0, self.training, False, False)
+        from_input, from_state, *biases = self.encoder.parameters()
+        _, state = lstm(past, None, (from_input, from_state, biases[0] + biases[1]))
+        from_input, from_state, *biases = self.decoder.parameters()
+        feedback, from_plan = from_input.tensor_split([self.latents], dim=1)  # (gate, latent), (gate, state)
+        measured = past[-1, :, : self.latents] - self.head(state[0])  # (window, latent)
+        recurrent = torch.addmm(from_state, feedback, self.head.weight)
+        bias = biases[0] + biases[1] + feedback @ self.head.bias
+        states, _ = lstm(plan, state, (from_plan, recurrent, bias), (measured, feedback))
         predicted: Tensor = self.head(states)
         return predicted

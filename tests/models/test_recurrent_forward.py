@@ -83,3 +83,16 @@ def test_windows_of_a_batch_do_not_see_each_other() -> None:
 def test_a_horizon_of_one_step_works() -> None:
     past, plan = windows()
     assert np.shape(model()(past, plan[:1])) == (1, WINDOWS, LATENTS)
+
+
+def test_without_gradients_predictions_are_the_same() -> None:
+    made, (past, plan) = model(), windows()
+    with torch.no_grad():
+        plain = made(past, plan)
+    assert torch.allclose(made(past, plan), plain, atol=1e-6)
+
+
+def test_names_of_the_weights_are_those_of_stored_models() -> None:
+    lstm = [f"{name}_l0" for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
+    wanted = [f"{layer}.{name}" for layer in ("encoder", "decoder") for name in lstm] + ["head.weight", "head.bias"]
+    assert list(model().state_dict()) == wanted

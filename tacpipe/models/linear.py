@@ -1,0 +1,310 @@
+"""The linear forecasts that every forecaster is held against: a mean, a damped trend and three least-squares maps.
+
+Windows come as three arrays: ``past`` (window, context, channel), counts above rest, newest last; ``motion`` (window,
+context + horizon, state), the arm's state at the same steps and then its plan; ``ahead`` (window, horizon, channel),
+counts above rest again. Every forecast is in counts above rest, of the same shape as ``ahead``:
+
+- ``train_mean``: the mean of ``ahead`` over the training windows and steps, of each channel;
+- ``damped_trend``: x_t + (phi + phi^2 + ... + phi^h) (x_t - x_{t-lag}) / lag, h steps ahead (Gardner and McKenzie,
+  Forecasting trends in time series, 1985, equation 2), one phi and lag for all channels, of the least squared error on
+  the training windows. With phi = 0 it is persistence;
+- ``last_value_linear``: NLinear (Zeng, Chen, Zhang and Xu, Are Transformers Effective for Time Series Forecasting?,
+  2023, section 4): the last value is taken off, one map from context to horizon serves all channels, and it is put back;
+- ``ridge``: ridge regression of ``ahead - x_t``, all steps and channels at once, on the changes x_{t-j} - x_t and on the
+  past motion, features standardised (Hoerl and Kennard, Ridge Regression, 1970);
+- ``ridge_actions``: the same with the planned motion among the features.
+
+Squared errors are in counts, so the axes that move most decide phi, lag and alpha.
+
+All five follow from the same sums over windows, which are taken once, in pieces and as float64. Features that change
+for all channels alike, as in the trend and in NLinear, need the diagonal blocks of the ridge's matrices only; the ridge
+without actions needs the corner of those with actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.floating[Any]]
+Windows = tuple[Floats, Floats, Floats]  # past, motion and ahead
+
+NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions")
+ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # against standardised features and sums over windows, as in scikit-learn
+PHIS = tuple(step / 20 for step in range(21))
+CHUNK = 2048  # windows whose features are held at once: 35 MB of 1,100 features and 960 targets
+RIDGE_SHARE = 1e-6  # of NLinear's mean square, added to each: frames that repeat leave its matrix all but singular
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map from features to increments of all steps and channels: bias + (features - centre) @ weight."""
+
+    centre: Floats  # (feature,)
+    weight: Floats  # (feature, step x channel), counts per unit of the feature
+    bias: Floats  # (step x channel,), counts
+    alpha: float
+
+    def __call__(self, features: Floats) -> Floats:
+        """Return increments in counts, (window, feature) to (window, step x channel)."""
+        increments: Floats = (features - self.centre) @ self.weight + self.bias
+        return increments
+
+    def to_tensors(self, name: str) -> dict[str, Floats]:
+        """Return its parts under ``name``."""
+        parts = {"centre": self.centre, "weight": self.weight, "bias": self.bias, "alpha": np.array([self.alpha])}
+        return {f"{name}.{part}": values for part, values in parts.items()}
+
+    @classmethod
+    def from_tensors(cls, name: str, tensors: Mapping[str, Floats]) -> Map:
+        """Return the map that `to_tensors` described."""
+        centre, weight, bias, alpha = (tensors[f"{name}.{part}"] for part in ("centre", "weight", "bias", "alpha"))
+        return cls(centre, weight, bias, float(alpha[0]))
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """What was fitted; float32, as the forecasts."""
+
+    mean_count: Floats  # (channel,)
+    phi: float
+    lag: int  # rows; 0 where a single past frame shows no trend
+    shared_weight: Floats  # (context - 1, horizon)
+    shared_bias: Floats  # (horizon,), counts
+    ridge: Map
+    ridge_actions: Map
+
+    @classmethod
+    def fit(cls, training: Windows, validation: Windows) -> Baselines:
+        """Return the baselines fitted on ``training``, each (past, motion, ahead); ``validation`` picks the alphas.
+
+        Raises `TacpipeError` where a part has no windows, arrays do not fit one another or a value is not finite.
+        """
+        _check("training", training)
+        _check("validation", validation)
+        if [one.shape[1:] for one in training] != [one.shape[1:] for one in validation]:
+            raise TacpipeError(
+                f"Validation windows of {_shapes(validation)} do not fit training windows of {_shapes(training)}; all "
+                "but their number must be equal."
+            )
+        past, motion, ahead = training
+        (context, channels), horizon = past.shape[1:], ahead.shape[1]
+        means = [one.mean(axis=0, dtype=np.float64) for one in training]
+        centre = _features(means[0][None], means[1][None])[0]
+        bias = (means[2] - means[0][-1]).ravel()
+        sums, judged = (_Sums.over(part, centre, bias) for part in (training, validation))
+        blind = centre.size - horizon * motion.shape[2]  # features that do not know the plan
+        shared = _Shared.of(sums, centre, bias, (context - 1, channels, horizon))
+        phi, lag = shared.damped_trend()
+        shared_weight, shared_bias = shared.least_squares()
+        return cls(
+            means[2].mean(axis=0).astype(np.float32),
+            phi,
+            lag,
+            shared_weight.astype(np.float32),
+            shared_bias.astype(np.float32),
+            _ridge(sums.first(blind), judged.first(blind), centre[:blind], bias),
+            _ridge(sums, judged, centre, bias),
+        )
+
+    @property
+    def chosen(self) -> dict[str, float]:
+        """What was picked by squared error: phi, the lag in rows and the two alphas."""
+        return {
+            "damped_trend.phi": self.phi,
+            "damped_trend.lag": float(self.lag),
+            "ridge.alpha": self.ridge.alpha,
+            "ridge_actions.alpha": self.ridge_actions.alpha,
+        }
+
+    def predict(self, past: Floats, motion: Floats) -> dict[str, Floats]:
+        """Return each baseline's counts above rest by its name, (window, horizon, channel), float32.
+
+        ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
+        where these are not what was fitted.
+        """
+        before, horizon = self.shared_weight.shape
+        channels = len(self.mean_count)
+        steps = before + 1 + horizon
+        states = (len(self.ridge_actions.centre) - before * channels) // steps
+        if past.shape[1:] != (before + 1, channels) or motion.shape != (len(past), steps, states):
+            raise TacpipeError(
+                f"Past frames of {past.shape} and motion of {motion.shape} do not fit the baselines; (window, "
+                f"{before + 1}, {channels}) and (window, {steps}, {states}) were fitted."
+            )
+        past = past.astype(np.float32, copy=False)
+        last = past[:, -1:]  # (window, 1, channel)
+        shape = len(past), horizon, channels
+        slope = (last - past[:, -1 - self.lag, None]) / np.float32(max(self.lag, 1))
+        damping = _damping(np.array([self.phi]), horizon)[0].astype(np.float32)  # (step,)
+        shared = np.matmul(self.shared_weight.T, past[:, :-1] - last) + self.shared_bias[:, None]
+        features = _features(past, motion.astype(np.float32, copy=False))
+        maps = {"ridge": self.ridge, "ridge_actions": self.ridge_actions}
+        return {
+            "train_mean": np.broadcast_to(self.mean_count, shape).copy(),
+            "damped_trend": last + damping[:, None] * slope,
+            "last_value_linear": last + shared,
+            **{name: last + one(features[:, : len(one.centre)]).reshape(shape) for name, one in maps.items()},
+        }
+
+    def to_tensors(self) -> dict[str, Floats]:
+        """Return all that `from_tensors` needs."""
+        tensors: dict[str, Floats] = {
+            "train_mean": self.mean_count,
+            "damped_trend.phi": np.array([self.phi]),
+            "damped_trend.lag": np.array([float(self.lag)]),
+            "last_value_linear.weight": self.shared_weight,
+            "last_value_linear.bias": self.shared_bias,
+        }
+        return tensors | self.ridge.to_tensors("ridge") | self.ridge_actions.to_tensors("ridge_actions")
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Floats]) -> Baselines:
+        """Return the baselines that `to_tensors` described."""
+        return cls(
+            tensors["train_mean"],
+            float(tensors["damped_trend.phi"][0]),
+            int(tensors["damped_trend.lag"][0]),
+            tensors["last_value_linear.weight"],
+            tensors["last_value_linear.bias"],
+            Map.from_tensors("ridge", tensors),
+            Map.from_tensors("ridge_actions", tensors),
+        )
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over windows of products of features and of features with targets, both less their training means."""
+
+    windows: int
+    xx: Floats  # (feature, feature)
+    xy: Floats  # (feature, step x channel)
+
+    @classmethod
+    def over(cls, part: Windows, centre: Floats, bias: Floats) -> _Sums:
+        past, motion, ahead = part
+        xx, xy = np.zeros((centre.size, centre.size)), np.zeros((centre.size, bias.size))
+        for first in range(0, len(past), CHUNK):
+            some = slice(first, first + CHUNK)
+            frames = past[some].astype(np.float64)
+            features = _features(frames, motion[some]) - centre
+            increments = (ahead[some] - frames[:, -1:]).reshape(len(frames), -1) - bias
+            xx += features.T @ features
+            xy += features.T @ increments
+        if not (np.isfinite(xx).all() and np.isfinite(xy).all()):
+            raise TacpipeError("Some windows hold values that are not finite. Take windows over usable rows only.")
+        return cls(len(past), xx, xy)
+
+    def first(self, features: int) -> _Sums:
+        """Return the sums of the first ``features`` alone."""
+        return _Sums(self.windows, self.xx[:features, :features], self.xy[:features])
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """The same sums for features that all channels share: over windows and channels, nothing taken off."""
+
+    count: int  # windows x channels
+    x: Floats  # (context - 1,)
+    y: Floats  # (horizon,)
+    xx: Floats  # (context - 1, context - 1)
+    xy: Floats  # (context - 1, horizon)
+
+    @classmethod
+    def of(cls, sums: _Sums, centre: Floats, bias: Floats, shape: tuple[int, int, int]) -> _Shared:
+        """Return what the blocks of each channel with itself say; ``shape`` is context - 1, channel and horizon."""
+        before, channels, horizon = shape
+        changes = before * channels  # which come first among the features
+        x, y = centre[:changes].reshape(before, channels), bias.reshape(horizon, channels)
+        xx = sums.xx[:changes, :changes].reshape(before, channels, before, channels)
+        xy = sums.xy[:changes].reshape(before, channels, horizon, channels)
+        return cls(
+            sums.windows * channels,
+            sums.windows * x.sum(axis=1),
+            sums.windows * y.sum(axis=1),
+            np.einsum("icjc->ij", xx) + sums.windows * x @ x.T,
+            np.einsum("ichc->ih", xy) + sums.windows * x @ y.T,
+        )
+
+    def damped_trend(self) -> tuple[float, int]:
+        """Return the phi and the lag in rows whose trend has the least squared error."""
+        if not len(self.x):
+            return 0.0, 0
+        lags = np.arange(1, len(self.x) + 1)  # changes come oldest first, and each is -lag times the slope
+        damping = _damping(np.array(PHIS), len(self.y))  # (phi, step)
+        slope_y = -self.xy[::-1] / lags[:, None]  # (lag, step)
+        slope_slope = np.diagonal(self.xx)[::-1] / lags**2  # (lag,)
+        error = np.square(damping).sum(axis=1)[:, None] * slope_slope - 2 * damping @ slope_y.T  # (phi, lag)
+        phi, lag = np.unravel_index(error.argmin(), error.shape)
+        return PHIS[phi], int(lags[lag])
+
+    def least_squares(self) -> tuple[Floats, Floats]:
+        """Return weight (context - 1, horizon) and bias (horizon,) of the least squared error."""
+        x, y = self.x / self.count, self.y / self.count
+        xx, xy = self.xx - self.count * np.outer(x, x), self.xy - self.count * np.outer(x, y)
+        power = np.trace(xx) / max(len(x), 1)
+        weight = np.linalg.solve(xx + (RIDGE_SHARE * power if power > 0 else 1.0) * np.eye(len(x)), xy)
+        return weight, y - x @ weight
+
+
+def _ridge(sums: _Sums, judged: _Sums, centre: Floats, bias: Floats) -> Map:
+    """Return the ridge regression whose alpha has the least squared error on the windows of ``judged``.
+
+    With the features' matrix Q diag(v) Q', the weights are Q diag(1 / (v + alpha)) Q' xy: what is costly does not
+    depend on alpha, neither for the weights nor for their error on other windows.
+    """
+    spread = np.sqrt(np.diagonal(sums.xx) / sums.windows)
+    moves = spread > np.finfo(np.float32).eps * np.abs(centre)  # else rounding would pass for a feature
+    gain = np.where(moves, 1 / np.where(moves, spread, 1), 0)
+    values, vectors = np.linalg.eigh(sums.xx * np.outer(gain, gain))
+    turn = gain[:, None] * vectors  # from standardised features to where their matrix is diagonal
+    xy = turn.T @ sums.xy
+    bent = (turn.T @ judged.xx @ turn) * (xy @ xy.T)
+    straight = np.einsum("fy,fy->f", xy, turn.T @ judged.xy)
+    shrinks = [1 / (np.maximum(values, 0) + alpha) for alpha in ALPHAS]
+    errors = [shrink @ bent @ shrink - 2 * shrink @ straight for shrink in shrinks]  # less what no alpha changes
+    best = int(np.argmin(errors))
+    weight = turn @ (shrinks[best][:, None] * xy)
+    return Map(centre.astype(np.float32), weight.astype(np.float32), bias.astype(np.float32), ALPHAS[best])
+
+
+def _features(past: Floats, motion: Floats) -> Floats:
+    """Return changes against the last frame, the oldest first, then the motion, its plan last: (window, feature)."""
+    windows = len(past)
+    return np.concatenate([(past[:, :-1] - past[:, -1:]).reshape(windows, -1), motion.reshape(windows, -1)], axis=1)
+
+
+def _damping(phi: Floats, horizon: int) -> Floats:
+    """Return phi + phi^2 + ... + phi^h for h from 1 to ``horizon``, (phi,) to (phi, step)."""
+    total: Floats = np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
+    return total
+
+
+def _check(name: str, part: Windows) -> None:
+    past, motion, ahead = part
+    if not len(past):
+        raise TacpipeError(
+            f"The {name} recordings hold no window. Give more or longer ones, or shorten context and horizon."
+        )
+    fits = (
+        [one.ndim for one in part] == [3, 3, 3]
+        and len(past) == len(motion) == len(ahead)
+        and motion.shape[1] == past.shape[1] + ahead.shape[1]
+        and past.shape[2] == ahead.shape[2]
+        and min(past.shape[1], ahead.shape[1]) >= 1
+    )
+    if not fits:
+        raise TacpipeError(
+            f"The {name} windows of {_shapes(part)} do not fit one another; past must be (window, context, channel), "
+            "motion (window, context + horizon, state) and ahead (window, horizon, channel)."
+        )
+
+
+def _shapes(part: Windows) -> str:
+    return ", ".join(str(one.shape) for one in part)

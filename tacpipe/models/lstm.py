@@ -1,0 +1,199 @@
+"""An LSTM layer whose backward pass on a processor is written by hand; elsewhere it is torch's own.
+
+Hochreiter and Schmidhuber, Long Short-Term Memory (Neural Computation 1997), with the forget gate of Gers, Schmidhuber
+and Cummins, Learning to Forget (Neural Computation 2000), in torch's order of gates i, f, g, o:
+
+    i, f, o = sigmoid(a), g = tanh(a)    where a = W x + R h' + b, for each gate its rows
+    c = f c' + i g,  h = o tanh(c)       where h', c' are those of the step before
+
+With dh and dc the loss's derivatives by h and c, those by a are
+
+    dc += dh (o - h tanh(c))
+    di = dc g i (1 - i),  df = dc c' f (1 - f),  dg = dc i (1 - g²),  do = dh tanh(c) o (1 - o)
+
+and then dc' = dc f, dh' = Rᵀ da. All factors of dc and dh are known after the forward pass, so they are computed for
+all steps at once; one step back is five operations. The gradient of all weights is one product over all steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
+Weights = tuple[Tensor, Tensor, Tensor]  # W (4 hidden, input), R (4 hidden, hidden), b (4 hidden,)
+Lead = tuple[Tensor, Tensor]  # inputs of the first step only (window, more), and their columns of W (4 hidden, more)
+
+
+def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None = None) -> tuple[Tensor, State]:
+    """Return h of all steps, shape (step, window, hidden), and the last state; ``inputs`` is (step, window, input).
+
+    The state before the first step is zero where none is given. ``lead`` adds inputs that exist in the first step only.
+    """
+    if inputs.is_cuda or not torch.is_grad_enabled():
+        return _of_torch(inputs, state, weights, lead)
+    first = None if lead is None else lead[0] @ lead[1].t()
+    hidden, cell = (None, None) if state is None else state
+    from_input, from_state, bias = weights
+    states, last_hidden, last_cell = _Layer.apply(inputs, first, hidden, cell, from_input, from_state, bias)  # type: ignore[no-untyped-call]
+    return states, (last_hidden, last_cell)
+
+
+def _of_torch(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
+    """Do the same with torch's layer: cuDNN on a GPU, and without gradients the fastest on a processor too."""
+    from_input, from_state, bias = weights
+    if lead is not None:
+        later = lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)
+        inputs = torch.cat([torch.cat([lead[0][None], later]), inputs], dim=-1)
+        from_input = torch.cat([lead[1], from_input], dim=1)
+    if state is None:
+        zero = inputs.new_zeros(inputs.shape[1], from_state.shape[1])
+        state = zero, zero
+    flat = [from_input, from_state, bias, torch.zeros_like(bias)]
+    states, hidden, cell = torch.lstm(
+        inputs, (state[0][None], state[1][None]), flat, True, 1, 0.0, torch.is_grad_enabled(), False, False
+    )
+    return states, (hidden[0], cell[0])
+
+
+class _Layer(torch.autograd.Function):
+    """h of all steps, and h and c after the last, of a layer that may begin at zero (``hidden`` and ``cell`` None)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        inputs: Tensor,
+        first: Tensor | None,
+        hidden: Tensor | None,
+        cell: Tensor | None,
+        from_input: Tensor,
+        from_state: Tensor,
+        bias: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        (steps, windows, _), size = inputs.shape, from_state.shape[1]
+        used = size + inputs.shape[-1]
+        weights = from_state.new_empty(4 * size, used + 1)
+        weights[:, :size], weights[:, size:used], weights[:, used] = from_state, from_input, bias
+        weights[2 * size : 3 * size] *= (
+            2  # tanh(a) = 2 sigmoid(2 a) - 1, and torch's sigmoid takes a quarter of the time
+        )
+        read = _empty(inputs, steps + 1, windows, used + 1)  # h', x and the 1 that b is multiplied with
+        read[0, :, :size] = 0.0 if hidden is None else hidden
+        read[:-1, :, size:used] = inputs
+        read[..., used] = 1.0
+        gates = _empty(inputs, steps, windows, 4 * size)
+        cells, tanhs = _empty(inputs, steps + 1, windows, size), _empty(inputs, steps, windows, size)
+        cells[0] = 0.0 if cell is None else cell
+        # Views of all steps are made at once: at small batches a view costs as much as the arithmetic.
+        columns = [part.unbind() for part in gates.chunk(4, dim=-1)]
+        every_read, every_h, every_c = read.unbind(), read[..., :size].unbind(), cells.unbind()
+        steps_of = zip(gates.unbind(), *columns, tanhs.unbind(), every_read, every_c, strict=False)
+        by_step, minus = weights.t(), inputs.new_tensor(-1.0)
+        for step, (row, i, f, g, o, tanh, given, before) in enumerate(steps_of):
+            torch.mm(given, by_step, out=row)
+            if first is not None and not step:
+                row += first
+                g += first[:, 2 * size : 3 * size]
+            row.sigmoid_()
+            torch.add(minus, g, alpha=2, out=g)
+            now = every_c[step + 1]
+            torch.mul(f, before, out=now)
+            now.addcmul_(i, g)
+            torch.add(now, now, out=tanh)
+            tanh.sigmoid_()
+            torch.add(minus, tanh, alpha=2, out=tanh)
+            torch.mul(o, tanh, out=every_h[step + 1])
+        ctx.set_materialize_grads(False)  # an encoder's unused states must not come back as zeros
+        ctx.save_for_backward(from_input, from_state, read, gates, cells, tanhs)
+        return read[1:, :, :size], every_h[-1].clone(), every_c[-1].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, by_states: Tensor | None, by_hidden: Tensor | None, by_cell: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        from_input, from_state, read, gates, cells, tanhs = ctx.saved_tensors
+        steps, windows, size = tanhs.shape
+        by_gates, slopes = _empty(gates, *gates.shape), _empty(gates, *tanhs.shape)
+        _factors(gates, read[1:, :, :size], cells, tanhs, by_gates, slopes)
+        dh, dc = (tanhs.new_zeros(windows, size) for _ in range(2))
+        for total, given in ((dh, by_hidden), (dh, None if by_states is None else by_states[-1]), (dc, by_cell)):
+            if given is not None:
+                total += given
+        told = None if by_states is None else by_states.unbind()
+        every_slope, every_dc = slopes.unbind(), dc[:, None]
+        of_cell = by_gates.view(steps, windows, 4, size)[:, :, :3].unbind()  # i, f, g
+        of_output, forgets = by_gates[..., 3 * size :].unbind(), gates[..., size : 2 * size].unbind()
+        rows = by_gates.unbind()
+        for step in reversed(range(steps)):
+            dc.addcmul_(dh, every_slope[step])
+            of_cell[step].mul_(every_dc)
+            of_output[step].mul_(dh)
+            dc.mul_(forgets[step])
+            if step and told is not None:
+                torch.addmm(told[step - 1], rows[step], from_state, out=dh)
+            elif step:
+                torch.mm(rows[step], from_state, out=dh)
+        flat = by_gates.view(steps * windows, -1)
+        used = size + from_input.shape[1]
+        needs = ctx.needs_input_grad
+        by_weights = flat.t() @ read[:-1].view(steps * windows, -1)  # of all three, as they were multiplied
+        return (
+            (flat @ from_input).view(steps, windows, -1) if needs[0] else None,
+            rows[0].clone() if needs[1] else None,
+            rows[0] @ from_state if needs[2] else None,
+            dc if needs[3] else None,
+            by_weights[:, size:used] if needs[4] else None,
+            by_weights[:, :size] if needs[5] else None,
+            by_weights[:, used] if needs[6] else None,
+        )
+
+
+def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_gates: Tensor, slopes: Tensor) -> None:
+    """Write what dc (of i, f, g) and dh (of o) are multiplied with to give da, and dh to be added to dc.
+
+    ``by_gates`` is (step, window, 4 hidden), ``slopes`` (step, window, hidden).
+    """
+    i, _, g, o = gates.chunk(4, dim=-1)
+    by_i, by_f, by_g, by_o = by_gates.chunk(4, dim=-1)
+    torch.addcmul(gates, gates, gates, value=-1, out=by_gates)
+    by_i *= g
+    by_f *= cells[:-1]
+    by_o *= tanhs
+    torch.mul(i, g, out=by_g)
+    torch.addcmul(i, by_g, g, value=-1, out=by_g)
+    torch.addcmul(o, hiddens, tanhs, value=-1, out=slopes)
+
+
+_free: deque[NDArray[np.uint8]] = deque(maxlen=16)  # of two layers in both directions, of this batch and the last
+
+
+class _Loan(NDArray[np.uint8] if TYPE_CHECKING else np.ndarray):  # type: ignore[misc]
+    """Memory that can be lent again once no tensor uses it."""
+
+    def __del__(self) -> None:
+        _free.append(self.base)
+
+
+def _empty(like: Tensor, *shape: int) -> Tensor:
+    """Return a tensor of any content, in memory that earlier such tensors have left.
+
+    Tens of megabytes freed after every batch go back to the system, and to get their pages anew takes as long as a
+    fifth of the arithmetic. The tensor's storage owns the loan, so views keep it too.
+    """
+    needed = math.prod(shape) * like.element_size()
+    for _ in range(len(_free)):
+        found = _free.popleft()
+        if needed <= found.nbytes <= 2 * needed:
+            break
+        _free.append(found)
+    else:
+        found = np.empty(needed, np.uint8)
+    return torch.from_numpy(found.view(_Loan))[:needed].view(like.dtype).view(shape)
