@@ -23,6 +23,7 @@ class Params:
     folds: int = 5  # how many parts kfold makes
     by: str = "object"  # attribute whose values leave-one-out leaves out one by one
     stratify: str = ""  # attribute whose values are spread evenly over the roles; empty for none
+    apart: str = ""  # of kfold: attribute whose values are dealt out too, each unknown in one fold; empty for none
 
 
 @stage(version=1)
@@ -35,7 +36,16 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
 
     from tacpipe.splits import Scheme, assign
 
-    scheme = Scheme(params.scheme, params.val, params.test, params.seed, params.folds, params.by, params.stratify)
+    scheme = Scheme(
+        name=params.scheme,
+        val=params.val,
+        test=params.test,
+        seed=params.seed,
+        folds=params.folds,
+        by=params.by,
+        stratify=params.stratify,
+        apart=params.apart,
+    )
     roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme, extend or {})
     table = pa.table(
         {

@@ -71,10 +71,27 @@ def skill_interval(model: Floats, baseline: Floats, *, seed: int = 0, resamples:
     mean = skill(model.sum(axis=0), baseline.sum(axis=0))
     if recordings < 2:
         return Interval(mean, np.full(steps, np.nan), np.full(steps, np.nan))
-    draws = np.random.default_rng(seed).multinomial(recordings, np.full(recordings, 1 / recordings), size=resamples)
-    drawn = skill(draws @ model, draws @ baseline)  # (resample, step)
-    low, high = np.full(steps, np.nan), np.full(steps, np.nan)
+    weights = draws(recordings, seed=seed, resamples=resamples)
+    return Interval(mean, *bounds(skill(weights @ model, weights @ baseline)))
+
+
+def draws(recordings: int, *, seed: int = 0, resamples: int = RESAMPLES) -> NDArray[np.int64]:
+    """Return how often each resample holds each recording, shape (resample, recording).
+
+    >>> draws(3, resamples=4).sum(axis=1).tolist()
+    [3, 3, 3, 3]
+    """
+    even = np.full(recordings, 1 / recordings)
+    return np.random.default_rng(seed).multinomial(recordings, even, size=resamples)
+
+
+def bounds(drawn: Floats) -> tuple[Floats, Floats]:
+    """Return where the middle 95 % of what was found in each resample lies, (resample, step) to two of (step,).
+
+    Resamples in which a value is not defined do not count; NaN where it is defined in none.
+    """
+    low, high = np.full(drawn.shape[1], np.nan), np.full(drawn.shape[1], np.nan)
     known = ~np.isnan(drawn).all(axis=0)
     tail = (1 - COVERAGE) / 2
     low[known], high[known] = np.nanquantile(drawn[:, known], [tail, 1 - tail], axis=0)
-    return Interval(mean, low, high)
+    return low, high

@@ -7,6 +7,7 @@ Everything here follows from names, attributes and a seed; the order in which na
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -31,6 +32,7 @@ class Scheme:
     folds: int = 5  # of kfold
     by: str = "object"  # attribute whose values leave-one-out leaves out one by one
     stratify: str = ""  # attribute whose values are spread evenly over the roles; empty for none
+    apart: str = ""  # of kfold: attribute whose values are dealt into the folds too, there unknown; empty for none
 
 
 def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
@@ -44,6 +46,10 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     authors        what the attribute ``authors_role`` says; with no val among them, ``val`` of train is drawn
     ============== =====================================================================================
 
+    With ``apart``, fold k of kfold tests all recordings of the k-th even part of that attribute's values, so that nothing
+    of these values is in train or val, and of the other recordings those of their own k-th part. So unknown and known
+    values are tested side by side, and over the folds every value is unknown once.
+
     ``keep`` holds roles of an older split: they stay, and only recordings without any are dealt out. Raises
     `TacpipeError` for a scheme, share or attribute that cannot be, and where no recording is left to train on.
     """
@@ -56,7 +62,7 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     elif scheme.name == "authors":
         folds = [_authors(fresh, attributes, scheme)]
     elif scheme.name == "kfold":
-        folds = _kfold(fresh, attributes, scheme)
+        folds = _kfold(fresh, attributes, scheme, keep)
     else:
         folds = _leave_one_out(attributes, scheme, keep)
     roles = {(name, fold): role for fold, found in enumerate(folds) for name, role in found.items()}
@@ -83,6 +89,11 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
     if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
         raise TacpipeError(
             f"{scheme.folds} folds cannot be made of {len(attributes)} recordings; folds must lie between 2 and that."
+        )
+    if scheme.apart and scheme.name != "kfold":
+        raise TacpipeError(
+            f"apart {scheme.apart} goes with the scheme kfold alone, not with {scheme.name}. "
+            f"To keep values apart one by one, choose leave-one-out by {scheme.apart}."
         )
 
 
@@ -133,17 +144,59 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
     return roles
 
 
-def _kfold(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> list[dict[str, str]]:
+def _kfold(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
+) -> list[dict[str, str]]:
     """Deal the shuffled recordings out in turn, stratum after stratum, so that parts differ by one at most."""
     rng = np.random.default_rng(scheme.seed)
     strata = _strata(names, attributes, scheme).values()
     order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
     part = {name: i % scheme.folds for i, name in enumerate(order)}
+    unknown = _unknown(attributes, scheme, keep) if scheme.apart else {}
     folds = []
     for fold in range(scheme.folds):
-        rest = _val_of([name for name in names if part[name] != fold], attributes, scheme, fold + 1)
-        folds.append(rest | {name: "test" for name in names if part[name] == fold})
+        tested = [name for name in names if fold in (part[name], unknown.get(name))]
+        rest = _val_of([name for name in names if name not in set(tested)], attributes, scheme, fold + 1)
+        folds.append(rest | dict.fromkeys(tested, "test"))
     return folds
+
+
+def _unknown(
+    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
+) -> dict[str, int]:
+    """Return the fold in which the value of ``apart`` that a recording has is unknown, by recording.
+
+    Values are shuffled, and each goes to the fold that has fewest; those of an older split stay where they were.
+    """
+    values = {name: _value(name, attributes, scheme.apart) for name in sorted(attributes)}
+    distinct = _ordered(set(values.values()))
+    if len(distinct) < scheme.folds:
+        raise TacpipeError(
+            f"{len(distinct)} values of {scheme.apart} cannot be kept apart in {scheme.folds} folds, because a fold "
+            f"would have none; make at most {len(distinct)} folds."
+        )
+    fold_of = _unknown_before(values, scheme, keep)
+    held = Counter(fold_of.values())
+    for i in np.random.default_rng([scheme.seed, 0]).permutation(len(distinct)):
+        if distinct[i] not in fold_of:
+            fold_of[distinct[i]] = min(range(scheme.folds), key=lambda fold: (held[fold], fold))
+            held[fold_of[distinct[i]]] += 1
+    return {name: fold_of[value] for name, value in values.items()}
+
+
+def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tuple[str, int], str]) -> dict[str, int]:
+    """Return the fold in which an older split tests all recordings of a value, by value."""
+    tested: dict[str, set[int]] = {}
+    for name in sorted({name for name, _ in keep if name in values}):
+        folds = {fold for (kept, fold), role in keep.items() if kept == name and role == "test"}
+        tested[values[name]] = tested.get(values[name], folds) & folds
+    known = [value for value, folds in tested.items() if not folds]
+    if known:
+        raise TacpipeError(
+            f"The older split has no fold that tests all recordings of {scheme.apart} {known[0]}, so it did not keep "
+            f"{scheme.apart} apart. Make a split anew, or leave apart as it was."
+        )
+    return {value: min(folds) for value, folds in tested.items()}
 
 
 def _leave_one_out(

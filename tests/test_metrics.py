@@ -74,3 +74,11 @@ def test_one_recording_gives_no_interval() -> None:
     found = metrics.skill_interval(np.array([[1.0]]), np.array([[2.0]]))
     assert found.mean.tolist() == [0.5]
     assert np.isnan(found.low).all()
+
+
+def test_bounds_leave_out_what_is_not_defined() -> None:
+    drawn = np.column_stack([np.arange(101.0), np.full(101, np.nan), np.where(np.arange(101) < 1, np.nan, 7.0)])
+    low, high = metrics.bounds(drawn)
+    assert np.allclose([low[0], high[0]], [2.5, 97.5])
+    assert np.isnan([low[1], high[1]]).all()
+    assert [low[2], high[2]] == [7.0, 7.0]

@@ -22,7 +22,7 @@ def with_role(roles: Roles, role: str, fold: int = 0) -> set[str]:
     return {name for (name, at), found in roles.items() if found == role and at == fold}
 
 
-@given(st.integers(3, 200), st.floats(0, 0.4), st.floats(0, 0.4), st.integers(0, 9))
+@given(st.integers(5, 200), st.floats(0, 0.4), st.floats(0, 0.4), st.integers(0, 9))
 def test_random_gives_every_recording_one_role_and_the_shares_asked_for(
     count: int, val: float, test: float, seed: int
 ) -> None:
@@ -55,6 +55,55 @@ def test_kfold_tests_every_recording_once_in_parts_that_differ_by_one() -> None:
     assert sorted(name for part in parts for name in part) == sorted(found)
     assert {len(part) for part in parts} == {4, 5}
     assert all(len(with_role(roles, "val", fold)) == 2 for fold in range(5))
+
+
+def objects(count: int, trials: int) -> dict[str, dict[str, str]]:
+    """Recordings of ``count`` objects, so many of each."""
+    return {f"o{i}-{j}": {"object": f"o{i}"} for i in range(count) for j in range(trials)}
+
+
+@pytest.mark.parametrize("stratify", ["", "object"])
+def test_kfold_apart_tests_unknown_objects_and_known_ones_side_by_side(stratify: str) -> None:
+    found = objects(7, 6)
+    roles = assign(found, Scheme("kfold", folds=3, val=0.2, stratify=stratify, apart="object"))
+    plain = assign(found, Scheme("kfold", folds=3, val=0.2, stratify=stratify))
+    unknown_in: list[str] = []
+    for fold in range(3):
+        learned = {found[name]["object"] for role in ("train", "val") for name in with_role(roles, role, fold)}
+        unknown = {one["object"] for one in found.values()} - learned
+        unknown_in += unknown
+        tested = with_role(roles, "test", fold)
+        assert {name for name in found if found[name]["object"] in unknown} <= tested
+        known = {name for name in tested if found[name]["object"] in learned}
+        assert known == {name for name in with_role(plain, "test", fold) if found[name]["object"] in learned}
+        assert known
+        assert with_role(roles, "val", fold)
+    assert sorted(unknown_in) == sorted({one["object"] for one in found.values()})  # each is unknown once
+
+
+def test_the_objects_that_are_unknown_together_follow_from_the_seed_and_parts_are_even() -> None:
+    found = objects(8, 1)
+    alike = [assign(found, Scheme("kfold", folds=4, val=0, seed=seed, apart="object")) for seed in (1, 1, 2)]
+    assert alike[0] == alike[1] != alike[2]
+    assert all(2 <= len(with_role(alike[0], "test", fold)) <= 4 for fold in range(4))  # 2 unknown, up to 2 known
+
+
+def test_a_recording_that_comes_in_later_is_unknown_together_with_its_object() -> None:
+    scheme = Scheme("kfold", folds=3, val=0.2, apart="object")
+    old = assign(objects(6, 4), scheme)
+    found = objects(9, 5)
+    new = assign(found, scheme, keep=old)
+    assert {key: new[key] for key in old} == old
+    learned = [{found[name]["object"] for name in found if new[name, fold] in ("train", "val")} for fold in range(3)]
+    unknown = [{f"o{i}" for i in range(9)} - one for one in learned]
+    assert sorted(name for one in unknown for name in one) == sorted(f"o{i}" for i in range(9))
+    assert {len(one) for one in unknown} == {3}
+
+
+def test_an_older_split_that_kept_nothing_apart_cannot_be_extended_to_do_so() -> None:
+    old = assign(objects(4, 6), Scheme("kfold", folds=3))
+    with pytest.raises(TacpipeError, match="did not keep object apart"):
+        assign(objects(4, 7), Scheme("kfold", folds=3, apart="object"), keep=old)
 
 
 def test_blocked_trains_on_the_first_and_tests_the_last() -> None:
@@ -119,6 +168,9 @@ def test_an_older_split_of_other_folds_is_refused() -> None:
         (Scheme("kfold", folds=1), "1 folds cannot be made"),
         (Scheme("leave-one-out", by="colour"), "has no attribute colour; it has object"),
         (Scheme(stratify="colour"), "has no attribute colour"),
+        (Scheme("kfold", folds=4, apart="object"), "3 values of object cannot be kept apart in 4 folds"),
+        (Scheme("kfold", folds=2, apart="colour"), "has no attribute colour"),
+        (Scheme("random", apart="object"), "apart object goes with the scheme kfold alone"),
     ],
 )
 def test_a_split_that_cannot_be_says_why(scheme: Scheme, message: str) -> None:

@@ -39,6 +39,15 @@ def test_the_same_params_give_the_same_table(shard: Shard) -> None:
     assert tables[0].equals(tables[1])
 
 
+def test_every_param_reaches_the_scheme(shard: Shard) -> None:
+    params = split.params(scheme="kfold", folds=2, val=0.25, seed=5, stratify="object", apart="object")
+    rows = split(params, dataset(shard, 16)).recordings["split"].tables.to_pylist()
+    objects = {f"t{i:02d}": i % 4 for i in range(16)}
+    for fold in (0, 1):
+        learned = {objects[row["recording"]] for row in rows if row["fold"] == fold and row["role"] != "test"}
+        assert len(learned) == 2
+
+
 def test_a_missing_attribute_is_an_error_sentence(shard: Shard) -> None:
     with pytest.raises(TacpipeError, match="has no attribute authors_role"):
         split(split.params(scheme="authors"), dataset(shard, 3))
