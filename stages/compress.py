@@ -1,14 +1,15 @@
 """Compress tactile channels to a few latents, fitted on the training recordings alone.
 
-The latents are added as columns ``z00``, ``z01``, …; all other columns stay. Channels are those whose field metadata
-says ``quantity=tactile``; their rest level is taken off before. ``codec.json`` and ``codec.safetensors`` hold what is
-needed to go back to counts.
+The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Channels are those whose field
+metadata says ``quantity=tactile``; their rest level is taken off before. ``codec.json`` and ``codec.safetensors`` hold
+what is needed to go back to counts, and how much is lost on the way.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from tacpipe.stage import stage
 
@@ -16,64 +17,103 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.dataset import Dataset, Shard
-    from tacpipe.stage import Fitted, Result
+    from tacpipe.stage import Fitted, Result, Workspace
 
 
 @dataclass(frozen=True)
 class Params:
-    """How many latents to keep."""
+    """How many latents to keep, and of what."""
 
     components: int = 20  # latents to keep, at most the number of channels; the paper kept 20
     variance: float = 0.0  # keep as many latents as hold this share of the variance instead; 0 counts components
+    of: str = "levels"  # levels: counts above rest; increments: what each row adds to the one before
 
 
-@stage(version=1)
+@dataclass(frozen=True)
+class AutoencoderParams:
+    """What the network reads, how wide it is, and how it is trained."""
+
+    frames: int = 1  # rows in a row that it reads, 1, 2 or 3: the paper's classes C1, C2 and C3
+    components: int = 8  # latents; the paper chose 8
+    hidden: str = ""  # widths of the encoder's hidden layers, as 64,32; empty: those of the class
+    of: str = "levels"  # levels: counts above rest; increments: what each row adds to the one before
+    search: int = 0  # networks to try under the same budget, at most 12, of which the best is kept; 0: none
+    epochs: int = 100  # most passes over the training rows
+    batch: int = 256  # rows a step of the optimiser
+    learning_rate: float = 1e-3  # of Adam, without unit
+    weight_decay: float = 1e-5  # of Adam, without unit
+    patience: int = 10  # epochs without a lower error on held-out training recordings after which training ends
+    seed: int = 0  # of first weights and shuffles
+    PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {"quick": {"epochs": 5}}
+
+
+@stage(version=2)
 def fit(params: Params, train: Dataset) -> Result:
-    """Return the codec fitted on all rows of the training recordings that no gap touches."""
-    import numpy as np
-
-    from tacpipe.codecs import pca, tactile
-    from tacpipe.codecs.codec import check_channels
-    from tacpipe.errors import TacpipeError
+    """Return the principal components of the training recordings' rows in contact that no gap touches."""
+    from tacpipe.codecs import pca, training_rows
     from tacpipe.stage import Result
 
-    if not train.shards:
-        raise TacpipeError("There is no training recording to fit a codec on. Make a split that has some.")
-    values, channels, layout = [], None, []
-    for name, shard in sorted(train.shards.items()):
-        table = shard.table()
-        found = tactile.columns(table.schema, "tactile")
-        if channels is None:
-            channels, layout = found, tactile.layout(table.schema, found)
-        try:
-            check_channels(channels, found)
-            counts = tactile.above_rest(table, channels)
-        except TacpipeError as error:
-            raise TacpipeError(f"{name}: {error}") from error
-        values.append(counts[~tactile.gaps(table) & np.isfinite(counts).all(axis=1)])
-    if not channels:
-        raise TacpipeError("The recordings have no tactile channel (field metadata quantity=tactile) to compress.")
-    codec = pca.fit(np.concatenate(values), channels, layout, components=params.components, variance=params.variance)
+    rows = training_rows.read(train.shards, params.of)
+    codec = pca.fit_and_measure(rows, components=params.components, variance=params.variance, of=params.of)
     return Result(files=codec.to_files())
 
 
-@stage(version=1, fit=fit)
+@stage(version=1)
+def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
+    """Return the autoencoder trained on the training recordings' rows in contact that no gap touches."""
+    from tacpipe.codecs import autoencoder_fit, training_rows
+    from tacpipe.stage import Result
+    from tacpipe.training.loop import Schedule
+
+    tried = autoencoder_fit.networks(
+        params.frames, params.hidden, params.search, params.learning_rate, params.weight_decay
+    )
+    schedule = Schedule(
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience,
+        gradient_clip=autoencoder_fit.GRADIENT_CLIP,
+        seed=params.seed,
+    )
+    rows = training_rows.read(train.shards, params.of, params.frames)
+    codec = autoencoder_fit.fit(rows, tried, schedule, workspace, components=params.components, of=params.of)
+    return Result(files=codec.to_files())
+
+
+@stage(version=2, fit=fit)
 def pca(params: Params, recording: Shard, codec: Fitted) -> pa.Table:
     """Add the principal components of the tactile channels as columns ``z00``, ``z01``, ….
 
     Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
     """
+    return _encoded(recording, codec)
+
+
+@stage(version=1, fit=fit_autoencoder)
+def autoencoder(params: AutoencoderParams, recording: Shard, codec: Fitted) -> pa.Table:
+    """Add what an autoencoder makes of the tactile channels as columns ``z00``, ``z01``, ….
+
+    Of the training recordings 15 % are held out to say when its training ends. Raises `TacpipeError` where the
+    recording's channels are not those the codec was fitted on.
+    """
+    return _encoded(recording, codec)
+
+
+def _encoded(recording: Shard, codec: Fitted) -> pa.Table:
+    """Return the recording's table with its latents."""
     import pyarrow as pa
 
     from tacpipe.codecs import codec as codecs
-    from tacpipe.codecs import tactile
+    from tacpipe.codecs import stretches, tactile
     from tacpipe.errors import TacpipeError
 
     fitted, table = codecs.load(codec), recording.table()
     channels = tactile.columns(table.schema, "tactile")
     try:
         codecs.check_channels(fitted.channels, channels)
-        latents = fitted.encode(tactile.above_rest(table, channels), channels)  # (time, latent)
+        begins = stretches.breaks(tactile.times(table))
+        latents = fitted.encode(tactile.above_rest(table, channels), channels, begins)  # (time, latent)
     except TacpipeError as error:
         raise TacpipeError(f"{recording.name}: {error}") from error
     for index, name in enumerate(fitted.latents):

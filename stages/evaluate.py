@@ -1,7 +1,8 @@
 """Judge a model on recordings, beside its baselines, with intervals over recordings.
 
-Writes ``metrics.json``, ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording) and the predictions of
-each recording. Recordings that the model was trained on are reported apart, under ``seen``.
+Writes ``metrics.json``, ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the
+sums behind them) and the predictions of each recording. Recordings that the model was trained on are reported apart,
+under ``seen``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class Params:
     """Nothing to choose: how a model is judged is not up to who trained it."""
 
 
-@stage(version=1)
+@stage(version=2)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Judge a model on recordings, by the measures of the task it was trained for."""
     import json

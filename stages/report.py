@@ -1,4 +1,9 @@
-"""Put results on one page that needs nothing but a browser."""
+"""Put results on one page that needs nothing but a browser.
+
+Several results of the task ``forward`` are compared first, seeds and folds of a method pooled; of more than two, only the
+best method's and that of the paper are told in full. Outputs of ``tacpipe compress`` may be given besides: they tell what
+codecs of other widths lose.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +24,10 @@ class Params:
     """What the page shows."""
 
     title: str = "Touch, predicted"  # heading of the page
-    traces: int = 2  # recordings of each result whose predictions are drawn
+    traces: int = 2  # recordings of each result told in full whose predictions are drawn
 
 
-@stage(version=1)
+@stage(version=2)
 def report(params: Params, results: Datasets) -> Result:
     """Put results on one page: headline, figures, tables, and where every number comes from."""
     from tacpipe.report import page

@@ -1,22 +1,30 @@
-"""Cut synchronized recordings down to the part that matters."""
+"""Mark what happens in synchronized recordings: contacts and slips.
+
+Segments choose what a model is trained on; nothing is thrown away, all rows stay.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import stage
 
 if TYPE_CHECKING:
+    import numpy as np
     import pyarrow as pa
+    from numpy.typing import NDArray
 
     from tacpipe.dataset import Shard
+
+EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
 
 
 @dataclass(frozen=True)
 class Params:
-    """What counts as contact.
+    """What counts as contact, and as the level without load.
 
     The thresholds stem from 52 published pick-and-move trials of a XELA uSkin: at rest the load stays below 6 counts,
     in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts remain for seconds.
@@ -28,12 +36,17 @@ class Params:
     off_count: float = 80.0  # device counts below which it ends
     merge_s: float = 0.5  # seconds; contacts that are no further apart are one
     min_s: float = 0.3  # seconds; shorter contacts are left out
-    pad_s: float = 0.5  # seconds kept before and after each contact
+    pad_s: float = 0.5  # seconds before and after each contact that belong to it
+    tare: str = "median"  # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
 
 
-@stage(version=1)
+@stage(version=2)
 def contacts(params: Params, recording: Shard) -> pa.Table:
-    """Return the rows in which either finger touches something, numbered in ``contact``; none if it never does."""
+    """Mark the rows in which either finger touches something, numbered from 0 in ``contact``; -1 in all others.
+
+    Each tactile channel's level without load is written into its field metadata ``rest``. Contact is told from the
+    median of the first seconds, whatever ``tare`` is.
+    """
     import numpy as np
     import pyarrow as pa
 
@@ -48,21 +61,107 @@ def contacts(params: Params, recording: Shard) -> pa.Table:
     rest: dict[str, dict[str, str]] = {}
     for names in _sensors(recording.name, table).values():
         values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
-        level = rest_level(values, t_ns, params.rest_s)
-        rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, level, strict=True)}
         axes = len({(table.field(name).metadata or {}).get(b"axis") for name in names})
+        level = rest_level(values, t_ns, params.rest_s)
         loads.append(load(values, level, axes))
+        written = _tared(params.tare, values, level, axes)
+        rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, written, strict=True)}
     if params.begins == "grasped":
         intervals = np.array([[0, len(t_ns)]])
     else:
         intervals = contact_intervals(
             np.max(loads, axis=0), t_ns, params.on_count, params.off_count, params.min_s, params.merge_s, params.pad_s
         )
-    lengths = intervals[:, 1] - intervals[:, 0]
-    rows = np.concatenate([np.arange(start, stop) for start, stop in intervals] or [np.zeros(0, dtype=np.int64)])
-    numbers = np.repeat(np.arange(len(intervals), dtype=np.int32), lengths)
+    numbers = np.full(len(t_ns), -1, dtype=np.int32)
+    for number, (start, stop) in enumerate(intervals):
+        numbers[start:stop] = number
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
-    return with_metadata(table.take(pa.array(rows)).append_column(field, pa.array(numbers)), rest)
+    return with_metadata(table.append_column(field, pa.array(numbers)), rest)
+
+
+@dataclass(frozen=True)
+class SlipParams:
+    """What counts as slip and as drop, in the readings of a proximity sensor that looks at the held object.
+
+    Thresholds are in multiples of the noise of the readings' rate after the grasp. One millimetre is 8 counts on the
+    published rig, its fingers' patch 25 mm, its noise 0.8 counts and its smallest reading 544.
+    """
+
+    channel: str = ""  # column with the readings; empty for the only one whose quantity is proximity
+    cutoff_hz: float = 5.0  # of the low-pass before the rate is taken
+    still_s: float = 0.5  # seconds after the grasp in which nothing slips yet: they give the noise and the level
+    on_sigma: float = 5.0  # times the rate's noise, beyond which slip begins
+    off_sigma: float = 2.0  # times the rate's noise, below which it ends
+    on_frames: int = 3  # rows that it must be beyond
+    off_frames: int = 5  # rows that it must be below
+    noise_floor: float = 3.0  # counts a second; least noise of the rate: a reading's step of one count makes 10 of them
+    level_count: float = 0.75  # counts; readings that have moved no further have not left their level yet
+    patch_mm: float = 25.0  # millimetres; an object that has slipped further is lost
+    count_per_mm: float = 8.0  # of the sensor
+    saturated_count: float = 544.0  # counts; a reading of this or less is no distance any more, the object is lost
+
+
+@stage(version=1)
+def slips(params: SlipParams, recording: Shard) -> pa.Table:
+    """Mark where the held object slips, and from where on it is dropped, by its distance from the wrist.
+
+    Adds the labels ``slip``, told with all of the recording at hand, ``slip_online``, told from the rows so far, and
+    ``dropped``. Run it behind ``segment contacts``: each contact is a grasp, and a drop lasts until the next one. Without
+    the column ``contact`` all of the recording is one. Outside of contacts, after a drop and where there is no reading
+    nothing slips.
+    """
+    import numpy as np
+    import pyarrow as pa
+
+    from tacpipe.signals import slip
+
+    table = recording.table()
+    if "slip" in table.column_names:
+        raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
+    readings = table.column(_proximity(recording.name, params.channel, table)).to_numpy().astype(np.float64)
+    t_ns = table.column("t_ns").to_numpy()
+    rate_hz = _rate_hz(recording.name, t_ns)
+    contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
+    still, patch_count = round(params.still_s * rate_hz), params.patch_mm * params.count_per_mm
+    limits = slip.Limits(
+        on_sigma=params.on_sigma,
+        off_sigma=params.off_sigma,
+        on_rows=params.on_frames,
+        off_rows=params.off_frames,
+        noise_floor=params.noise_floor,
+        level_count=params.level_count,
+    )
+    values = slip.filled(readings)
+    labels = {name: np.zeros(len(t_ns), dtype=bool) for name in ("slip", "slip_online", "dropped")}
+    grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
+    for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise
+        since, held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
+        lost = slip.dropped(since, still, patch_count, params.saturated_count)
+        known_lost = slip.dropped_online(since, still, patch_count, params.saturated_count)
+        labels["dropped"][rows] = lost
+        labels["slip"][rows] = held & ~lost & slip.slip_offline(since, rate_hz, params.cutoff_hz, still, limits)
+        known = slip.slip_online(since, rate_hz, params.cutoff_hz, still, limits)
+        labels["slip_online"][rows] = held & ~known_lost & known
+    for name, marks in labels.items():
+        field = pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})
+        table = table.append_column(field, pa.array(marks.astype(np.int8)))
+    return table
+
+
+def _tared(tare: str, values: NDArray[Any], level: NDArray[np.float64], axes: int) -> NDArray[np.float64]:
+    """Return what is taken off each channel (channel,); ``level`` is the median of the first seconds."""
+    import numpy as np
+
+    from tacpipe.signals.contact import axis_mean_level
+
+    if tare == "median":
+        return level
+    if tare == "first":
+        first: NDArray[np.float64] = values[0].astype(np.float64)
+        return first
+    if tare == "axis_mean":
+        return axis_mean_level(values, axes)
+    raise TacpipeError(f"tare is {tare!r}; it must be median, first or axis_mean.")
 
 
 def _sensors(name: str, table: pa.Table) -> dict[Any, list[str]]:
@@ -78,3 +177,36 @@ def _sensors(name: str, table: pa.Table) -> dict[Any, list[str]]:
             f"with a tactile stream."
         )
     return found
+
+
+def _proximity(name: str, channel: str, table: pa.Table) -> str:
+    """Return the column with the distance of the object."""
+    found: list[str] = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == b"proximity"]
+    if channel:
+        if channel not in table.column_names:
+            raise TacpipeError(
+                f"Recording {name} has no column {channel}; proximity is in {', '.join(found) or 'none'}."
+            )
+        return channel
+    if len(found) != 1:
+        raise TacpipeError(
+            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is told from one. "
+            f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
+        )
+    return found[0]
+
+
+def _rate_hz(name: str, t_ns: NDArray[np.int64]) -> float:
+    """Return how many rows there are a second. Raises `TacpipeError` where their steps are not even."""
+    import numpy as np
+
+    if len(t_ns) < 2:
+        raise TacpipeError(f"Recording {name} has {len(t_ns)} rows; slip shows in two or more. Exclude the recording.")
+    steps_ns = np.diff(t_ns)
+    mean_ns = float(steps_ns.mean())
+    if not mean_ns > 0 or np.abs(steps_ns - mean_ns).max() > EVEN * mean_ns:
+        raise TacpipeError(
+            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is told "
+            f"on even ones. Synchronize with `--grid uniform`."
+        )
+    return 1e9 / mean_ns

@@ -14,20 +14,27 @@ class Params:
     trials: int = 24  # recordings
     seed: int = 0  # of all that is random
     duration_s: float = 12.0  # seconds a recording: approach, grasp, lift and move, then further moves
+    protocol: str = "mixed"  # how the arm moves: controlled (trapezoids), kinaesthetic (by hand), or mixed
+    effort: float = 0.0  # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
+    friction_scale: float = 1.0  # times the friction that was drawn; with 4 nothing ever slips
+    grip_loss_probability: float = 0.0  # share of trials in which the grip gives way, unannounced
+    grip_loss: float = 0.2  # share of the grip force that is lost then
+    lever_m: float = 0.0  # metres from the grasp to the centre of mass, sideways; twists the object
+    still: bool = False  # hold the lifted object still from first to last row, without drift and creep
     tactile_rate_hz: float = 50.0  # frames a second of each tactile sensor
     robot_rate_hz: float = 1000.0  # states a second of the arm
     hold_probability: float = 0.07  # share of tactile frames that repeat the one before; 0.75 is like the 2021 rig
     drop_probability: float = 0.002  # share of samples that are lost
-    noise_scale: float = 1.0  # times the noise of a real uSkin at rest (1.35, 1.15, 3.4 counts in x, y, z)
-    tactile_jitter_ms: float = 2.0  # milliseconds, standard deviation of a tactile frame's stamp
-    robot_jitter_ms: float = 0.5  # milliseconds, standard deviation of an arm state's stamp
-    clock_offset_ms: float = 0.0  # milliseconds, largest offset of a tactile clock; nothing downstream undoes it
-    clock_skew_ppm: float = 50.0  # parts per million, largest skew of a stream's clock
+    noise_scale: float = 1.0  # times the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
+    tactile_jitter_ms: float = 2.0  # milliseconds, mean and standard deviation of a tactile frame's way to the host
+    robot_jitter_ms: float = 0.5  # milliseconds, the same of an arm state or a proximity reading
+    clock_offset_ms: float = 80.0  # milliseconds, largest offset of the sensors' own clocks (t_device_ns)
+    clock_skew_ppm: float = 50.0  # parts per million, largest skew of a device's own clock
 
 
-@stage(version=1)
+@stage(version=2)
 def forward(params: Params, trial: Trial) -> Recording:
-    """Return one grasp-lift-move trial: xela1, xela2, robot and, with ground truth, truth."""
+    """Return one grasp-lift-move trial: xela1, xela2, robot, proximity and, with ground truth, truth."""
     from tacpipe.simulation.pick_and_move import Rig, simulate_trial
 
     values = asdict(params)

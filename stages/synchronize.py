@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
@@ -18,43 +18,122 @@ if TYPE_CHECKING:
 
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
+DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device says of a sample; they stay as they are
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
+GRIDS, CLOCKS = ("uniform", "logged", "fresh"), ("auto", "device", "arrival")
+MEDIAN_NS = (
+    10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
+)
 
 
 @dataclass(frozen=True)
 class Params:
-    """The grid, and what counts as a gap."""
+    """The grid, the clock that places samples on it, and what counts as a gap."""
 
     rate_hz: float = 50.0  # points a second of the uniform grid
-    grid: str = "uniform"  # uniform, or logged: the master's own stamps, with values at equal stamps left as they are
+    grid: str = "uniform"  # uniform; logged: at the master's own stamps; fresh: at those whose rows are not held
     master: str = ""  # stream whose first sample starts the grid; empty for the first tactile one by name
     gap_ms: float = 50.0  # milliseconds; a point between samples further apart than this is marked as in a gap
+    clock: str = "auto"  # device: when the device says a sample was taken; arrival: when it came; auto: as can be had
+    unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are
 
 
-@stage(version=1)
+@dataclass(frozen=True)
+class _Stream:
+    """One stream of a recording, and when its samples were taken on the host's clock."""
+
+    name: str
+    table: pa.Table
+    t_ns: NDArray[np.int64]  # (time,)
+    held: NDArray[np.bool_]  # (time,)
+    attributes: dict[str, Attribute] = field(default_factory=dict)  # what the fit of its clock gave
+
+    @property
+    def channels(self) -> list[str]:
+        return _channel_names(self.table)
+
+    @property
+    def truth(self) -> bool:
+        """Whether all of it is ground truth."""
+        return all(name.startswith(TRUTH) for name in self.channels)
+
+
+@stage(version=2)
 def synchronize(params: Params, recording: Shard) -> Recording:
     """Return one table on one clock, over the time that all streams cover, with masks of holds and gaps."""
     import pyarrow as pa
 
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
 
+    _require_known(params)
     tables = {name: recording.table(name) for name in sorted(recording.streams) if name != EVENTS}
-    stamps = {name: _stamps(recording.name, name, table) for name, table in tables.items()}
-    master = _master(recording.name, params.master, tables)
-    grid_ns = _grid(recording.name, params, stamps, master)
-    time = tables[master].schema.field("t_ns")
-    columns: list[tuple[pa.Field, Any]] = [(time, grid_ns)]
-    attributes: dict[str, Attribute] = {"grid": params.grid, "grid_master": master}
+    streams = {name: _stream(recording.name, name, table, params.clock) for name, table in tables.items()}
+    master = streams[_master(recording.name, params.master, tables)]
+    grid_ns, rows = _grid(recording.name, params, streams, master)
+    columns: list[tuple[pa.Field, Any]] = [(master.table.schema.field("t_ns"), grid_ns)]
+    attributes: dict[str, Attribute] = {"grid": params.grid, "grid_master": master.name}
     attributes["grid_rate_hz"] = params.rate_hz if params.grid == "uniform" else round(mean_rate_hz(grid_ns), 3)
-    for name, table in tables.items():
-        held = _held(table)
-        columns += _channels(name, table, stamps[name], grid_ns)
-        if not all(column.startswith(TRUTH) for column in _channel_names(table)):
-            columns += _masks(name, stamps[name], held, grid_ns, round(params.gap_ms * 1e6))
-            attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stamps[name]), 3)
-            attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stamps[name], held), 3)
-    arrays = [pa.array(values, field.type) for field, values in columns]
-    return Recording(pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns])), attributes)
+    for name, stream in streams.items():
+        exact = _rows_at(stream.t_ns, grid_ns, rows)
+        if params.unwrap:
+            stream, wrapped = _unwrapped(stream)
+            attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
+        columns += _channels(stream, tables[name].schema, grid_ns, exact)
+        if not stream.truth:
+            columns += _masks(stream, grid_ns, exact, round(params.gap_ms * 1e6))
+            attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
+            attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.held), 3)
+            attributes |= stream.attributes
+    arrays = [pa.array(values, kind.type) for kind, values in columns]
+    return Recording(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
+
+
+def _require_known(params: Params) -> None:
+    for value, what, known in ((params.grid, "grid", GRIDS), (params.clock, "clock", CLOCKS)):
+        if value not in known:
+            raise TacpipeError(f"There is no {what} {value!r}; it must be {', '.join(known[:-1])} or {known[-1]}.")
+
+
+def _stream(recording: str, name: str, table: pa.Table, clock: str) -> _Stream:
+    """Return a stream with its samples on the host's clock; ``clock`` says by which stamps."""
+    stream = _Stream(name, table, _stamps(recording, name, table), _held(table))
+    if clock == "arrival" or stream.truth:
+        return stream
+    if DEVICE not in table.column_names:
+        if clock == "device":
+            raise TacpipeError(
+                f"Recording {recording}: stream {name!r} has no column {DEVICE}, and so no clock of a device. "
+                f"Take `--clock auto`, which uses the device's clock where there is one, or `--clock arrival`."
+            )
+        return stream
+    t_ns, attributes = _on_host_clock(recording, name, table, stream.t_ns)
+    return replace(stream, t_ns=t_ns, attributes=attributes)
+
+
+def _on_host_clock(
+    recording: str, stream: str, table: pa.Table, arrival_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], dict[str, Attribute]]:
+    """Return when samples were taken by their device's clock, mapped to the host's, and what the fit gave."""
+    import pyarrow as pa
+
+    from tacpipe.signals.clocks import fit_clock, host_times
+
+    column = table.column(DEVICE)
+    if column.null_count or not pa.types.is_integer(column.type):
+        raise TacpipeError(
+            f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
+            f"it must be whole nanoseconds in each row. Mend it at the source, or take `--clock arrival`."
+        )
+    device_ns = column.cast(pa.int64()).to_numpy()
+    try:
+        fit = fit_clock(device_ns, arrival_ns)
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {recording}, stream {stream!r}: {error}") from error
+    return host_times(fit, device_ns, arrival_ns), {
+        f"{stream}_clock_offset_ms": round(fit.offset_ns / 1e6, 3),
+        f"{stream}_clock_drift_ppm": round(fit.drift_ppm, 1),
+        f"{stream}_clock_residual_ms": round(fit.median_residual_ns / 1e6, 3),
+    }
 
 
 def _stamps(recording: str, stream: str, table: pa.Table) -> NDArray[np.int64]:
@@ -89,96 +168,141 @@ def _master(recording: str, wanted: str, tables: Mapping[str, pa.Table]) -> str:
     raise TacpipeError(f"Recording {recording} has no tactile stream; name the master among {_list(tables)}.")
 
 
-def _grid(recording: str, params: Params, stamps: Mapping[str, NDArray[np.int64]], master: str) -> NDArray[np.int64]:
-    """Return the grid points that lie within every stream, on the phase of the master's first sample."""
+def _grid(
+    recording: str, params: Params, streams: Mapping[str, _Stream], master: _Stream
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the grid points that lie within every stream, and the row of each: of the master, or of the grid itself.
+
+    A uniform grid is on the phase of the master's first sample.
+    """
+    import numpy as np
+
     from tacpipe.signals.resampling import uniform_grid
 
-    first = max(int(t_ns[0]) for t_ns in stamps.values())
-    last = min(int(t_ns[-1]) for t_ns in stamps.values())
-    if params.grid == "uniform":
-        grid_ns = uniform_grid(int(stamps[master][0]), last, params.rate_hz)
-    elif params.grid == "logged":
-        grid_ns = stamps[master]
-    else:
-        raise TacpipeError(f"There is no grid {params.grid!r}; it must be uniform or logged.")
-    grid_ns = grid_ns[(grid_ns >= first) & (grid_ns <= last)]
-    if not len(grid_ns):
+    first = max(int(stream.t_ns[0]) for stream in streams.values())
+    last = min(int(stream.t_ns[-1]) for stream in streams.values())
+    grid_ns = uniform_grid(int(master.t_ns[0]), last, params.rate_hz) if params.grid == "uniform" else master.t_ns
+    within = (grid_ns >= first) & (grid_ns <= last)
+    if params.grid == "fresh":
+        within &= ~master.held
+    rows = np.flatnonzero(within)
+    if not len(rows):
         raise TacpipeError(
             f"Recording {recording}: its streams have no time in common: the last to start does so at {first} ns and "
             f"the first to end at {last} ns. Check their clocks, or exclude the recording."
         )
-    return grid_ns
+    return grid_ns[rows], rows
+
+
+def _unwrapped(stream: _Stream) -> tuple[_Stream, int]:
+    """Return the stream with the wrap-around of its tactile counts undone, and in how many channels there was any."""
+    import pyarrow as pa
+
+    from tacpipe.signals.wraps import unwrapped
+
+    table, wrapped = stream.table, 0
+    for position, kind in enumerate(table.schema):
+        tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
+        if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
+            values = table.column(kind.name).to_numpy()
+            found = unwrapped(values)
+            if found is not values:
+                table = table.set_column(position, kind.with_type(pa.int32()), pa.array(found))
+                wrapped += 1
+    return replace(stream, table=table), wrapped
 
 
 def _channels(
-    stream: str, table: pa.Table, t_ns: NDArray[np.int64], grid_ns: NDArray[np.int64]
+    stream: _Stream, schema: pa.Schema, grid_ns: NDArray[np.int64], exact: NDArray[np.int64] | None
 ) -> list[tuple[pa.Field, Any]]:
-    """Return field and values of each channel on the grid, in the order of the table."""
-    import numpy as np
+    """Return field and values of each channel on the grid, in the order of the table; ``schema`` is that recorded."""
     import pyarrow as pa
 
-    from tacpipe.signals.resampling import bracketing_rows, linear, nearest_rows, slerp
+    from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
-    exact = _rows_at(t_ns, grid_ns)
-    names = _channel_names(table)
+    table = stream.table
     if exact is not None:
         rows = pa.array(exact)
-        return [(_field(stream, table, name, "none"), table.column(name).take(rows).combine_chunks()) for name in names]
-    found: dict[str, tuple[pa.Field, Any]] = {}
-    groups: dict[str, list[str]] = {"nearest": [], "linear": []}
-    for name in names:
+        return [
+            (_field(stream, name, "none"), table.column(name).take(rows).combine_chunks()) for name in stream.channels
+        ]
+    groups: dict[str, list[str]] = {}
+    for name in stream.channels:
         groups.setdefault(_method(table, name), []).append(name)
-    rows = pa.array(nearest_rows(t_ns, grid_ns)) if groups["nearest"] else None
-    for name in groups.pop("nearest"):
-        found[name] = (_field(stream, table, name, "nearest"), table.column(name).take(rows).combine_chunks())
-    used = bracketing_rows(t_ns, grid_ns)
-    t_ns = t_ns[used]
+    found: dict[str, tuple[pa.Field, Any]] = {}
+    if "nearest" in groups:
+        rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
+        for name in groups.pop("nearest"):
+            found[name] = (_field(stream, name, "nearest"), table.column(name).take(rows).combine_chunks())
+    used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
-        if not members:
-            continue
-        values = np.stack([table.column(name).to_numpy()[used] for name in members], axis=1)  # (time, channel)
-        if method == "linear":
-            moved = linear(t_ns, values, grid_ns)
-        else:
-            moved = slerp(t_ns, values[:, _order(stream, table, members)].astype(np.float64), grid_ns)
-            members = [members[i] for i in _order(stream, table, members)]
-        for name, column in zip(members, moved.T, strict=True):
-            kind = _between(table.schema.field(name).type)
-            field = _field(stream, table, name, "slerp" if method != "linear" else "linear", kind)
-            found[name] = (field, np.ascontiguousarray(column, dtype=kind.to_pandas_dtype()))
-    return [found[name] for name in names]
+        how = method.partition(" ")[0]
+        ordered = [members[i] for i in _order(stream.name, table, members)] if how == "slerp" else members
+        moved = _between_samples(stream, ordered, how, grid_ns, slice(None) if how == "median" else used)
+        for name, column in zip(ordered, moved.T, strict=True):
+            found[name] = _as_stored(_field(stream, name, how, _between(schema.field(name).type)), column)
+    return [found[name] for name in stream.channels]
+
+
+def _between_samples(
+    stream: _Stream, names: list[str], how: str, grid_ns: NDArray[np.int64], used: Any
+) -> NDArray[np.float64]:
+    """Return channels between their samples (grid, channel), from the rows ``used`` alone."""
+    import numpy as np
+
+    from tacpipe.signals.resampling import linear, median_around, slerp
+
+    t_ns = stream.t_ns[used]
+    values = np.stack([stream.table.column(name).to_numpy()[used] for name in names], axis=1)  # (time, channel)
+    if how == "slerp":
+        return slerp(t_ns, values.astype(np.float64), grid_ns)
+    if how == "median":
+        return median_around(t_ns, values, grid_ns, MEDIAN_NS)
+    return linear(t_ns, values, grid_ns)
+
+
+def _as_stored(kind: pa.Field, column: NDArray[np.float64]) -> tuple[pa.Field, Any]:
+    import numpy as np
+
+    return kind, np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype())
 
 
 def _masks(
-    stream: str, t_ns: NDArray[np.int64], held: NDArray[np.bool_], grid_ns: NDArray[np.int64], gap_ns: int
+    stream: _Stream, grid_ns: NDArray[np.int64], exact: NDArray[np.int64] | None, gap_ns: int
 ) -> list[tuple[pa.Field, Any]]:
     """Return where the nearest sample was held, where there is a gap, and how far the nearest sample is."""
+    import numpy as np
     import pyarrow as pa
 
-    from tacpipe.signals.resampling import in_gap, nearest, nearest_distance_ns
+    from tacpipe.signals.resampling import in_gap, nearest_rows
 
-    mask = {"unit": "1", "quantity": "mask", "stream": stream}
+    mask = {"unit": "1", "quantity": "mask", "stream": stream.name}
+    rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
     return [
-        (pa.field(f"{stream}_held", pa.bool_(), metadata=mask), nearest(t_ns, held, grid_ns)),
-        (pa.field(f"{stream}_gap", pa.bool_(), metadata=mask), in_gap(t_ns, grid_ns, gap_ns)),
+        (pa.field(f"{stream.name}_held", pa.bool_(), metadata=mask), stream.held[rows]),
+        (pa.field(f"{stream.name}_gap", pa.bool_(), metadata=mask), in_gap(stream.t_ns, grid_ns, gap_ns)),
         (
-            pa.field(f"{stream}_dt_ns", pa.int64(), metadata={**mask, "unit": "ns"}),
-            nearest_distance_ns(t_ns, grid_ns),
+            pa.field(f"{stream.name}_dt_ns", pa.int64(), metadata={**mask, "unit": "ns"}),
+            np.abs(stream.t_ns[rows] - grid_ns),
         ),
     ]
 
 
-def _rows_at(t_ns: NDArray[np.int64], grid_ns: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the rows whose stamps are the grid's, or None if the stream has no sample at some grid point."""
+def _rows_at(
+    t_ns: NDArray[np.int64], grid_ns: NDArray[np.int64], grid_rows: NDArray[np.int64]
+) -> NDArray[np.int64] | None:
+    """Return the rows whose stamps are the grid's, or None if the stream has no sample at some grid point.
+
+    ``grid_rows`` (grid,) are the rows that a stream has there which was stamped along with the grid's.
+    """
     import numpy as np
 
-    first = int(np.searchsorted(t_ns, grid_ns[0]))
-    rows = np.arange(first, first + len(grid_ns))
+    rows: NDArray[np.int64] = np.searchsorted(t_ns, grid_ns[0]) + grid_rows - grid_rows[0]
     if rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns):
         return rows  # one clock for both, equal stamps in a row included
-    rows = np.searchsorted(t_ns, grid_ns)
+    rows = np.searchsorted(t_ns, grid_ns).astype(np.int64)
     found = rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns)
-    return rows.astype(np.int64) if found else None
+    return rows if found else None
 
 
 def _held(table: pa.Table) -> NDArray[np.bool_]:
@@ -198,15 +322,17 @@ def _channel_names(table: pa.Table) -> list[str]:
 
 
 def _method(table: pa.Table, name: str) -> str:
-    """Return how a channel is interpolated: nearest, linear, or slerp and the name of its quaternion."""
+    """Return how a channel is interpolated: nearest, linear, median, or slerp and the name of its quaternion."""
     import pyarrow as pa
 
     field = table.schema.field(name)
     metadata = field.metadata or {}
     quantity = metadata.get(b"quantity", b"").decode()
     number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
-    if not number or quantity in AS_IT_STANDS or name in ("t_device_ns", "seq"):
+    if not number or quantity in AS_IT_STANDS or name in (DEVICE, SEQUENCE):
         return "nearest"
+    if quantity == "proximity":
+        return "median"
     if quantity == "orientation":
         return "slerp " + name.removesuffix(metadata.get(b"component", b"").decode())
     return "linear"
@@ -232,13 +358,13 @@ def _between(kind: pa.DataType) -> pa.DataType:
     return pa.float32() if kind.bit_width <= 16 else pa.float64()
 
 
-def _field(stream: str, table: pa.Table, name: str, interpolation: str, kind: pa.DataType | None = None) -> pa.Field:
+def _field(stream: _Stream, name: str, interpolation: str, kind: pa.DataType | None = None) -> pa.Field:
     """Return the field of a channel on the grid: ``<stream>_<column>``, where it came from and how."""
     import pyarrow as pa
 
-    field = table.schema.field(name)
-    metadata = {**(field.metadata or {}), b"stream": stream, b"interpolation": interpolation}
-    return pa.field(name if name.startswith(TRUTH) else f"{stream}_{name}", kind or field.type, metadata=metadata)
+    found = stream.table.schema.field(name)
+    metadata = {**(found.metadata or {}), b"stream": stream.name, b"interpolation": interpolation}
+    return pa.field(name if name.startswith(TRUTH) else f"{stream.name}_{name}", kind or found.type, metadata=metadata)
 
 
 def _list(names: Any) -> str:

@@ -21,7 +21,7 @@ Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data,
 """
 SUMMARIES = {
     "ingest": "Read published recordings into a dataset.",
-    "segment": "Cut recordings down to what matters in them.",
+    "segment": "Mark what matters in recordings.",
     "compress": "Turn tactile channels into latents.",
     "train": "Train a model.",
     "simulate": "Write recordings of the simulated rig, with ground truth.",

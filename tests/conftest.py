@@ -106,6 +106,16 @@ def lab(
     forget()
 
 
+@pytest.fixture(scope="session")
+def chained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project in which the forward chain has run; tests may add to it, but change nothing that is there."""
+    from tests import chain
+
+    folder = tmp_path_factory.mktemp("chained")
+    chain.run(folder)
+    return folder
+
+
 def forget() -> None:
     """Make the registry look again for what is installed."""
     registry.entry_points.cache_clear()

@@ -15,6 +15,7 @@ COMMANDS = {
     "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
     "synchronize": "synchronize simulate.forward -o {0}",
     "segment.contacts": "segment contacts synchronize -o {0}",
+    "segment.slips": "segment slips segment.contacts -o {0}",
     "split": "split segment.contacts --scheme random --val 0.34 --test 0.34 -o {0}",
     "compress.pca": "compress pca segment.contacts --split split --components 4 -o {0}",
 }

@@ -86,7 +86,7 @@ def test_the_commands_of_the_readme_print_what_it_says(tmp_path: Path, monkeypat
     (tmp_path / "moving_stages.py").write_text(code)
     environment = {"PYTHONPATH": str(tmp_path), "TACPIPE_STORE": str(tmp_path / "store"), "OMP_NUM_THREADS": "1"}
     given = [command for block in blocks(sixty + own, "console") for command in printed(block)]
-    assert len(given) >= 13
+    assert len(given) >= 12
 
     for command, lines in given:
         ran = tacpipe(tmp_path, command.removeprefix("tacpipe "), **environment)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shlex
@@ -140,7 +141,7 @@ def cached(folder: Path) -> list[bytes]:
 
 @pytest.mark.dvc
 @NEEDS_DVC
-def test_the_forward_chain_runs_once_and_dvc_shows_its_metrics_params_and_plots(
+def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_params_and_plots(
     tmp_path: Path, environment: Mapping[str, str]
 ) -> None:
     project = Project(tmp_path / "forward", environment)
@@ -149,29 +150,32 @@ def test_the_forward_chain_runs_once_and_dvc_shows_its_metrics_params_and_plots(
         shutil.copy(HERE / name, project.folder / name)
     (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
     params = yaml.safe_load((project.folder / "params.yaml").read_text())
-    params["forward"]["recordings"] = "simulate forward --trials 6 --duration-s 4"
-    params["forward"]["train"] |= {"epochs": 1, "hidden": 8}
+    params["forward"] |= {"recordings": "simulate forward --trials 10 --duration-s 4", "preset": "quick", "folds": [0]}
+    params["forward"]["quick"]["methods"]["taxelwise"] |= {"epochs": 1, "hidden": 8}
     (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
     project.start()
-    project.run("dvc repro")
-    again = project.run("dvc repro")
+    target, results = "forward-raw@taxelwise-0", "results/forward/taxelwise/0"
+    project.run(f"dvc repro {target}")
+    again = project.run(f"dvc repro {target}")
     project.commit("one epoch")
 
     assert "Running stage" not in again
     assert "up to date" in again
-    metrics = json.loads(project.run("dvc metrics show --json"))[""]["data"]["results/forward/metrics.json"]["data"]
-    assert metrics["model"]["mae_counts"]["all"]["t10"] > 0
-    assert metrics["persistence"]["mae_counts"]["all"]["t10"] > 0
-    project.change("components: 20", "components: 12")
+    shown = json.loads(project.run(f"dvc metrics show --json {results}/metrics.json"))
+    metrics = shown[""]["data"][f"{results}/metrics.json"]["data"]
+    assert metrics["model"]["mae_counts"]["both"]["t10"] > 0
+    assert metrics["persistence"]["mae_counts"]["both"]["t10"] > 0
+    project.change("rest_s: 0.2", "rest_s: 0.3")
     changed = json.loads(project.run("dvc params diff --json"))["params.yaml"]
-    assert changed == {"forward.compress.components": {"old": 20, "new": 12, "diff": -8}}
+    assert changed == {"forward.segment.rest_s": {"old": 0.2, "new": 0.3, "diff": pytest.approx(0.1)}}
     project.run("dvc plots show --out plots")
     page = (project.folder / "plots" / "index.html").read_text()
     assert "persistence" in page
     assert "mse_counts" in page
     assert "<DVC_METRIC" not in page
     contents = cached(project.folder)
-    assert sum(b'"format": 1' in content for content in contents) == 7  # a manifest a stage, one of which persists
+    # a manifest each of recordings, synced, segments, split, model and results
+    assert sum(b'"format": 1' in content for content in contents) == 6
     assert not [content for content in contents if content.startswith(b"PAR1")]
     assert max(map(len, contents)) < 5_000_000
 
@@ -237,35 +241,60 @@ def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:
     assert "Running stage" not in toy.run("dvc repro")
 
 
-def stages() -> Iterator[tuple[str, dict[str, Any], list[str]]]:
-    """Yield each stage of the project's own chain and the words of its command."""
-    params = yaml.safe_load((HERE / "params.yaml").read_text())
+def filled(value: Any, names: Mapping[str, str]) -> Any:
+    """Return ``value`` with each ``${name}`` in its texts replaced."""
+    if isinstance(value, str):
+        for name, text in names.items():
+            value = value.replace(f"${{{name}}}", text)
+        return value
+    if isinstance(value, list):
+        return [filled(one, names) for one in value]
+    if isinstance(value, dict):
+        return {filled(name, names): filled(one, names) for name, one in value.items()}
+    return value
+
+
+def stages(preset: str) -> Iterator[tuple[str, dict[str, Any], list[list[str]]]]:
+    """Yield each stage of the project's own chain in its first fold, and the words of each of its commands."""
+    params = yaml.safe_load((HERE / "params.yaml").read_text())["forward"]
+    known = {"forward.recordings": params["recordings"], "forward.preset": preset}
     for name, value in yaml.safe_load((HERE / "dvc.yaml").read_text())["stages"].items():
-        command = value["cmd"].replace("${forward.recordings}", params["forward"]["recordings"])
-        yield name, value, shlex.split(command)
+        matrix = {key: ["0"] if one == "${forward.folds}" else one for key, one in value.get("matrix", {}).items()}
+        for chosen in itertools.product(*matrix.values()):
+            items = {f"item.{key}": str(one) for key, one in zip(matrix, chosen, strict=True)}
+            found = filled({key: one for key, one in value.items() if key != "matrix"}, {**known, **items})
+            commands = found["cmd"] if isinstance(found["cmd"], list) else [found["cmd"]]
+            yield "-".join([name, *items.values()]), found, [shlex.split(command) for command in commands]
 
 
-@pytest.mark.parametrize(("name", "value", "words"), [pytest.param(*found, id=found[0]) for found in stages()])
-def test_every_step_of_the_chain_is_a_stage_whose_block_of_params_fits(
-    name: str, value: dict[str, Any], words: list[str], lab: Lab
-) -> None:
-    assert words[0] == "tacpipe"
-    known = registry.stages()
-    assert words[1] in known or f"{words[1]}.{words[2]}" in known
-    if "--block" in words:
-        assert words[words.index("--block") + 1] in value["params"]
+def output_of(words: list[str]) -> str:
+    """Return what DVC tracks of a command's output."""
+    output = words[words.index("-o") + 1]
+    return output if output.endswith(".html") else f"{output}/manifest.json"
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_every_command_of_the_chain_is_a_stage_whose_block_of_params_fits(preset: str, lab: Lab) -> None:
+    known, seen = registry.stages(), set()
     shutil.copy(HERE / "params.yaml", lab.folder)
-
-    printed = json.loads(lab.run(shlex.join([*words[1:], "--print-params"])).out)
-
-    assert isinstance(printed, dict)
+    for name, value, commands in stages(preset):
+        for words in commands:
+            assert words[0] == "tacpipe", name
+            assert words[1] in known or f"{words[1]}.{words[2]}" in known, name
+            block = words[words.index("--block") + 1] if "--block" in words else ""
+            assert not block or any(block.startswith(one) for one in value["params"]), name
+            if (*words[1:3], block) not in seen:
+                printed = json.loads(lab.run(shlex.join([*words[1:], "--print-params"])).out)
+                assert isinstance(printed, dict), name
+            seen.add((*words[1:3], block))
 
 
 def test_dvc_tracks_manifests_and_the_report_alone() -> None:
     before: set[str] = set()
-    for name, value, words in stages():
+    for name, value, commands in stages("quick"):
         outs = {out if isinstance(out, str) else next(iter(out)) for out in value["outs"]}
-        output = words[words.index("-o") + 1]
-        assert outs == {output if output.endswith(".html") else f"{output}/manifest.json"}, name
-        assert set(value.get("deps", ())) <= before, name
+        assert outs <= {output_of(words) for words in commands}, name
+        assert output_of(commands[-1]) in outs, name
+        for needed in value.get("deps", ()):
+            assert needed in before or any(out.startswith(f"{needed}/") for out in before), name
         before |= outs

@@ -30,10 +30,8 @@ def imported(folder: Path, words: str) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("lab")
-    chain.run(folder)
-    return folder
+def lab(chained: Path) -> Path:
+    return chained
 
 
 @pytest.mark.parametrize("words", ["--help", "train --help", "train forward --help", "store gc --help", "show --help"])

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from tacpipe.codecs.stretches import INCREMENTS, LEVELS
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
+    Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 DESCRIPTION, TENSORS = "codec.json", "codec.safetensors"
+KINDS = ("autoencoder", "pca")
 
 
 class Codec(Protocol):
@@ -23,6 +26,10 @@ class Codec(Protocol):
     @property
     def kind(self) -> str:
         """The word that `load` knows it by."""
+
+    @property
+    def of(self) -> str:
+        """What latents stand for: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -36,11 +43,16 @@ class Codec(Protocol):
     def layout(self) -> tuple[Mapping[str, str], ...]:
         """Stream, taxel and axis of each channel."""
 
-    def encode(self, values: Floats, channels: Sequence[str]) -> Floats:
-        """Return the latents of counts above rest, (time, channel) to (time, latent)."""
+    def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
+        """Return the latents of counts above rest, (time, channel) to (time, latent), float32.
+
+        ``begins`` (time,) says where a stretch of rows that follow one another begins; None: at the first row alone.
+        A row's latents depend on rows of its stretch up to it, never on later ones; where one of those that it reads is
+        not finite they are NaN.
+        """
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts above rest that latents stand for, (…, latent) to (…, channel)."""
+        """Return the counts that latents stand for, (…, latent) to (…, channel): levels or increments, as ``of`` says."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +62,14 @@ class Raw:
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
     kind: str = "raw"
+    of: str = LEVELS
 
     @property
     def latents(self) -> tuple[str, ...]:
         """The names of the channels."""
         return self.channels
 
-    def encode(self, values: Floats, channels: Sequence[str]) -> Floats:
+    def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
         """Return ``values`` as float32, shape (time, channel)."""
         check_channels(self.channels, channels)
         return values.astype(np.float32)
@@ -64,6 +77,24 @@ class Raw:
     def decode(self, latents: Floats) -> Floats:
         """Return ``latents`` as they are, shape (…, channel)."""
         return latents
+
+
+def decode_ahead(codec: Codec, latents: Floats, last: Floats) -> Floats:
+    """Return the counts above rest that latents of the rows to come stand for, shape (window, step, channel).
+
+    ``latents`` is (window, step, latent), its first step the row after ``last``, which is (window, channel) in counts
+    above rest. A codec of increments adds them up onto ``last``; one of levels does not look at it.
+    """
+    decoded = codec.decode(latents)
+    return last[:, None] + np.cumsum(decoded, axis=1) if codec.of == INCREMENTS else decoded
+
+
+def encode_finite(project: Callable[[Floats], Floats], inputs: Floats, width: int) -> Floats:
+    """Return what ``project`` makes of the rows of ``inputs`` that are finite, (time, ``width``), float32; others NaN."""
+    finite = np.isfinite(inputs).all(axis=1)
+    latents = np.full((len(inputs), width), np.nan, dtype=np.float32)
+    latents[finite] = project(inputs[finite])
+    return latents
 
 
 def check_channels(expected: Sequence[str], given: Sequence[str]) -> None:
@@ -87,6 +118,11 @@ def latent_names(count: int) -> tuple[str, ...]:
     return tuple(f"z{index:02d}" for index in range(count))
 
 
+def description(content: Mapping[str, Any]) -> bytes:
+    """Return the bytes of ``codec.json``: keys sorted, so that one codec has one content."""
+    return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
+
+
 def load(files: Mapping[str, bytes]) -> Codec:
     """Return the codec that `codec.json` and `codec.safetensors` among ``files`` hold.
 
@@ -100,4 +136,10 @@ def load(files: Mapping[str, bytes]) -> Codec:
         from tacpipe.codecs.pca import PCA
 
         return PCA.from_files(files)
-    raise TacpipeError(f"A codec of kind {kind!r} is unknown here; pca is known. Install the plug-in that made it.")
+    if kind == "autoencoder":
+        from tacpipe.codecs.autoencoder import Autoencoder
+
+        return Autoencoder.from_files(files)
+    raise TacpipeError(
+        f"A codec of kind {kind!r} is unknown here; {' and '.join(KINDS)} are known. Install the plug-in that made it."
+    )

@@ -1,25 +1,37 @@
 """Principal components of standardised tactile channels.
 
 The equations are those of any textbook (Pearson 1901): with the training rows' mean and standard deviation s of each
-channel, latent = W ((counts - mean) / s) with orthonormal rows in W, and counts = mean + s (latent W).
+channel, latent = W ((counts - mean) / s) with orthonormal rows in W, and counts = mean + s (latent W). Of increments the
+mean is 0.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tacpipe.codecs.codec import DESCRIPTION, TENSORS, check_channels, latent_names
+from tacpipe.codecs import measures, stretches
+from tacpipe.codecs.codec import (
+    DESCRIPTION,
+    TENSORS,
+    check_channels,
+    description,
+    encode_finite,
+    latent_names,
+)
+from tacpipe.codecs.standard import standard
+from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
+    Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -31,7 +43,9 @@ class PCA:
     mean_count: Floats  # (channel,)
     scale_count: Floats  # (channel,)
     components: Floats  # (latent, channel)
-    explained_ratio: Floats  # (latent,)
+    explained_ratio: Floats  # (component,), of all components, kept or not
+    of: str = stretches.LEVELS
+    measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "pca"
 
     @property
@@ -39,23 +53,28 @@ class PCA:
         """The names of the latents: ``z00`` holds the most variance."""
         return latent_names(len(self.components))
 
-    def encode(self, values: Floats, channels: Sequence[str]) -> Floats:
+    def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
         """Return the latents of counts above rest as float32, (time, channel) to (time, latent).
 
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        latents = ((values - self.mean_count) / self.scale_count) @ self.components.T  # (time, latent)
-        return latents.astype(np.float32)
+        return encode_finite(self.project, stretches.inputs(values, begins, self.of, 1), len(self.components))
+
+    def project(self, inputs: Floats) -> Floats:
+        """Return the latents (row, latent) of finite rows (row, channel), levels or increments as ``of`` says."""
+        return ((inputs - self.mean_count) / self.scale_count) @ self.components.T
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts above rest that latents stand for as float64, (…, latent) to (…, channel)."""
+        """Return the counts that latents stand for as float64, (…, latent) to (…, channel)."""
         return (latents @ self.components) * self.scale_count + self.mean_count
 
     def to_files(self) -> dict[str, bytes]:
         """Return the codec as the content of ``codec.safetensors`` and ``codec.json``."""
-        description = {
+        content = {
+            **self.measured,
             "kind": self.kind,
+            "of": self.of,
             "channels": list(self.channels),
             "layout": [dict(one) for one in self.layout],
             "latents": len(self.components),
@@ -67,40 +86,40 @@ class PCA:
             "components": np.ascontiguousarray(self.components),
             "explained_ratio": self.explained_ratio,
         }
-        return {
-            TENSORS: save_tensors(tensors),
-            DESCRIPTION: (json.dumps(description, indent=1, sort_keys=True) + "\n").encode(),
-        }
+        return {TENSORS: save_tensors(tensors), DESCRIPTION: description(content)}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> PCA:
         """Return the codec that `to_files` wrote."""
-        description, tensors = json.loads(files[DESCRIPTION]), load_tensors(files[TENSORS])
+        content, tensors = json.loads(files[DESCRIPTION]), load_tensors(files[TENSORS])
         return cls(
-            tuple(description["channels"]),
-            tuple(description["layout"]),
+            tuple(content["channels"]),
+            tuple(content["layout"]),
             tensors["mean_count"],
             tensors["scale_count"],
             tensors["components"],
             tensors["explained_ratio"],
+            content["of"],
+            measures.stored(content),
         )
 
 
 def fit(
-    values: Floats,
+    inputs: Floats,
     channels: Sequence[str],
     layout: Sequence[Mapping[str, str]],
     *,
     components: int = 20,
     variance: float = 0.0,
+    of: str = stretches.LEVELS,
 ) -> PCA:
-    """Return the codec fitted on counts above rest ``values``, shape (time, channel).
+    """Return the codec fitted on ``inputs``, shape (row, channel), counts above rest or increments as ``of`` says.
 
     It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this share of the variance.
     A channel that never moves gets the scale 1. The sign of each component is such that its largest weight is positive.
     Raises `TacpipeError` for a count or share that the data cannot give.
     """
-    rows, width = values.shape
+    rows, width = inputs.shape
     most = min(rows - 1, width)
     if most < 1:
         raise TacpipeError(f"A codec cannot be fitted on {rows} rows. Give it training recordings with contact.")
@@ -108,18 +127,41 @@ def fit(
         raise TacpipeError(f"variance is {variance}; it is a share between 0 and 1. Use 0 to count components instead.")
     if variance == 0 and not 1 <= components <= most:
         raise TacpipeError(f"components is {components}; {rows} rows of {width} channels give 1 to {most}.")
-    from sklearn import decomposition
-
-    mean, scale = values.mean(axis=0), values.std(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    found = decomposition.PCA(variance or components, svd_solver="full").fit((values - mean) / scale)
-    weights = np.asarray(found.components_, dtype=np.float64)  # (latent, channel)
+    mean, scale = standard(inputs, of)
+    # scikit-learn's PCA always takes the mean off, which increments keep; the triangle of a QR has the same singular
+    # values and right vectors as all the rows, and as few rows as there are channels.
+    triangle = np.linalg.qr((inputs - mean) / scale, mode="r")
+    _, singular, weights = np.linalg.svd(triangle)
+    power = np.zeros(width)
+    power[: len(singular)] = singular**2
+    ratio = power / power.sum()
+    kept = int(np.searchsorted(ratio.cumsum(), variance, side="right")) + 1 if variance else components
+    kept = min(kept, most)
+    weights = weights[:kept]  # (latent, channel)
     largest = np.take_along_axis(weights, np.abs(weights).argmax(axis=1)[:, None], axis=1)
     return PCA(
-        tuple(channels),
-        tuple(layout),
-        mean,
-        scale,
-        weights * np.where(largest < 0, -1.0, 1.0),
-        np.asarray(found.explained_variance_ratio_, dtype=np.float64),
+        tuple(channels), tuple(layout), mean, scale, weights * np.where(largest < 0, -1.0, 1.0), ratio[:most], of
     )
+
+
+def fit_and_measure(
+    rows: TrainingRows, *, components: int = 20, variance: float = 0.0, of: str = stretches.LEVELS
+) -> PCA:
+    """Return the codec fitted on ``rows`` of all recordings, with its measures.
+
+    The errors are those of as many components fitted without the recordings that are held out, as an autoencoder of
+    the same recordings is, so that the two compare. Without any held out, ``val`` is left out.
+    """
+    everything = rows.of(rows.inputs.keys())
+    codec = fit(everything, rows.channels, rows.layout, components=components, variance=variance, of=of)
+    train, val = rows.parts
+    kept = len(codec.components)
+    if len(val) and len(train) > kept:
+        judged = fit(train, rows.channels, rows.layout, components=kept, of=of)
+    else:
+        judged, train, val = codec, everything, everything[:0]
+    measured = {
+        "reconstruction": measures.reconstructions(judged, train, val),
+        "latent_covariance": measures.covariance(codec, everything),
+    }
+    return replace(codec, measured=measured)

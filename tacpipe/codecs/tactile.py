@@ -70,3 +70,10 @@ def gaps(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
         if name.endswith("_gap"):
             gap |= table.column(name).to_numpy().astype(bool)
     return gap
+
+
+def times(table: pa.Table) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
+    if "t_ns" not in table.column_names:
+        raise TacpipeError("There is no column t_ns, so it cannot be told which rows follow one another.")
+    return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)

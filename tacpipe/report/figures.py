@@ -7,6 +7,7 @@ and all metadata are taken out.
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,100 @@ def skill_by_trial(skill: Sequence[float], windows: Sequence[int]) -> str:
         axes[0].grid(axis="y")
 
     return _svg(draw, "Skill over persistence of each recording", size=(5.4, 3.0))
+
+
+def skill_of_methods(
+    skill: Mapping[str, Mapping[str, Sequence[float]]],
+    ahead: Sequence[float],
+    unit: str,
+    order: Sequence[str] = (),
+    floor: float = -1.0,
+) -> str:
+    """Return a figure of the skill of several methods over the time ahead, each with the band of its interval.
+
+    ``skill`` is by method, then mean, low and high, one value a step. Figures with the same ``order`` of names give a name
+    the same line. Below ``floor`` the figure ends, so that one method
+    that is far worse than persistence does not press the others into one line.
+    """
+
+    def draw(axes: list[Axes]) -> None:
+        axes[0].axhline(0, color=COLOURS["persistence"], linewidth=2, label="persistence")
+        lines = list(itertools.product(("-", "--", ":"), ("model", "codec", "other")))
+        names = list(order) or list(skill)
+        for name, one in skill.items():
+            line, colour = lines[names.index(name) % len(lines)]
+            mean, low, high = (np.array(one[part]) for part in ("mean", "low", "high"))
+            axes[0].fill_between(ahead, low, high, color=COLOURS[colour], alpha=0.15, linewidth=0)
+            axes[0].plot(
+                ahead, mean, color=COLOURS[colour], linestyle=line, marker="o", markersize=3, linewidth=1.8, label=name
+            )
+        told = [value for found in skill.values() for part in ("mean", "low", "high") for value in found[part]]
+        highest, lowest = np.nanmax([0.05, *told]), max(floor, np.nanmin([0.0, *told]))
+        room = 0.05 * (highest - lowest)
+        axes[0].set_ylim(lowest - (room if lowest > floor else 0), highest + room)
+        axes[0].set_xlabel(f"time ahead ({unit})")
+        axes[0].set_ylabel("skill (above 0: better than persistence)")
+        axes[0].grid(axis="y")
+        axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.16), borderaxespad=0)
+
+    return _svg(draw, "Skill of methods over persistence by time ahead, with 95 % intervals", size=(5.4, 4.8))
+
+
+def explained_variance(ratio: Sequence[float], kept: int) -> str:
+    """Return bars of the share of variance that each principal component holds; those that are ``kept`` stand out."""
+
+    def draw(axes: list[Axes]) -> None:
+        numbers = np.arange(1, len(ratio) + 1)
+        colours = [COLOURS["model"] if number <= kept else FAINT for number in numbers]
+        axes[0].bar(numbers, 100 * np.array(ratio), color=colours, width=0.8, linewidth=0)
+        axes[0].set_xlabel("principal component")
+        axes[0].set_ylabel("variance (%)")
+        axes[0].grid(axis="y")
+        axes[0].set_axisbelow(True)
+
+    return _svg(draw, "Share of variance by principal component", size=(5.4, 3.4))
+
+
+def covariance(matrix: Floats) -> str:
+    """Return a covariance matrix (latent, latent) in squares: the stronger the colour, the farther from 0."""
+
+    def draw(axes: list[Axes]) -> None:
+        from matplotlib.patches import Rectangle
+
+        largest = float(np.abs(matrix).max()) or 1.0
+        for (row, column), value in np.ndenumerate(matrix):
+            # the square root shows what is small beside the first component; cells of nothing are left out
+            strength = round(float(np.sqrt(abs(value) / largest)), 2)
+            if strength >= 0.01:
+                colour = COLOURS["model" if value > 0 else "persistence"]
+                axes[0].add_patch(Rectangle((column + 0.5, row + 0.5), 1, 1, color=colour, alpha=strength, linewidth=0))
+        count = len(matrix)
+        axes[0].set(xlim=(0.5, count + 0.5), ylim=(count + 0.5, 0.5), aspect="equal", xlabel="latent", ylabel="latent")
+        axes[0].spines[["top", "right"]].set_visible(True)
+        shown = [1, *range(5, count + 1, 5)] if count > 10 else list(range(1, count + 1))
+        axes[0].set_xticks(shown)
+        axes[0].set_yticks(shown)
+
+    return _svg(draw, "Covariance between latents", size=(4.2, 3.8))
+
+
+def loss_by_width(series: Mapping[str, Mapping[int, float]]) -> str:
+    """Return a figure of reconstruction error over the number of latents; ``series`` is by kind, then by number."""
+
+    def draw(axes: list[Axes]) -> None:
+        lines = itertools.product(("-", "--", ":"), ("model", "codec", "other", "persistence"))
+        for (name, losses), (line, colour) in zip(sorted(series.items()), lines, strict=False):
+            widths = sorted(losses)
+            values = [losses[width] for width in widths]
+            axes[0].plot(widths, values, color=COLOURS[colour], linestyle=line, marker="o", markersize=4, label=name)
+        axes[0].set_xticks(sorted({width for losses in series.values() for width in losses}))
+        axes[0].set_ylim(bottom=0)
+        axes[0].set_xlabel("latents")
+        axes[0].set_ylabel("mean squared error (standardised)")
+        axes[0].grid(axis="y")
+        axes[0].legend()
+
+    return _svg(draw, "Reconstruction error by number of latents", size=(5.4, 3.4))
 
 
 def traces(time_s: Floats, truth: Mapping[str, Floats], ahead: Mapping[str, Mapping[str, Floats]]) -> str:

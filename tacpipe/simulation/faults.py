@@ -1,4 +1,4 @@
-"""What goes wrong between a sensor and its log: late stamps, a clock that is off, lost samples, frames held."""
+"""What goes wrong between a sensor and its log: samples lost, frames held, stamps late, a device's clock that is off."""
 
 from __future__ import annotations
 
@@ -13,32 +13,50 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Clock:
-    """A stream's clock as the log sees it: a reading is ``offset_ns + (1 + skew) * time`` plus jitter."""
+    """A device's own clock: at ``time`` since the trial's start it reads ``offset_ns + (1 + skew) * time``."""
 
     offset_ns: int = 0
     skew: float = 0.0  # 50e-6 is 50 parts per million
-    jitter_ns: float = 0.0  # standard deviation
 
 
-def sample_times(duration_ns: int, rate_hz: float, drop_probability: float, rng: np.random.Generator) -> Times:
-    """Return when samples are taken, int64 nanoseconds from 0 to ``duration_ns`` (time,).
+@dataclass(frozen=True)
+class Samples:
+    """When a device took the samples that reached the log, and the number that it gave each; both are (time,)."""
+
+    true_ns: Times  # since the start of the trial
+    seq: Times  # counts every sample taken, so that a lost one leaves a gap
+
+    @property
+    def lost(self) -> int:
+        """How many samples are missing between the first and the last one in the log."""
+        return int(self.seq[-1] - self.seq[0]) + 1 - len(self.seq) if len(self.seq) else 0
+
+
+def samples(duration_ns: int, rate_hz: float, drop_probability: float, rng: np.random.Generator) -> Samples:
+    """Return the samples of a device from 0 to ``duration_ns``.
 
     They are evenly spaced, of a random phase within one period, and each is lost with ``drop_probability``.
     """
     period_ns = 1e9 / rate_hz
-    taken = np.arange(rng.random() * period_ns, duration_ns, period_ns)
-    true_ns: Times = np.rint(taken[rng.random(len(taken)) >= drop_probability]).astype(np.int64)
-    return true_ns
+    taken_ns = np.rint(np.arange(rng.random() * period_ns, duration_ns, period_ns)).astype(np.int64)
+    seq = np.flatnonzero(rng.random(len(taken_ns)) >= drop_probability)
+    return Samples(taken_ns[seq], seq.astype(np.int64))
 
 
-def stamps(true_ns: Times, clock: Clock, rng: np.random.Generator) -> Times:
-    """Return what a log would stamp samples taken at ``true_ns`` with, int64 (time,); never running backwards.
+def device_stamps(true_ns: Times, clock: Clock) -> Times:
+    """Return what the device's clock reads at ``true_ns``, int64 (time,)."""
+    read_ns: Times = true_ns + clock.offset_ns + np.rint(true_ns * clock.skew).astype(np.int64)
+    return read_ns
 
-    A log writes samples in the order in which they come, so a stamp that jitter put before the last one is raised.
+
+def arrivals(true_ns: Times, delay_ns: float, rng: np.random.Generator) -> Times:
+    """Return when samples taken at ``true_ns`` reach the host, int64 (time,); never running backwards.
+
+    Each is on its way for an exponentially distributed time: never less than nothing, ``delay_ns`` on average and with
+    the same standard deviation. A link keeps the order of its samples, so one that is late holds up those behind it.
     """
-    jitter_ns = rng.normal(0.0, clock.jitter_ns, len(true_ns)) if clock.jitter_ns > 0 else np.zeros(len(true_ns))
-    late_ns = np.rint(true_ns * clock.skew + jitter_ns).astype(np.int64)
-    return np.maximum.accumulate(true_ns + clock.offset_ns + late_ns) if len(true_ns) else true_ns
+    late_ns = np.rint(rng.exponential(delay_ns, len(true_ns))).astype(np.int64)
+    return np.maximum.accumulate(true_ns + late_ns) if len(true_ns) else true_ns
 
 
 def hold(values: NDArray[Any], probability: float, rng: np.random.Generator) -> tuple[NDArray[Any], NDArray[np.bool_]]:

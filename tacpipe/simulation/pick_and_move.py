@@ -1,21 +1,22 @@
-"""The physics of a pick-and-move trial: two fingers with a uSkin each grasp an object, lift it and carry it about.
+"""A pick-and-move trial of the simulated rig: two fingers with a uSkin each grasp a bottle, lift it and carry it about.
 
-The hand follows a trajectory at 1 kHz; the object is held without slip. Newton gives the force that the fingers must
-bring up, and a 4x4 grid of taxels on each shares it out and turns it into counts. What happens, in order:
+What happens, in order:
 
 1. the fingers close (0.6 to 1.2 s), then the grip force ramps up (0.4 s);
-2. the seven phases of the published rig: accelerate, cruise, decelerate upwards, the same along -x, hold;
-3. moves along random axes until the time is over.
+2. the hand lifts the bottle and moves it, as `tacpipe.simulation.trajectory` tells;
+3. the bottle sticks, slips or is dropped, as `tacpipe.simulation.mechanics` tells;
+4. what the fingers bring up shows on `tacpipe.simulation.taxels`, slip on `tacpipe.simulation.proximity` as well;
+5. each device logs it on its own clock, with the faults of `tacpipe.simulation.faults`.
 
-Axes: the hand's x and y are horizontal, y from finger 1 to finger 2, z is up. A taxel's x is the hand's x, its y the
-hand's z, its z the pressure. The gripper points down; the hand turns about the vertical as it moves.
+The grip is weak on purpose, as it was on the published rig: the accelerations at which the bottle slips lie among those
+that the hand reaches. Axes of the hand: x and y are horizontal, y from finger 1 to finger 2, z is up.
 
-Masses, grip force, jerk limit, taxel pitch and stream rates are those of `Rig`; count gains were set so that the spread
-of the tared z channels comes near the 1219 counts of the published recordings (x and y: 279 and 190).
+The spread of the tared counts comes near that of the published recordings, 279, 190 and 1219 counts in x, y and z.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,39 +24,41 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe.errors import TacpipeError
 from tacpipe.formats import channels
-from tacpipe.simulation import faults
+from tacpipe.simulation import faults, mechanics, proximity, taxels, trajectory
 from tacpipe.stage import Attribute, Recording
 
 Floats = NDArray[np.float64]
 
-GRAVITY_M_S2 = 9.81
-TRUTH_HZ = 1000
 START_NS = 1_600_000_000_000_000_000  # UTC stamp of the first trial's start; the next ones follow minutes later
 TRIAL_NS = 120_000_000_000
 MASSES_KG = (0.20, 0.28, 0.36, 0.44, 0.52)  # five fills of a bottle
-GRIP_N = (6.0, 10.0)  # normal force of each finger
-JERK_S = 0.03  # over which the acceleration of a profile changes
-TABLE_M = 0.001  # rise over which the table hands the object's weight over to the fingers
+GRIP_N = (4.0, 8.0)  # normal force of each finger
+FRICTION = (0.35, 0.60)  # mu_s
+RESERVE = (
+    1.3  # least 2 mu_s N over the weight: slip begins at 0.3 g or more, and kinetic friction still bears the weight
+)
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
-PITCH_M = 0.0047
-CROSSTALK = 0.08  # of a taxel's signal that its four neighbours see
-CREEP, CREEP_S = 0.03, 0.5  # share of the pressure that follows late, and how late
-DRIFT_COUNT = 2.0  # random walk, counts after one second
-GAIN_COUNT_N = (1500.0, 1500.0, 3000.0)  # x, y, z
-BULGE = 0.15  # of a taxel's pressure that pushes it outwards, for each taxel that it is off the centre
-BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)
-BASE_SPREAD_COUNT = 300.0
-NOISE_COUNT = (1.35, 1.15, 3.4)  # x, y, z; standard deviation of second differences / sqrt(6), quiet xela-psc frames
-OFF_AXIS = 0.05  # of a force that shows on the other axes
+APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
+LOSS_S, SLIDE_S = 0.02, 0.04  # over which a grip gives way, and for which the load must then be too much
 
 
 @dataclass(frozen=True)
 class Rig:
-    """How long a trial lasts and how its streams are logged."""
+    """What is done to the bottle, and how the streams are logged; the fields are those of the stage's params.
+
+    To study one thing at a time: ``friction_scale=4`` never slips, ``effort=1.15`` slips because of the plan alone,
+    ``effort=0.9, grip_loss_probability=1, grip_loss=0.3`` because of the grip alone, and ``still`` keeps the load constant.
+    """
 
     duration_s: float = 12.0
+    protocol: str = "mixed"  # of trajectory.PROTOCOLS, or each with the same chance
+    effort: float = 0.0  # largest load that the plan makes over the friction limit; 0: grip and friction are random
+    friction_scale: float = 1.0
+    grip_loss_probability: float = 0.0
+    grip_loss: float = 0.2
+    lever_m: float = 0.0
+    still: bool = False
     tactile_rate_hz: float = 50.0
     robot_rate_hz: float = 1000.0
     hold_probability: float = 0.07
@@ -63,168 +66,228 @@ class Rig:
     noise_scale: float = 1.0
     tactile_jitter_ms: float = 2.0
     robot_jitter_ms: float = 0.5
-    clock_offset_ms: float = 0.0
+    clock_offset_ms: float = 80.0
     clock_skew_ppm: float = 50.0
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What the hand and the object do, at 1 kHz from 0; arrays are (time,) or (time, axis)."""
+class Scene:
+    """What truly happens in a trial, before anything is logged; arrays are (time, …) at 1 kHz."""
 
-    t_ns: NDArray[np.int64]
-    position_m: Floats  # (time, axis), world
-    acceleration_m_s2: Floats  # (time, axis), world
-    yaw_rad: Floats  # (time,)
+    protocol: str
+    path: trajectory.Trajectory
     finger_m: Floats  # (time,)
-    grip_n: Floats  # (time,)
-    mass_kg: float
-
-    @property
-    def force_n(self) -> Floats:
-        """The force on the object that the fingers bring up together (time, axis), in the frame of the hand.
-
-        Newton: mass times acceleration and weight; before the object has left the table the table bears the weight.
-        """
-        borne = np.clip((self.position_m[:, 2] - self.position_m[0, 2]) / TABLE_M, 0.0, 1.0)
-        cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        x, y, z = self.acceleration_m_s2.T
-        turned = np.column_stack([cos * x + sin * y, cos * y - sin * x, (z + GRAVITY_M_S2) * borne])
-        force: Floats = self.mass_kg * turned
-        return force
-
-    @property
-    def normal_n(self) -> Floats:
-        """The pressing force of each finger (time, finger): the grip, shifted by what moves the object along y."""
-        along = self.force_n[:, 1] / 2
-        return np.maximum(np.column_stack([self.grip_n + along, self.grip_n - along]), 0.0) * (self.grip_n > 0)[:, None]
+    grasp: mechanics.Grasp
+    contact: mechanics.Contact
+    skins: tuple[taxels.Skin, taxels.Skin]
+    loss_ns: int | None  # when the grip gave way
 
 
 def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
-    """Return trial ``index`` of the rig: the streams xela1, xela2, robot and truth, and what is known of them.
+    """Return trial ``index`` of the rig: the streams xela1, xela2, robot, proximity and truth, and what is known of them.
 
     The same seed, index and rig give the same values. Attributes that begin with ``gt_`` and the columns of ``truth``,
     at 1 kHz, are ground truth. Raises `TacpipeError` for a trial too short to lift anything.
     """
-    rng = np.random.default_rng([seed, index])
-    motion = move(rig.duration_s, rng)
+    scene = perform(seed, index, rig)
     start_ns = START_NS + index * TRIAL_NS
-    truth: dict[str, Attribute] = {"gt_mass_kg": motion.mass_kg, "gt_grip_n": float(motion.grip_n[-1])}
     streams: dict[str, pa.Table] = {}
-    for finger, stream in enumerate(("xela1", "xela2")):
-        clock = _clock(rig, rig.tactile_jitter_ms, rig.clock_offset_ms, rng)
-        true_ns = faults.sample_times(int(motion.t_ns[-1]), rig.tactile_rate_hz, rig.drop_probability, rng)
-        counts = tactile(motion, finger, true_ns, rig.noise_scale, rng)
-        counts, _ = faults.hold(counts, rig.hold_probability, rng)
-        t_ns = start_ns + faults.stamps(true_ns, clock, rng)
-        streams[stream] = channels.stream(t_ns, counts.T, channels.uskin_fields())
-        truth |= {f"gt_{stream}_clock_offset_ns": clock.offset_ns, f"gt_{stream}_clock_skew": clock.skew}
-    clock = _clock(rig, rig.robot_jitter_ms, 0.0, rng)
-    true_ns = faults.sample_times(int(motion.t_ns[-1]), rig.robot_rate_hz, rig.drop_probability, rng)
-    fields = [channels.float_field("finger_m", "m", "finger_width"), *channels.pose_fields()]
-    t_ns = start_ns + faults.stamps(true_ns, clock, rng)
-    streams["robot"] = channels.stream(t_ns, _robot(motion, true_ns).T, fields)
-    truth |= {"gt_robot_clock_offset_ns": clock.offset_ns, "gt_robot_clock_skew": clock.skew}
-    streams["truth"] = _truth(motion, start_ns)
-    attributes: dict[str, Attribute] = {
+    known: dict[str, Attribute] = {}
+    duration_ns = int(scene.path.t_ns[-1])
+    devices = {
+        "xela1": (rig.tactile_rate_hz, rig.tactile_jitter_ms, rig.clock_offset_ms),
+        "xela2": (rig.tactile_rate_hz, rig.tactile_jitter_ms, rig.clock_offset_ms),
+        "robot": (rig.robot_rate_hz, rig.robot_jitter_ms, 0.0),
+        "proximity": (proximity.RATE_HZ, rig.robot_jitter_ms, rig.clock_offset_ms),
+    }
+    for number, (name, (rate_hz, delay_ms, offset_ms)) in enumerate(devices.items()):
+        rng = np.random.default_rng([seed, index, 1, number])
+        samples = faults.samples(duration_ns, rate_hz, rig.drop_probability, rng)
+        offset, skew = rng.uniform(-1, 1, 2)
+        clock = faults.Clock(round(offset * offset_ms * 1e6), float(skew * rig.clock_skew_ppm * 1e-6))
+        arrived_ns = faults.arrivals(samples.true_ns, delay_ms * 1e6, rng)
+        values, fields = _measured(name, scene, samples.true_ns, rig, rng)
+        clocks = [start_ns + faults.device_stamps(samples.true_ns, clock), samples.seq]
+        streams[name] = channels.stream(start_ns + arrived_ns, [*clocks, *values.T], [*_clock_fields(), *fields])
+        known |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
+    streams["truth"] = _truth(scene, start_ns)
+    return Recording(streams, _attributes(scene, index, start_ns, rig) | known)
+
+
+def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
+    """Return what truly happens in trial ``index``; how its streams are logged changes nothing of it."""
+    rng = np.random.default_rng([seed, index])
+    approach_s, pause_s = rng.uniform(*APPROACH_S), rng.uniform(*PAUSE_S)
+    chance = trajectory.PROTOCOLS[int(rng.integers(len(trajectory.PROTOCOLS)))]
+    protocol = chance if rig.protocol == "mixed" else rig.protocol
+    if rig.still:
+        path = trajectory.still(rig.duration_s)
+        closing, squeeze = np.ones(len(path.t_ns)), np.ones(len(path.t_ns))
+    else:
+        path = trajectory.trajectory(protocol, rig.duration_s, approach_s + RAMP_S + pause_s, rng)
+        closing = _ease(path.t_ns / 1e9 / approach_s)
+        squeeze = _ease((path.t_ns / 1e9 - approach_s) / RAMP_S)
+    mass_kg = float(MASSES_KG[rng.integers(len(MASSES_KG))])
+    load_n = np.linalg.norm(
+        mechanics.Grasp(mass_kg, 1.0, squeeze).demand_n(path.hand_acceleration_m_s2)[:, ::2], axis=1
+    )
+    grip_n, friction = _grip(mass_kg, float(load_n.max()), rig.effort, rng)
+    grasp = mechanics.Grasp(mass_kg, friction * rig.friction_scale, grip_n * squeeze, rig.lever_m)
+    loss_ns = None
+    if rng.random() < rig.grip_loss_probability:
+        row = _loss_row(load_n, grasp, path.rise_m, rig.grip_loss, rng)
+        loss_ns = int(path.t_ns[row])
+        weaker = 1 - rig.grip_loss * _ease((path.t_ns - loss_ns) / 1e9 / LOSS_S)
+        grasp = mechanics.Grasp(mass_kg, grasp.friction, grasp.grip_n * weaker, rig.lever_m)
+    rise_m = None if rig.still else path.rise_m
+    contact = mechanics.carry(grasp, path.hand_acceleration_m_s2, rise_m, rate_hz=trajectory.RATE_HZ)
+    skins = (taxels.skin(rng), taxels.skin(rng))
+    return Scene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
+
+
+def touch(scene: Scene, finger: int, true_ns: NDArray[np.int64], *, creep: float = taxels.CREEP) -> Floats:
+    """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis)."""
+    contact = scene.contact
+    rows = np.minimum(np.searchsorted(scene.path.t_ns, true_ns), len(scene.path.t_ns) - 1)
+    at = _at(scene, true_ns)
+    displacement, torque = at(contact.displacement_m), at(contact.torque_nm)
+    pressures = [
+        at(contact.normal_n[:, j])[:, None] * taxels.shares(one, displacement, torque)
+        for j, one in enumerate(scene.skins)
+    ]
+    friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
+    pulled = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
+    late = at(taxels.lagged(contact.normal_n[:, finger], trajectory.RATE_HZ))
+    share = taxels.shares(scene.skins[finger], displacement, torque)
+    pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * share
+    own = slice(finger * channels.TAXELS, (finger + 1) * channels.TAXELS)
+    return np.concatenate([pulled[:, own] + taxels.bulge(pressed), pressed[:, :, None]], axis=2)
+
+
+def _measured(
+    name: str, scene: Scene, true_ns: NDArray[np.int64], rig: Rig, rng: np.random.Generator
+) -> tuple[NDArray[Any], list[Any]]:
+    """Return what a device logs of samples taken at ``true_ns`` (time, channel), and its fields."""
+    if name == "robot":
+        return _robot(scene, true_ns), [channels.float_field("finger_m", "m", "finger_width"), *channels.pose_fields()]
+    if name == "proximity":
+        up_m = _at(scene, true_ns)(scene.contact.displacement_m[:, 1])
+        field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
+        return proximity.readings(up_m, rig.noise_scale, rng)[:, None], [field]
+    finger = ("xela1", "xela2").index(name)
+    one = scene.skins[finger]
+    force = touch(scene, finger, true_ns, creep=0.0 if rig.still else taxels.CREEP)
+    drift_scale = 0.0 if rig.still else rig.noise_scale
+    errors = taxels.errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
+    counts = taxels.digitised(one.base_count + taxels.signal(one, force) + errors)
+    return faults.hold(counts, rig.hold_probability, rng)[0], channels.uskin_fields()
+
+
+def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Return a random grip force and friction that hold the weight, or such that ``load_n`` is ``effort`` of their limit.
+
+    Where effort, mass and plan ask for a grip beyond `GRIP_N`, the grip lies beyond it.
+    """
+    if effort:
+        product = load_n / (2 * effort)
+        low, high = np.clip([product / GRIP_N[1], product / GRIP_N[0]], *FRICTION)
+        friction = float(rng.uniform(low, high))
+        return product / friction, friction
+    while True:
+        grip_n, friction = float(rng.uniform(*GRIP_N)), float(rng.uniform(*FRICTION))
+        if 2 * friction * grip_n >= RESERVE * mass_kg * mechanics.GRAVITY_M_S2:
+            return grip_n, friction
+
+
+def _loss_row(load_n: Floats, grasp: mechanics.Grasp, rise_m: Floats, loss: float, rng: np.random.Generator) -> int:
+    """Return a random row in which the grip gives way while the hand is up: one after which the load is too much.
+
+    The load must stay so from where the grip has given way until `SLIDE_S` later. Where that is nowhere so, any row
+    will do.
+    """
+    aloft = rise_m >= rise_m.max() / 2
+    given, until = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
+    short = np.cumsum(np.append(0, load_n <= (1 - loss) * grasp.limit_n))  # rows before each in which friction holds
+    sliding = aloft.copy()
+    sliding[-until:] = False
+    sliding[:-until] &= short[until:-1] == short[given : given - until - 1]
+    return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
+
+
+def _at(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
+    """Return a function that interpolates values at 1 kHz (time,) or (time, axis) to ``true_ns``."""
+    rows = np.clip(np.searchsorted(scene.path.t_ns, true_ns, side="right"), 1, len(scene.path.t_ns) - 1)
+    before_ns = scene.path.t_ns[rows - 1]
+    share = (true_ns - before_ns) / (scene.path.t_ns[rows] - before_ns)
+
+    def at(values: Floats) -> Floats:
+        weight = share if values.ndim == 1 else share[:, None]
+        found: Floats = values[rows - 1] * (1 - weight) + values[rows] * weight
+        return found
+
+    return at
+
+
+def _robot(scene: Scene, true_ns: NDArray[np.int64]) -> Floats:
+    """Return finger width, position and quaternion (time, 8) at ``true_ns``: the gripper points down and yaws."""
+    at = _at(scene, true_ns)
+    half = at(scene.path.yaw_rad) / 2
+    zero = np.zeros_like(half)
+    return np.column_stack([at(scene.finger_m), at(scene.path.position_m), np.cos(half), np.sin(half), zero, zero])
+
+
+def _clock_fields() -> list[Any]:
+    device = pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
+    return [device, pa.field("seq", pa.int64(), metadata={"unit": "1", "quantity": "sequence"})]
+
+
+def _truth(scene: Scene, start_ns: int) -> Any:
+    """Return the stream ``truth`` at 1 kHz."""
+    contact = scene.contact
+    columns: list[tuple[Any, Any]] = [
+        (channels.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[:, j]) for j in (0, 1)
+    ]
+    columns += _vector("gt_force_{}_n", "N", "force", contact.force_n)
+    columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", scene.path.acceleration_m_s2)
+    moved, speed = contact.displacement_m, contact.velocity_m_s
+    columns += _vector("gt_displacement_{}_m", "m", "position", moved, "xz")
+    columns.append((channels.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
+    columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", speed, "xz")
+    columns.append((channels.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
+    columns.append((channels.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm))
+    columns.append((channels.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad))
+    mass = np.full(len(scene.path.t_ns), scene.grasp.mass_kg)
+    columns.append((channels.float_field("gt_mass_kg", "kg", "mass"), mass))
+    columns += [(channels.label_field("gt_slip"), contact.slip), (channels.label_field("gt_dropped"), contact.dropped)]
+    fields, values = zip(*columns, strict=True)
+    return channels.stream(start_ns + scene.path.t_ns, values, fields)
+
+
+def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[str] = channels.AXES) -> list[Any]:
+    return [
+        (channels.float_field(name.format(axis), unit, quantity), column)
+        for axis, column in zip(axes, values.T, strict=True)
+    ]
+
+
+def _attributes(scene: Scene, index: int, start_ns: int, rig: Rig) -> dict[str, Attribute]:
+    contact, grasp = scene.contact, scene.grasp
+    onset_ns = None if contact.onset is None else start_ns + int(scene.path.t_ns[contact.onset])
+    return {
         "sensor": "xela-uskin",
         "simulated": True,
-        "object": f"bottle-{round(motion.mass_kg * 1000)}g",
+        "object": f"bottle-{round(grasp.mass_kg * 1000)}g",
         "object_class": "bottle",
-        "dropped": False,
+        "protocol": "still" if rig.still else scene.protocol,
+        "dropped": bool(contact.dropped.any()),
         "rate_hz": rig.tactile_rate_hz,
         "trial": f"trial-{index:04d}",
+        "gt_mass_kg": grasp.mass_kg,
+        "gt_grip_n": float(grasp.grip_n.max()),
+        "gt_friction": grasp.friction,
+        "gt_slip_onset_ns": onset_ns,
+        "gt_grip_loss_ns": None if scene.loss_ns is None else start_ns + scene.loss_ns,
     }
-    return Recording(streams, attributes | truth)
-
-
-def move(duration_s: float, rng: np.random.Generator) -> Motion:
-    """Return a random trial's motion, grip and mass, ``duration_s`` long."""
-    rows = round(duration_s * TRUTH_HZ) + 1
-    approach_s, ramp_s, pause_s = rng.uniform(0.6, 1.2), 0.4, rng.uniform(0.2, 0.5)
-    first = approach_s + ramp_s + pause_s
-    if duration_s < first + 1.5:
-        raise TacpipeError(f"A trial of {duration_s} s ends before its lift; duration_s must be 4 s or more.")
-    time_s = np.arange(rows) / TRUTH_HZ
-    acceleration = _smooth(_profile(rows, round(first * TRUTH_HZ), rng))  # (time, axis)
-    velocity = np.cumsum(acceleration, axis=0) / TRUTH_HZ
-    position = np.cumsum(velocity, axis=0) / TRUTH_HZ + [0.58, 0.0, 0.18]
-    turning = np.clip((time_s - first) / 1.0, 0.0, 1.0)
-    yaw = rng.uniform(0.05, 0.3) * turning * np.sin(2 * np.pi * (time_s - first) / rng.uniform(4.0, 8.0))
-    closing = _ease(time_s / approach_s)
-    grip = rng.uniform(*GRIP_N) * _ease((time_s - approach_s) / ramp_s)
-    mass_kg = float(MASSES_KG[rng.integers(len(MASSES_KG))])
-    t_ns = np.arange(rows, dtype=np.int64) * (1_000_000_000 // TRUTH_HZ)
-    finger_m = OPEN_M + (GRASPED_M - OPEN_M) * closing
-    return Motion(t_ns, position, acceleration, yaw, finger_m, grip, mass_kg)
-
-
-def tactile(
-    motion: Motion, finger: int, true_ns: NDArray[np.int64], noise_scale: float, rng: np.random.Generator
-) -> NDArray[np.uint16]:
-    """Return the counts of finger 0 or 1 at the times ``true_ns`` (time, channel), taxel by taxel, axes x, y, z.
-
-    Each finger bears half of the shear. A Gaussian centred where the object touches shares pressure and shear among
-    the taxels; the centre moves with the shear, and pressure bulges the skin outwards. Counts are base, gain times
-    force, a late share (creep), cross-talk to neighbours and other axes, drift and noise, rounded.
-    """
-    at_s, time_s = true_ns / 1e9, motion.t_ns / 1e9
-    late = _lagged(motion.normal_n[:, finger])
-    normal, slow, shear_x, shear_z = (
-        np.interp(at_s, time_s, values)
-        for values in (motion.normal_n[:, finger], late, motion.force_n[:, 0] / 2, motion.force_n[:, 2] / 2)
-    )
-    touching = np.interp(at_s, time_s, (motion.grip_n > 0).astype(np.float64))
-    grid = (np.arange(4) - 1.5) * PITCH_M
-    place = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)  # (taxel, 2)
-    centre = rng.uniform(-0.003, 0.003, 2) + 2e-4 * np.column_stack([shear_x, shear_z])  # (time, 2), 0.2 mm/N
-    distance2 = ((place[None] - centre[:, None]) ** 2).sum(axis=2)  # (time, taxel)
-    share = np.exp(-distance2 / (2 * rng.uniform(0.004, 0.006) ** 2))
-    share /= share.sum(axis=1, keepdims=True)
-    pressed = (1 - CREEP) * normal + CREEP * slow
-    force = np.stack([shear_x * touching, shear_z * touching, pressed], axis=1)[:, None] * share[:, :, None]
-    force[:, :, :2] += BULGE * force[:, :, 2:] * (place[None] - centre[:, None]) / PITCH_M
-    mixing = np.eye(3) + OFF_AXIS * rng.uniform(-1, 1, (channels.TAXELS, 3, 3))  # (taxel, axis, axis)
-    signal = np.einsum("tna,nba->tnb", force, mixing) * GAIN_COUNT_N  # (time, taxel, axis)
-    signal = np.einsum("tna,mn->tma", signal, _crosstalk())
-    base = np.array(BASE_COUNT) + rng.uniform(-BASE_SPREAD_COUNT, BASE_SPREAD_COUNT, (channels.TAXELS, 3))
-    steps_s = np.diff(at_s, prepend=at_s[:1])
-    drift = np.cumsum(rng.normal(0, DRIFT_COUNT, signal.shape) * np.sqrt(steps_s)[:, None, None], axis=0)
-    noise = rng.normal(0, 1.0, signal.shape) * NOISE_COUNT * noise_scale
-    level = np.rint(base + signal + drift + noise).clip(0, 65_535)
-    counts: NDArray[np.uint16] = level.reshape(len(true_ns), -1).astype(np.uint16)
-    return counts
-
-
-def _profile(rows: int, first: int, rng: np.random.Generator) -> Floats:
-    """Return the commanded acceleration (time, axis): trapezoids of velocity, one after another from row ``first``."""
-    acceleration = np.zeros((rows, 3))
-    reach = np.zeros(3)  # where the hand is from its start, m
-    limits = np.array([0.30, 0.15, 0.40])  # m to either side; z stays above the first lift
-    row, leg = first, 0
-    while row < rows:
-        phase = round(rng.uniform(0.25, 0.6) * TRUTH_HZ)  # rows, T of the published profile
-        axis = (2, 0)[leg] if leg < 2 else int(rng.integers(3))
-        sign = (1.0, -1.0)[leg] if leg < 2 else -np.sign(reach[axis]) or float(rng.choice([-1.0, 1.0]))
-        longest = limits[axis] if leg < 2 else max(limits[axis] * 0.5, 0.05)
-        speed = rng.uniform(0.4, 1.0) * longest / (2 * phase / TRUTH_HZ)  # m/s, V; the leg is 2 V T long
-        if leg >= 2 and axis == 2 and sign < 0:
-            speed = min(speed, 0.8 * reach[2] / (2 * phase / TRUTH_HZ))
-        if row + 3 * phase + round(JERK_S * TRUTH_HZ) >= rows:
-            break
-        acceleration[row : row + phase, axis] += sign * speed * TRUTH_HZ / phase
-        acceleration[row + 2 * phase : row + 3 * phase, axis] -= sign * speed * TRUTH_HZ / phase
-        reach[axis] += sign * 2 * speed * phase / TRUTH_HZ
-        row += 3 * phase + (phase if leg == 1 else round(rng.uniform(0.05, 0.3) * TRUTH_HZ))
-        leg += 1
-    return acceleration
-
-
-def _smooth(acceleration: Floats) -> Floats:
-    """Return ``acceleration`` (time, axis) averaged over `JERK_S`, so that it never jumps."""
-    width = round(JERK_S * TRUTH_HZ)
-    total = np.cumsum(acceleration, axis=0)
-    total[width:] -= total[:-width].copy()
-    return total / width
 
 
 def _ease(progress: Floats) -> Floats:
@@ -232,46 +295,3 @@ def _ease(progress: Floats) -> Floats:
     held = np.clip(progress, 0.0, 1.0)
     eased: Floats = held**2 * (3 - 2 * held)
     return eased
-
-
-def _lagged(values: Floats) -> Floats:
-    """Return ``values`` (time,) after a first-order lag of `CREEP_S`."""
-    steps = np.arange(round(6 * CREEP_S * TRUTH_HZ))
-    kernel = np.exp(-steps / (CREEP_S * TRUTH_HZ))
-    kernel /= kernel.sum()
-    size = 1 << int(np.ceil(np.log2(len(values) + len(kernel))))
-    lagged: Floats = np.fft.irfft(np.fft.rfft(values, size) * np.fft.rfft(kernel, size), size)[: len(values)]
-    return lagged
-
-
-def _crosstalk() -> Floats:
-    """Return what of each taxel's signal each one sees (taxel, taxel)."""
-    row, column = np.divmod(np.arange(channels.TAXELS), 4)
-    apart = np.abs(row[:, None] - row) + np.abs(column[:, None] - column)
-    seen: Floats = np.eye(channels.TAXELS) + CROSSTALK * (apart == 1)
-    return seen
-
-
-def _clock(rig: Rig, jitter_ms: float, offset_ms: float, rng: np.random.Generator) -> faults.Clock:
-    offset_ns = round(rng.uniform(-1, 1) * offset_ms * 1e6)
-    return faults.Clock(offset_ns, float(rng.uniform(-1, 1) * rig.clock_skew_ppm * 1e-6), jitter_ms * 1e6)
-
-
-def _robot(motion: Motion, true_ns: NDArray[np.int64]) -> Floats:
-    """Return finger width, position and quaternion (time, 8) at ``true_ns``: the gripper points down and yaws."""
-    columns = [motion.finger_m, *motion.position_m.T, motion.yaw_rad]
-    finger, x, y, z, yaw = (np.interp(true_ns, motion.t_ns, column) for column in columns)
-    zero = np.zeros_like(yaw)
-    return np.column_stack([finger, x, y, z, np.cos(yaw / 2), np.sin(yaw / 2), zero, zero])
-
-
-def _truth(motion: Motion, start_ns: int) -> Any:
-    """Return the stream ``truth`` at 1 kHz."""
-    columns = {"gt_finger1_normal_n": motion.normal_n[:, 0], "gt_finger2_normal_n": motion.normal_n[:, 1]}
-    columns |= {f"gt_force_{axis}_n": motion.force_n[:, i] for i, axis in enumerate("xyz")}
-    fields = [channels.float_field(name, "N", "force") for name in columns]
-    more = {f"gt_acceleration_{axis}_m_s2": motion.acceleration_m_s2[:, i] for i, axis in enumerate("xyz")}
-    fields += [channels.float_field(name, "m/s^2", "acceleration") for name in more]
-    fields.append(channels.float_field("gt_mass_kg", "kg", "mass"))
-    mass = np.full(len(motion.t_ns), motion.mass_kg)
-    return channels.stream(start_ns + motion.t_ns, [*columns.values(), *more.values(), mass], fields)

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 def write(folder: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
     """Replace the checkpoint in ``folder``; after return it is on disk, and before it the old one is whole."""
     folder.mkdir(parents=True, exist_ok=True)
-    content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {"state": json.dumps(state)})
+    content = save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {"state": json.dumps(state)})
     draft = folder / f"{FILE}.tmp"
     with open(draft, "wb") as file:
         file.write(content)

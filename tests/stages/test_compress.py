@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -12,15 +16,23 @@ from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, ta
 PCA = registry.load("compress.pca")
 assert PCA.fit is not None
 FIT = PCA.fit
+AUTOENCODER = registry.load("compress.autoencoder")
+assert AUTOENCODER.fit is not None
+FIT_AUTOENCODER = AUTOENCODER.fit
 RECORDINGS = [motion(seed) for seed in range(4)]
 
 
-def fitted(*shards: FakeShard, **how: float) -> dict[str, bytes]:
+def fitted(*shards: FakeShard, **how: float | str) -> dict[str, bytes]:
     return dict(FIT(PCA.params(**({"components": 3} | how)), dataset(*shards)).files)
 
 
 def compressed(shard: FakeShard, files: dict[str, bytes]) -> pa.Table:
     return PCA(PCA.params(), shard, files)
+
+
+def learned(folder: Path, *shards: FakeShard, **how: Any) -> dict[str, bytes]:
+    params = AUTOENCODER.params(**({"components": 3, "hidden": "8", "epochs": 2} | how))
+    return dict(FIT_AUTOENCODER(params, dataset(*shards), folder).files)
 
 
 def test_latents_are_added_and_everything_else_stays() -> None:
@@ -77,3 +89,71 @@ def test_no_recording_and_no_tactile_channel_are_refused() -> None:
         fitted()
     with pytest.raises(TacpipeError, match="no tactile channel"):
         fitted(FakeShard("a", table(np.zeros((9, 0)))))
+
+
+def test_rows_outside_of_contact_are_encoded_and_not_learned() -> None:
+    values = np.random.default_rng(0).normal(size=(80, len(CHANNELS)))
+    wild = values.copy()
+    wild[:30] *= 1e4
+    contact = np.where(np.arange(80) < 30, -1, 0)
+    inside, marked = FakeShard("a", table(values[30:])), FakeShard("a", table(wild, contact=contact))
+    assert fitted(marked) == fitted(inside)
+    assert np.isfinite(compressed(marked, fitted(marked))["z00"].to_numpy()).all()
+
+
+def test_rows_that_are_not_finite_get_latents_that_are_not() -> None:
+    values = np.random.default_rng(0).normal(size=(80, len(CHANNELS)))
+    values[9, 4] = np.nan
+    shard = FakeShard("a", table(values))
+    found = compressed(shard, fitted(shard))
+    assert np.isnan(found["z01"].to_numpy()).nonzero()[0].tolist() == [9]
+
+
+def test_increments_do_not_reach_across_a_gap_in_time() -> None:
+    files = fitted(*RECORDINGS, of="increments")
+    whole = RECORDINGS[0].content
+    cut = FakeShard("cut", whole.take([*range(20), *range(30, 80)]))
+    latents = compressed(cut, files)["z00"].to_numpy()
+    uncut = compressed(RECORDINGS[0], files)["z00"].to_numpy()
+    assert latents[0] == latents[20] == 0
+    assert np.allclose(latents[1:20], uncut[1:20])
+    assert np.allclose(latents[21:], uncut[31:])
+
+
+def test_codec_json_says_what_latents_stand_for_and_what_is_lost() -> None:
+    told = json.loads(fitted(*RECORDINGS, of="increments")["codec.json"])
+    assert (told["kind"], told["of"], told["latents"], len(told["explained_ratio"])) == ("pca", "increments", 3, 12)
+    assert told["reconstruction"]["val"].keys() == {"rows", "mse_standardised", "mae_counts"}
+    assert np.shape(told["latent_covariance"]) == (3, 3)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_an_autoencoder_adds_its_latents_and_everything_else_stays(tmp_path: Path, frames: int) -> None:
+    files = learned(tmp_path, *RECORDINGS, frames=frames)
+    found = AUTOENCODER(AUTOENCODER.params(), RECORDINGS[0], files)
+    assert found.column_names == [*RECORDINGS[0].content.column_names, "z00", "z01", "z02"]
+    counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
+    expected = codecs.load(files).encode(counts, CHANNELS)
+    assert np.allclose(np.column_stack([found[name].to_numpy() for name in ("z00", "z01", "z02")]), expected, atol=1e-5)
+    told = json.loads(files["codec.json"])
+    assert (told["kind"], told["frames"], len(told["search"])) == ("autoencoder", frames, 1)
+
+
+def test_an_autoencoder_is_the_same_for_the_same_seed_and_another_for_another(tmp_path: Path) -> None:
+    one, two = learned(tmp_path / "a", *RECORDINGS), learned(tmp_path / "b", *reversed(RECORDINGS))
+    assert one == two
+    assert learned(tmp_path / "c", *RECORDINGS, seed=1) != one
+
+
+def test_a_rig_with_other_channels_is_refused_by_an_autoencoder_too(tmp_path: Path) -> None:
+    files = learned(tmp_path, *RECORDINGS)
+    with pytest.raises(TacpipeError, match="small: The codec does not fit this table"):
+        AUTOENCODER(AUTOENCODER.params(), FakeShard("small", table(np.zeros((9, 6)))), files)
+
+
+@pytest.mark.parametrize("how", [{"of": "speed"}, {"of": ""}])
+def test_another_kind_of_value_is_refused_before_anything_is_fitted(tmp_path: Path, how: dict[str, str]) -> None:
+    with pytest.raises(TacpipeError, match=r"^of is .*; a codec is fitted on levels or increments"):
+        fitted(*RECORDINGS, **how)
+    with pytest.raises(TacpipeError, match=r"^of is .*; a codec is fitted on levels or increments"):
+        learned(tmp_path, *RECORDINGS, **how)

@@ -10,7 +10,7 @@ simulate = load("simulate.forward")
 def test_a_trial_has_the_streams_of_the_rig_and_follows_from_seed_and_number() -> None:
     params = simulate.params(duration_s=5.0)
     first, again, other = simulate(params, 3), simulate(params, 3), simulate(params, 4)
-    assert set(first.streams) == {"xela1", "xela2", "robot", "truth"}
+    assert set(first.streams) == {"xela1", "xela2", "robot", "proximity", "truth"}
     assert all(first.streams[name].equals(again.streams[name]) for name in first.streams)
     assert first.attributes == again.attributes
     assert not first.streams["xela1"].equals(other.streams["xela1"])

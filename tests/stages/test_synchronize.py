@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from tacpipe.formats import channels
 from tacpipe.registry import load
 from tacpipe.stage import Recording
 
+SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 T0 = 1_637_771_974_778_354_001
 MS = 1_000_000
 synchronize = load("synchronize")
@@ -27,7 +30,7 @@ def params(**values: Any) -> Any:
 
 def uskin(t_ms: np.ndarray, values: np.ndarray | None = None) -> pa.Table:
     if values is None:
-        values = np.random.default_rng(0).integers(0, 65_536, (len(t_ms), 48))
+        values = np.random.default_rng(0).integers(14_000, 46_000, (len(t_ms), 48))
     return channels.stream(T0 + np.asarray(t_ms) * MS, values.T, channels.uskin_fields())
 
 
@@ -120,6 +123,143 @@ def test_on_the_logged_grid_values_at_equal_stamps_stay_as_they_are(shard: Shard
     assert table.schema.field("other_orientation_x").metadata[b"interpolation"] == b"slerp"
 
 
+def test_on_the_fresh_grid_are_the_rows_of_the_master_that_are_not_held(shard: Shard) -> None:
+    t_ms = np.array([0, 10, 10, 25, 60, 70])
+    values = np.random.default_rng(3).integers(14_000, 46_000, (6, 48))
+    values[2], values[4] = values[1], values[3]  # the held row 2 has the stamp of row 1
+    first, second = uskin(t_ms, values), uskin(t_ms)
+    table, attributes = run(
+        shard({"xela1": first, "xela2": second, "robot": robot(np.arange(-5, 90, 2))}), grid="fresh"
+    )
+    assert ((table.column("t_ns").to_numpy() - T0) / MS).tolist() == [0.0, 10.0, 25.0, 70.0]
+    for name in first.column_names[1:]:
+        assert table.column(f"xela1_{name}").to_pylist() == first.column(name).take([0, 1, 3, 5]).to_pylist()
+        assert table.column(f"xela2_{name}").to_pylist() == second.column(name).take([0, 1, 3, 5]).to_pylist()
+        assert table.column(f"xela1_{name}").type == pa.uint16()
+    assert not any(table.column("xela1_held").to_pylist())
+    assert table.schema.field("robot_orientation_x").metadata[b"interpolation"] == b"slerp"
+    assert attributes["grid"] == "fresh"
+    assert attributes["grid_rate_hz"] == pytest.approx(3 / 0.07, abs=1e-3)
+
+
+def with_device(table: pa.Table, t_device_ns: np.ndarray) -> pa.Table:
+    """Return a stream with its device's clock and numbers, as drivers log them."""
+    kinds = [
+        pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"}),
+        pa.field("seq", pa.int64(), metadata={"unit": "1", "quantity": "label"}),
+    ]
+    table = table.append_column(kinds[0], pa.array(t_device_ns))
+    return table.append_column(kinds[1], pa.array(np.arange(table.num_rows)))
+
+
+def late(seconds: int = 10) -> tuple[pa.Table, np.ndarray]:
+    """Return a stream at 100 Hz whose channels are its true time in ms and which comes late, and its device's stamps."""
+    taken_ns = np.arange(100 * seconds) * 10 * MS
+    arrival_ns = np.maximum.accumulate(
+        taken_ns + np.random.default_rng(5).exponential(3 * MS, len(taken_ns)).astype(int)
+    )
+    table = uskin(taken_ns / MS, np.repeat(taken_ns[:, None] // MS, 48, axis=1))
+    return table.set_column(0, table.schema.field("t_ns"), pa.array(T0 + arrival_ns)), (taken_ns * 1.00004).astype(int)
+
+
+def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Shard) -> None:
+    table, device_ns = late()
+    streams = {"xela1": with_device(table, device_ns), "robot": robot(np.arange(0, 9000))}
+    errors = {}
+    for clock in ("auto", "arrival"):
+        found, attributes = run(shard(streams), clock=clock)
+        taken_ms = (found.column("t_ns").to_numpy() - T0) / MS
+        errors[clock] = np.abs(found.column("xela1_taxel01_x").to_numpy() - taken_ms)
+        assert ("xela1_clock_drift_ppm" in attributes) == (clock == "auto")
+        assert not any("robot_clock" in name for name in attributes)
+        assert found.schema.field("xela1_t_device_ns").type == pa.int64()
+        assert set(found.column("xela1_t_device_ns").to_pylist()) <= set(device_ns.tolist())
+        assert set(found.column("xela1_seq").to_pylist()) <= set(range(1000))
+    assert errors["auto"].max() < 0.2
+    assert np.median(errors["arrival"]) > 2
+
+
+def test_the_fit_of_each_clock_is_an_attribute(shard: Shard) -> None:
+    table, device_ns = late()
+    _, attributes = run(shard({"xela1": with_device(table, device_ns)}), clock="device")
+    assert attributes["xela1_clock_offset_ms"] == pytest.approx(T0 / MS, abs=0.2)
+    assert attributes["xela1_clock_drift_ppm"] == pytest.approx(-40, abs=10)
+    assert attributes["xela1_clock_residual_ms"] == pytest.approx(3 * np.log(2), rel=0.2)
+
+
+def test_ground_truth_needs_no_device(shard: Shard) -> None:
+    table, device_ns = late()
+    truth = channels.stream(
+        T0 + np.arange(9000) * MS, [np.zeros(9000)], [channels.float_field("gt_mass_kg", "kg", "mass")]
+    )
+    found, _ = run(shard({"xela1": with_device(table, device_ns), "truth": truth}), clock="device")
+    assert "gt_mass_kg" in found.column_names
+
+
+def test_a_device_clock_that_is_none_is_named_with_its_stream(shard: Shard) -> None:
+    table, device_ns = late()
+    with pytest.raises(
+        TacpipeError, match=r"Recording trial, stream 'xela1': .* stands still at 7 ns .*--clock arrival"
+    ):
+        run(shard({"xela1": with_device(table, np.full(len(device_ns), 7))}))
+    some = pa.array([None, *device_ns[1:].tolist()], pa.int64())
+    with pytest.raises(TacpipeError, match="t_device_ns of stream 'xela1' is int64 with 1 empty rows"):
+        run(shard({"xela1": table.append_column("t_device_ns", some)}))
+
+
+def test_proximity_is_the_median_of_the_readings_around_and_lies_between_them_where_there_are_none(
+    shard: Shard,
+) -> None:
+    t_ms = np.r_[np.arange(0, 100, 2.5), np.arange(150, 201, 2.5)]
+    counts = np.random.default_rng(0).integers(544, 757, len(t_ms))
+    field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
+    near = channels.stream(T0 + (t_ms * MS).astype(int), [counts], [field])
+    table, _ = run(shard({"xela1": uskin(np.arange(0, 220, 20)), "proximity": near}))
+    wanted = []
+    for point in np.arange(0, 201, 20):
+        around = np.abs(t_ms - point) <= 10
+        wanted.append(np.median(counts[around]) if around.any() else np.interp(point, t_ms, counts))
+    found = table.column("proximity_distance")
+    np.testing.assert_allclose(found.to_numpy(), wanted, rtol=1e-6)
+    assert found.type == pa.float32()
+    assert table.schema.field("proximity_distance").metadata[b"interpolation"] == b"median"
+    assert table.column("proximity_gap").to_pylist()[6:7] == [True]
+
+
+def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shard: Shard) -> None:
+    t_ms = np.arange(0, 200, 10)
+    walk = np.full((20, 48), 30_000)
+    walk[:, 5] = 65_000 + 100 * np.arange(20)
+    tactile = uskin(t_ms, walk % 65_536)
+    counter = pa.field("count", pa.uint16(), metadata={"unit": "1", "quantity": "counter"})
+    tactile = tactile.append_column(counter, pa.array(walk[:, 5] % 65_536, pa.uint16()))
+    wrapping = tactile.column_names[6]
+    logged, attributes = run(shard({"xela1": tactile}), grid="logged")
+    assert logged.column(f"xela1_{wrapping}").type == pa.int32()
+    assert logged.column(f"xela1_{wrapping}").to_pylist() == walk[:, 5].tolist()
+    assert attributes["xela1_wrapped_channels"] == 1
+    others = [name for name in tactile.column_names[1:] if name != wrapping]
+    assert all(logged.column(f"xela1_{name}").equals(tactile.column(name)) for name in others)
+    uniform, _ = run(shard({"xela1": tactile}), rate_hz=200.0)
+    assert uniform.column(f"xela1_{wrapping}").type == pa.float32()
+    np.testing.assert_array_equal(uniform.column(f"xela1_{wrapping}").to_numpy(), 65_000 + 50 * np.arange(39))
+    kept, attributes = run(shard({"xela1": tactile}), grid="logged", unwrap=False)
+    assert kept.column(f"xela1_{wrapping}").equals(tactile.column(wrapping))
+    assert "xela1_wrapped_channels" not in attributes
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
+def test_nothing_wraps_in_the_published_trials(shard: Shard) -> None:
+    ingest = load("ingest.xela-flat")
+    assert ingest.discover is not None
+    for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
+        recording = ingest(ingest.params(), files)
+        found, attributes = run(shard(recording.streams), grid="logged")
+        assert not any("wrapped" in name for name in attributes)
+        assert {found.schema.field(name).type for name in found.column_names if "_taxel" in name} == {pa.uint16()}
+
+
 def test_ground_truth_keeps_its_names_and_has_no_masks(shard: Shard) -> None:
     t_ms = np.arange(0, 200)
     truth = channels.stream(T0 + t_ms * MS, [t_ms / 2], [channels.float_field("gt_force_n", "N", "force")])
@@ -146,7 +286,9 @@ def test_time_that_runs_backwards_is_named_with_stream_and_row(shard: Shard) -> 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"grid": "even"}, "no grid 'even'"),
+        ({"grid": "even"}, "no grid 'even'; it must be uniform, logged or fresh"),
+        ({"clock": "sun"}, "no clock 'sun'; it must be auto, device or arrival"),
+        ({"clock": "device"}, "stream 'robot' has no column t_device_ns"),
         ({"master": "camera"}, "no stream 'camera' to be master; it has robot, xela1"),
         ({"rate_hz": 0.0}, "gives no grid"),
     ],

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,43 @@ def test_gradients_are_clipped(tmp_path: Path) -> None:
     run(tmp_path, steep)
     assert norms
     assert max(norms) <= 1.0 + 1e-4
+
+
+def test_the_rate_of_a_cycle_rises_and_falls_and_ends_at_nothing() -> None:
+    schedule = dataclasses.replace(SCHEDULE, cycle=True)
+    rates = [schedule.rate(progress / 100) for progress in range(101)]
+    assert rates[0] == pytest.approx(SCHEDULE.learning_rate / 25)
+    assert rates[30] == pytest.approx(SCHEDULE.learning_rate) == max(rates)
+    assert all(one < other for one, other in pairwise(rates[:31]))
+    assert all(one > other for one, other in pairwise(rates[30:]))
+    assert rates[-1] == pytest.approx(0, abs=1e-12)
+    assert max(abs(one - other) for one, other in pairwise(rates)) < 0.06 * SCHEDULE.learning_rate  # no jump
+
+
+def test_the_rate_is_the_same_throughout_without_a_cycle() -> None:
+    assert {SCHEDULE.rate(progress / 10) for progress in range(11)} == {SCHEDULE.learning_rate}
+
+
+def test_the_optimiser_steps_at_the_rate_of_all_epochs_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    def rate(schedule: Schedule, progress: float) -> float:
+        asked.append(progress)
+        return 0.0
+
+    monkeypatch.setattr(Schedule, "rate", rate)
+    found = run(tmp_path, schedule=dataclasses.replace(SCHEDULE, epochs=3, batch=20, cycle=True))
+    assert asked == pytest.approx([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6])
+    assert len({line["val_loss"] for line in found.history}) == 1  # at a rate of 0 nothing is learned
+
+
+@pytest.mark.parametrize("batches", [3, 9])
+def test_a_cycle_goes_on_where_it_was_killed(tmp_path: Path, batches: int) -> None:
+    schedule = dataclasses.replace(SCHEDULE, cycle=True)
+    whole = run(tmp_path / "whole", schedule=schedule)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "killed", interrupted_after(batches), schedule)
+    assert same(run(tmp_path / "killed", schedule=schedule), whole)
 
 
 def test_a_loss_that_is_not_finite_ends_training_with_a_sentence(tmp_path: Path) -> None:

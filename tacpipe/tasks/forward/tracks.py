@@ -1,4 +1,4 @@
-"""One recording as a forecaster reads it: latents, pose of the arm and raw channels side by side, and its windows."""
+"""One recording as a forecaster reads it: latents, motion of the arm and raw channels side by side, and its windows."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.signals.windows import window_starts
 
@@ -24,8 +25,14 @@ Floats = NDArray[np.floating[Any]]
 
 POSITION = tuple(f"robot_position_{axis}_m" for axis in "xyz")
 ORIENTATION = tuple(f"robot_orientation_{axis}" for axis in "xyzw")
-STATE = POSITION + ORIENTATION
+POSE = POSITION + ORIENTATION
+VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
+TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
+ARM = POSE + VELOCITY + TURNING
+FINGER = "robot_finger_m"
+JOINTS = 7
 TRUTH = "gt_"  # how the simulator's ground truth begins, which no model may see
+APART = {"uniform": 1.5, "logged": 3.0, "fresh": 3.0}  # times the usual step: further apart, rows are missing between
 
 
 @dataclass(frozen=True)
@@ -34,17 +41,25 @@ class Track:
 
     name: str
     t_ns: NDArray[np.int64]  # (time,)
-    contact: NDArray[np.int64]  # (time,)
-    groups: NDArray[np.int64]  # (time,), equal within what a window may span
+    contact: NDArray[np.int64]  # (time,), below 0 where nothing is touched
+    groups: NDArray[np.int64]  # (time,), equal where rows follow one another without a gap
     usable: NDArray[np.bool_]  # (time,)
     latent: Floats  # (time, latent)
-    state: Floats  # (time, state), position in metres and unit quaternion
+    arm: Floats  # (time, 13): `ARM`
+    finger: Floats  # (time,), m; 0 where it is not recorded
     tactile: Floats  # (time, channel)
-    logged: bool = False  # whether the rows are as they were logged, rather than on a uniform grid
+    timeline: str = "uniform"  # the grid: uniform, logged or fresh
+    object: str | None = None  # what is held, where a label tells
 
-    def starts(self, context: int, horizon: int) -> NDArray[np.int64]:
-        """Return the first rows of all windows of ``context + horizon`` rows, shape (window,)."""
-        return window_starts(self.groups, self.usable, context, horizon, 1)
+    def starts(self, context: int, horizon: int, stride: int = 1) -> NDArray[np.int64]:
+        """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
+        return window_starts(self.groups, self.usable, context, horizon, stride)
+
+    def contact_starts(self, context: int, horizon: int, stride: int) -> NDArray[np.int64]:
+        """Return the first rows of the windows that lie within one contact (window,)."""
+        same = np.concatenate([[0], np.cumsum(np.diff(self.contact) != 0)])[: len(self.contact)]
+        groups = self.groups * (int(same.max(initial=0)) + 1) + same
+        return window_starts(groups, self.usable & (self.contact >= 0), context, horizon, stride)
 
 
 def codec_of(table: pa.Table, files: Mapping[str, bytes]) -> codecs.Codec:
@@ -83,7 +98,8 @@ def inputs(table: pa.Table, names: Sequence[str]) -> Floats:
         if name not in table.column_names:
             raise TacpipeError(
                 f"There is no column {name}. Give recordings that went through `tacpipe synchronize` and "
-                "`tacpipe segment contacts`, with the arm's state in a stream named robot."
+                "`tacpipe segment contacts`, with the arm's state in a stream named robot, and for a model of latents "
+                "through `tacpipe compress`."
             )
     return tactile.matrix(table, names)
 
@@ -91,23 +107,47 @@ def inputs(table: pa.Table, names: Sequence[str]) -> Floats:
 def track(shard: Shard, codec: codecs.Codec) -> Track:
     """Return the track of a recording; its latents are those stored, or its channels where ``codec`` is raw.
 
-    Rows in a gap of any stream, outside contact or with a value that is not finite are unusable. Raises `TacpipeError`
-    naming the recording where a column is absent or its channels are not the codec's.
+    Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the
+    recording where a column is absent or its channels are not the codec's.
     """
     table = shard.table()
     try:
         codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"))
         above_rest = tactile.above_rest(table, codec.channels)
         latent = above_rest if codec.kind == "raw" else inputs(table, codec.latents)
-        state = np.hstack([inputs(table, POSITION), _orientation(inputs(table, ORIENTATION))])
+        pose = np.hstack([inputs(table, POSITION), _orientation(inputs(table, ORIENTATION))])
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
-    finite = np.isfinite(latent).all(axis=1) & np.isfinite(state).all(axis=1) & np.isfinite(above_rest).all(axis=1)
-    usable = finite & ~tactile.gaps(table) & (contact >= 0)
-    latent, state = latent.astype(np.float32), state.astype(np.float32)
-    logged = shard.attributes.get("grid") == "logged"
-    return Track(shard.name, t_ns, contact, _groups(t_ns, contact), usable, latent, state, above_rest, logged)
+    arm = np.hstack([pose, _velocity(table, t_ns, pose)]).astype(np.float32)
+    finite = np.isfinite(latent).all(axis=1) & np.isfinite(arm).all(axis=1) & np.isfinite(above_rest).all(axis=1)
+    finger = inputs(table, [FINGER])[:, 0] if FINGER in table.column_names else np.zeros(len(t_ns))
+    timeline = str(shard.attributes.get("grid", "uniform"))
+    held = shard.attributes.get("object")
+    return Track(
+        shard.name,
+        t_ns,
+        contact,
+        _groups(t_ns, APART.get(timeline, APART["uniform"])),
+        finite & np.isfinite(finger) & ~tactile.gaps(table),
+        latent.astype(np.float32),
+        arm,
+        finger.astype(np.float32),
+        above_rest,
+        timeline,
+        None if held is None else str(held),
+    )
+
+
+def _velocity(table: pa.Table, t_ns: NDArray[np.int64], pose: Floats) -> Floats:
+    """Return the hand's linear and angular velocity (time, 6): from the joints where they are those of a known arm."""
+    names = [f"robot_joint{joint}_rad" for joint in range(1, JOINTS + 1)]
+    speeds = [f"robot_joint{joint}_velocity_rad_s" for joint in range(1, JOINTS + 1)]
+    if set(names + speeds) <= set(table.column_names):
+        angles = inputs(table, names)
+        if kinematics.carries(kinematics.PANDA, angles, pose[:, :3]):
+            return kinematics.hand_velocity(kinematics.PANDA, angles, inputs(table, speeds), pose[:, :3])
+    return kinematics.differences(t_ns, pose[:, :3], pose[:, 3:])
 
 
 def whole_numbers(table: pa.Table, name: str) -> NDArray[np.int64]:
@@ -117,34 +157,34 @@ def whole_numbers(table: pa.Table, name: str) -> NDArray[np.int64]:
     return np.asarray(table.column(name).to_numpy(), dtype=np.int64)
 
 
-def aligned(state: Floats, reference: Floats) -> Floats:
-    """Return the poses (time, state) with the quaternions' common sign nearest to that of ``reference`` (4,).
+def aligned(arm: Floats, reference: Floats) -> Floats:
+    """Return the arm's rows (time, 13) with the quaternions' common sign nearest to that of ``reference`` (4,).
 
     A quaternion and its negative are the same rotation. Within a recording the sign is continuous already; between
     recordings it is a matter of chance, and a model would take it for another pose.
     """
-    finite = state[np.isfinite(state).all(axis=1), 3:]
+    turned = slice(len(POSITION), len(POSE))
+    finite = arm[np.isfinite(arm).all(axis=1), turned]
     if len(finite) and finite[0] @ reference < 0:
-        return np.hstack([state[:, :3], -state[:, 3:]])
-    return state
+        return np.hstack([arm[:, : turned.start], -arm[:, turned], arm[:, turned.stop :]])
+    return arm
 
 
 def rate_hz(tracks: Sequence[Track]) -> float:
     """Return the median rate of the tracks' grids in Hz; 0 where none has two rows.
 
-    On the rows as logged a step is a row, however long it takes; so rates may differ there. Else raises `TacpipeError`
-    where they do by more than 1 %, and where only some of the tracks are as logged.
+    On rows as logged or fresh a step is a row, however long it takes; so rates may differ there. Else raises
+    `TacpipeError` where they do by more than 1 %, and where the tracks are not of one timeline.
     """
-    if len({one.logged for one in tracks}) > 1:
-        logged = next(one.name for one in tracks if one.logged)
-        raise TacpipeError(
-            f"{logged} has its rows as logged and others a uniform grid. Synchronize all with one --grid."
-        )
+    if len({one.timeline for one in tracks}) > 1:
+        found = {one.timeline: one.name for one in tracks}
+        told = ", ".join(f"{name} is {timeline}" for timeline, name in sorted(found.items()))
+        raise TacpipeError(f"The recordings are not of one grid: {told}. Synchronize all with one --grid.")
     rates = {one.name: 1e9 / float(np.median(np.diff(one.t_ns))) for one in tracks if len(one.t_ns) > 1}
     if not rates:
         return 0.0
     slow, fast = min(rates, key=lambda name: rates[name]), max(rates, key=lambda name: rates[name])
-    if rates[fast] > 1.01 * rates[slow] and not tracks[0].logged:
+    if rates[fast] > 1.01 * rates[slow] and tracks[0].timeline == "uniform":
         raise TacpipeError(
             f"{slow} runs at {rates[slow]:.2f} Hz and {fast} at {rates[fast]:.2f} Hz, so a step is not the same time. "
             "Synchronize all recordings with one --rate-hz."
@@ -158,10 +198,9 @@ def _orientation(quaternions: Floats) -> Floats:
         return continuous(quaternions.astype(np.float64))
 
 
-def _groups(t_ns: NDArray[np.int64], contact: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return a number for each row (time,) that changes with the contact and where rows are missing from the grid."""
+def _groups(t_ns: NDArray[np.int64], apart: float) -> NDArray[np.int64]:
+    """Return a number for each row (time,) that changes where rows are missing: a step of ``apart`` times the usual."""
     if len(t_ns) < 2:
         return np.zeros(len(t_ns), dtype=np.int64)
-    apart = np.diff(t_ns)
-    new = (np.diff(contact) != 0) | (apart > 1.5 * np.median(apart))
-    return np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
+    steps = np.diff(t_ns)
+    return np.concatenate([[0], np.cumsum(steps > apart * np.median(steps))]).astype(np.int64)

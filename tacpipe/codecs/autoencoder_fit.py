@@ -1,0 +1,209 @@
+"""The training of an autoencoder, and the search for the best of some networks under one budget.
+
+Rows of all but the held-out training recordings are learned, and the mean squared error of giving the held-out ones
+back, all frames of them, in units of each channel's scale, says when to stop and which network is best. Recordings of
+the role val are not touched, so that they judge a forecaster that stands behind the codec.
+
+Networks of increments have no biases: a row that does not move has latents 0 and comes back as 0, so that increments
+that are added up do not drift.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tacpipe.codecs import measures, stretches
+from tacpipe.codecs.autoencoder import Autoencoder, scaled
+from tacpipe.codecs.standard import standard
+from tacpipe.codecs.training_rows import TrainingRows
+from tacpipe.errors import TacpipeError
+from tacpipe.training import loop
+
+if TYPE_CHECKING:
+    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
+
+FRAMES = (1, 2, 3)  # of the classes C1, C2 and C3
+HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # layers between input and latent, by frames
+SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # that a search tries, times the frames
+STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # that it takes learning rate and weight decay times
+MOST = len(SHAPES) * len(STEPS)
+GRADIENT_CLIP = 1.0  # largest norm of the gradient, without unit, as of the forecasters
+
+
+@dataclass(frozen=True)
+class Network:
+    """One of the networks to try: hidden layers of the encoder, mirrored in the decoder, and how Adam steps."""
+
+    hidden: tuple[int, ...]
+    learning_rate: float
+    weight_decay: float  # of Adam: this share of a weight is added to its gradient
+
+
+def networks(
+    frames: int, hidden: str, search: int, learning_rate: float = 1e-3, weight_decay: float = 1e-5
+) -> list[Network]:
+    """Return the networks to try: the first ``search`` of those that there are or, where it is 0, that of ``hidden``.
+
+    ``hidden`` is text such as ``64,32``; empty, it is that of the class of ``frames``. Raises `TacpipeError`
+    for what makes no network.
+
+    >>> [one.hidden for one in networks(2, "", search=3)]
+    [(128, 64), (256, 128, 64), (256, 128)]
+    """
+    if frames not in FRAMES:
+        raise TacpipeError(f"frames is {frames}; an autoencoder reads 1, 2 or 3 frames in a row.")
+    if not 0 <= search <= MOST:
+        raise TacpipeError(f"search is {search}; it is how many networks to try, 1 to {MOST}, or 0 for no search.")
+    if not weight_decay >= 0:
+        raise TacpipeError(f"weight_decay is {weight_decay}; it must be 0 or above.")
+    if search and hidden:
+        raise TacpipeError(f"hidden is {hidden!r} and search is {search}, which tries its own. Give one of them.")
+    if not search:
+        return [Network(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
+    tried = [
+        Network(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * much)
+        for fast, much in STEPS
+        for shape in SHAPES
+    ]
+    return tried[:search]
+
+
+def fit(
+    rows: TrainingRows,
+    tried: Sequence[Network],
+    schedule: loop.Schedule,
+    workspace: Path,
+    *,
+    components: int,
+    of: str = stretches.LEVELS,
+) -> Autoencoder:
+    """Return the codec of ``components`` latents whose network, of those ``tried``, gives held-out rows back best.
+
+    Its ``measured["search"]`` holds, for each network, its lowest validation error, the epochs it took and whether it
+    is the one kept. Networks that were trained before an interruption are read from ``workspace``. Raises `TacpipeError`
+    where recordings or rows do not suffice, and for ``components`` that the channels cannot give.
+    """
+    width = len(rows.channels)
+    if not 1 <= components <= width:
+        raise TacpipeError(f"components is {components}; {width} channels give 1 to {width}.")
+    if len(rows.inputs) < 2:
+        raise TacpipeError(
+            "An autoencoder is stopped by recordings that it does not learn, so it needs at least 2 training "
+            "recordings and there is 1. Make a split with more."
+        )
+    train, val = rows.parts
+    if len(train) < 2 or not len(val):
+        raise TacpipeError(
+            f"An autoencoder cannot be fitted on {len(train)} rows and stopped by {len(val)}. Give it longer training "
+            "recordings with contact."
+        )
+    mean, scale = standard(train[:, -width:], of)
+    learned, watched = (torch.from_numpy(scaled(part, mean, scale)) for part in (train, val))
+    found = [
+        _trained(learned, watched, network, schedule, workspace / f"{index:02d}", components, of)
+        for index, network in enumerate(tried)
+    ]
+    best = min(range(len(found)), key=lambda index: _lowest(found[index]))
+    encoder, decoder = (_layers(found[best].weights, part) for part in ("encoder", "decoder"))
+    codec = Autoencoder(rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, of)
+    told = [
+        _told(network, one) | {"kept": at == best} for at, (network, one) in enumerate(zip(tried, found, strict=True))
+    ]
+    measured = {
+        "reconstruction": measures.reconstructions(codec, train, val),
+        "latent_covariance": measures.covariance(codec, train),
+        "search": told,
+    }
+    return replace(codec, measured=measured)
+
+
+class _Mirrored(nn.Module):
+    """Encoder and decoder whose layers mirror each other."""
+
+    def __init__(self, widths: Sequence[int], *, bias: bool) -> None:
+        super().__init__()
+        self.encoder, self.decoder = _stack(widths, bias), _stack(widths[::-1], bias)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Return ``rows`` (row, frames * channel) as they come back."""
+        back: Tensor = self.decoder(self.encoder(rows))
+        return back
+
+
+def _stack(widths: Sequence[int], bias: bool) -> nn.Sequential:
+    """Return linear layers between the widths, an ELU behind all but the last."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise(widths):
+        layers += [nn.Linear(before, after, bias=bias), nn.ELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def _trained(
+    learned: Tensor,
+    watched: Tensor,
+    network: Network,
+    schedule: loop.Schedule,
+    workspace: Path,
+    components: int,
+    of: str,
+) -> loop.Trained:
+    widths = (learned.shape[1], *network.hidden, components)
+
+    def part(rows: Tensor) -> loop.Part:
+        def loss(model: nn.Module, indices: Tensor) -> Tensor:
+            picked = rows[indices]
+            return nn.functional.mse_loss(model(picked), picked)
+
+        return loop.Part(len(rows), loss)
+
+    return loop.train(
+        lambda: _Mirrored(widths, bias=of == stretches.LEVELS),
+        part(learned),
+        part(watched),
+        replace(schedule, learning_rate=network.learning_rate),
+        workspace,
+        weight_decay=network.weight_decay,
+    )
+
+
+def _lowest(trained: loop.Trained) -> float:
+    return min(float(line["val_loss"]) for line in trained.history)
+
+
+def _told(network: Network, trained: loop.Trained) -> dict[str, Any]:
+    """Return what the record of the search says of a network; no seconds, which are never the same."""
+    return {
+        "hidden": list(network.hidden),
+        "learning_rate": measures.told(network.learning_rate),
+        "weight_decay": measures.told(network.weight_decay),
+        "parameters": sum(value.numel() for value in trained.weights.values()),
+        "epochs": len(trained.history),
+        "val_loss": measures.told(_lowest(trained)),
+    }
+
+
+def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[Floats, Floats], ...]:
+    """Return weight and bias of each layer of ``encoder`` or ``decoder``; a layer without bias has zeros."""
+    found = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
+    places = sorted({int(name.split(".")[1]) for name in found})
+    pairs = ((found[f"{part}.{at}.weight"], found.get(f"{part}.{at}.bias")) for at in places)
+    return tuple((w, np.zeros(len(w), dtype=np.float32) if b is None else b) for w, b in pairs)
+
+
+def _widths(text: str) -> tuple[int, ...]:
+    """Return the widths that text such as ``64,32`` names."""
+    pieces = [piece.strip() for piece in text.split(",")]
+    if not all(piece.isascii() and piece.isdecimal() and int(piece) > 0 for piece in pieces):
+        raise TacpipeError(
+            f"hidden is {text!r}; it is the widths of the hidden layers, whole numbers above 0 with commas between, as "
+            "64,32. Leave it empty for those of the class."
+        )
+    return tuple(int(piece) for piece in pieces)

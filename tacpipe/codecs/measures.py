@@ -1,0 +1,77 @@
+"""What a fit measures of its codec, as it stands in ``codec.json``.
+
+==================  ==============================================================================================
+reconstruction      of ``train`` rows and of ``val``, training recordings that were held out: mean squared error of
+                    encoding and decoding in units of each channel's scale, where 1 is what a codec without latents
+                    gives, and mean absolute error in counts
+latent_covariance   of the latents of the training rows, (latent, latent)
+search              the networks that were tried; see `tacpipe.codecs.autoencoder_fit`
+==================  ==============================================================================================
+
+Errors are those of the newest frame and, of a codec of increments, those of the increments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
+
+NAMES = ("reconstruction", "latent_covariance", "search")
+DIGITS = 6  # that are told; beyond them the order of additions shows, which the number of threads changes
+
+
+class Fitted(Protocol):
+    """A codec that reads rows as `tacpipe.codecs.stretches.inputs` makes them."""
+
+    @property
+    def scale_count(self) -> Floats:
+        """The spread of each channel on training rows, in counts."""
+
+    def project(self, inputs: Floats) -> Floats:
+        """Return the latents (row, latent) of finite rows (row, frames * channel)."""
+
+    def decode(self, latents: Floats) -> Floats:
+        """Return the counts that latents stand for."""
+
+
+def reconstructions(codec: Fitted, train: Floats, val: Floats) -> dict[str, dict[str, float]]:
+    """Return the errors on both parts, inputs (row, frames * channel); ``val`` is left out where it has no rows."""
+    parts = {"train": train, "val": val}
+    return {name: reconstruction(codec, rows) for name, rows in parts.items() if len(rows)}
+
+
+def reconstruction(codec: Fitted, inputs: Floats) -> dict[str, float]:
+    """Return the errors of encoding and decoding ``inputs`` (row, frames * channel), and the number of rows."""
+    newest = inputs[:, -len(codec.scale_count) :]
+    error = codec.decode(codec.project(inputs).astype(np.float32)) - newest
+    return {
+        "rows": len(inputs),
+        "mse_standardised": told(float(np.square(error / codec.scale_count).mean())),
+        "mae_counts": told(float(np.abs(error).mean())),
+    }
+
+
+def covariance(codec: Fitted, inputs: Floats) -> list[list[float]]:
+    """Return the covariance of the latents of ``inputs`` (row, frames * channel), (latent, latent)."""
+    found = np.atleast_2d(np.cov(codec.project(inputs).astype(np.float64), rowvar=False))
+    digits = DIGITS - 1 - int(np.floor(np.log10(max(float(np.abs(found).max()), 1e-30))))
+    return (found.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no minus before a 0
+
+
+def told(value: float) -> float:
+    """Return ``value`` with as many digits as are told.
+
+    >>> told(0.123456789)
+    0.123457
+    """
+    return float(f"{value:.{DIGITS}g}")
+
+
+def stored(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what ``codec.json`` holds of measures."""
+    return {name: content[name] for name in NAMES if name in content}

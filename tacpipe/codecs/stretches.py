@@ -1,0 +1,63 @@
+"""What a codec reads of the rows that follow one another: levels or increments, of one frame or of some in a row.
+
+A stretch is a run of rows without a gap in time. Nothing here looks ahead, and nothing looks across the start of a
+stretch: its first row stands in for the rows before it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.floating[Any]]
+Flags = NDArray[np.bool_]
+
+LEVELS, INCREMENTS = "levels", "increments"
+GAP = 1.5  # times the median step of time, above which rows do not follow one another; as windows of the tasks have it
+
+
+def breaks(t_ns: NDArray[np.int64]) -> Flags:
+    """Return for each row (time,) whether a stretch begins there, from the rows' times in ns.
+
+    >>> breaks(np.array([0, 20, 40, 100, 120])).tolist()
+    [True, False, False, True, False]
+    """
+    begins = np.zeros(len(t_ns), dtype=bool)
+    begins[:1] = True
+    if len(t_ns) > 1:
+        apart = np.diff(t_ns)
+        begins[1:] = apart > GAP * np.median(apart)
+    return begins
+
+
+def check(of: str) -> None:
+    """Raise `TacpipeError` unless ``of`` is levels or increments."""
+    if of not in (LEVELS, INCREMENTS):
+        raise TacpipeError(f"of is {of!r}; a codec is fitted on {LEVELS} or {INCREMENTS}.")
+
+
+def inputs(values: Floats, begins: Flags | None, of: str, frames: int) -> Floats:
+    """Return what a codec reads of each row of ``values`` (time, channel): (time, frames * channel), newest frame last.
+
+    ``of`` is levels, ``values`` as they are, or increments, what was added since the row before. ``begins`` (time,)
+    says where a stretch begins; None: at the first row alone. Rows at the start of a stretch repeat its first frame, and
+    the increment there is 0. Raises `TacpipeError` for another ``of``.
+
+    >>> inputs(np.array([[1.0], [4.0], [9.0]]), None, "increments", 2).tolist()
+    [[0.0, 0.0], [0.0, 3.0], [3.0, 5.0]]
+    """
+    check(of)
+    rows = np.arange(len(values))
+    first = np.zeros_like(rows) if begins is None else np.maximum.accumulate(np.where(begins, rows, 0))
+    if of == INCREMENTS:
+        with np.errstate(
+            invalid="ignore"
+        ):  # a row that is not finite has no increment, at the start of a stretch either
+            values = values - values[np.maximum(rows - 1, first)]
+    if frames == 1:
+        return values
+    return np.hstack([values[np.maximum(rows - lag, first)] for lag in reversed(range(frames))])

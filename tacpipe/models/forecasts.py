@@ -1,0 +1,86 @@
+"""The forecasters by name, each reading the same windows and giving touch in the unit that it was given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast
+from tacpipe.models.recurrent_forward import RecurrentForward
+from tacpipe.models.taxelwise import TaxelwiseForecast
+from tacpipe.models.windows import POSE, Windows
+
+ARCHITECTURES = ("taxelwise", *CELLS, "recurrent")
+LOSSES = ("absolute", "huber", "squared")
+Layout = Sequence[Mapping[str, str]]
+
+
+class RecurrentForecast(nn.Module):
+    """The paper's model between its scalings: features and poses to [-1, 1] and back; it tells levels, not changes."""
+
+    change_only = False
+    touch_centre: Tensor
+    touch_half: Tensor
+    pose_centre: Tensor
+    pose_half: Tensor
+
+    def __init__(self, features: int, hidden: int) -> None:
+        """Make a model of random weights whose scalings are those of data within [-1, 1]."""
+        super().__init__()
+        self.network = RecurrentForward(features, POSE, hidden)
+        for name, width in (("touch", features), ("pose", POSE)):
+            self.register_buffer(f"{name}_centre", torch.zeros(width))
+            self.register_buffer(f"{name}_half", torch.ones(width))
+
+    def calibrate(self, windows: Windows, ahead: Tensor) -> None:
+        """Fit the scalings on training windows: the lowest and highest value of each feature and coordinate."""
+        for name, values in (("touch", torch.cat([windows.touch, ahead])), ("pose", windows.arm[..., :POSE])):
+            low, high = values.flatten(0, 1).amin(0), values.flatten(0, 1).amax(0)
+            half = (high - low) / 2
+            getattr(self, f"{name}_centre").copy_((high + low) / 2)
+            getattr(self, f"{name}_half").copy_(torch.where(half > 0, half, 1.0))
+
+    def forward(self, windows: Windows) -> Tensor:
+        """Return the features to come (horizon, window, feature), in their own unit."""
+        restored: Tensor = self._scaled(windows) * self.touch_half + self.touch_centre
+        return restored
+
+    def loss(self, windows: Windows, ahead: Tensor) -> Tensor:
+        """Return the mean squared error in scaled features, the paper's measure; ``ahead`` (horizon, window, feature)."""
+        return nn.functional.mse_loss(self._scaled(windows), (ahead - self.touch_centre) / self.touch_half)
+
+    def _scaled(self, windows: Windows) -> Tensor:
+        touch = (windows.touch - self.touch_centre) / self.touch_half
+        pose = (windows.arm[..., :POSE] - self.pose_centre) / self.pose_half
+        past = torch.cat([touch, pose[: windows.context]], -1)
+        predicted: Tensor = self.network(past, pose[windows.context :])
+        return predicted
+
+
+def build(params: Mapping[str, Any], features: int, layout: Layout, *, changes: bool) -> nn.Module:
+    """Return a forecaster of random weights for ``features`` latents or channels.
+
+    ``params`` has architecture, hidden, dropout, loss, context and horizon; ``layout`` says where each channel sits;
+    ``changes`` that features are increments already. Raises `TacpipeError` for a name that is unknown or a
+    representation that an architecture cannot read.
+    """
+    architecture, loss = params["architecture"], params["loss"]
+    if architecture not in ARCHITECTURES:
+        raise TacpipeError(f"There is no architecture {architecture!r}; there are {', '.join(ARCHITECTURES)}.")
+    if loss not in LOSSES:
+        raise TacpipeError(f"There is no loss {loss!r}; there are {', '.join(LOSSES)}.")
+    if architecture == "recurrent":
+        if loss != "squared":
+            raise TacpipeError(f"The recurrent model minimises the squared error, not {loss}. Give --loss squared.")
+        return RecurrentForecast(features, params["hidden"])
+    sizes = {name: params[name] for name in ("hidden", "dropout", "loss", "context", "horizon")}
+    if architecture in CELLS:
+        return SequenceForecast(features, cell=architecture, increments=changes, **sizes)
+    return TaxelwiseForecast(layout, **sizes)
+
+
+__all__ = ["ARCHITECTURES", "LOSSES", "ChangeForecast", "RecurrentForecast", "build"]

@@ -1,0 +1,119 @@
+"""What a forecaster reads: windows of touch and arm, time first, in the units of the recording."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+POSE = 7  # columns of ``arm`` that hold position and quaternion; velocity follows
+ARM = 13
+
+
+class Windows(NamedTuple):
+    """Windows of one length; rows of the past, the last of them now, then those of the plan."""
+
+    touch: Tensor  # (context, window, feature): latents in their codec's unit, or counts above rest
+    arm: Tensor  # (context + horizon, window, 13): position m, quaternion xyzw, velocity m/s, angular velocity rad/s
+    finger: Tensor  # (context, window): width between the fingers, m; 0 where it is not recorded
+
+    @property
+    def context(self) -> int:
+        """How many rows of the past there are."""
+        return len(self.touch)
+
+    @property
+    def horizon(self) -> int:
+        """How many rows the plan has."""
+        return len(self.arm) - len(self.touch)
+
+
+def held(touch: Tensor) -> Tensor:
+    """Return 1 where a row of ``touch`` (context, window, feature) repeats the one before, (context, window); else 0.
+
+    The first row counts as new: what came before it lies outside the window.
+    """
+    same = (touch[1:] == touch[:-1]).all(dim=-1)
+    return torch.cat([same.new_zeros(1, touch.shape[1]), same]).to(touch.dtype)
+
+
+def rotations(quaternions: Tensor) -> Tensor:
+    """Return the rotation matrices (…, 3, 3) of unit quaternions x, y, z, w (…, 4)."""
+    x, y, z, w = quaternions.unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
+        torch.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
+        torch.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def motion(windows: Windows) -> tuple[Tensor, Tensor]:
+    """Return motion in the frame that the hand has now (context + horizon, window, 12), and up in it (window, 3).
+
+    Columns: where the hand is from now, m; how it is turned from now, as the vector part of the rotation's skew
+    symmetric half; velocity, m/s; angular velocity, rad/s. Neither place nor heading of the arm is told: the load on a
+    fingertip follows from weight and acceleration as the hand sees them.
+    """
+    position, quaternions = windows.arm[..., :3], windows.arm[..., 3:POSE]
+    now = windows.context - 1
+    turned = rotations(quaternions)  # (row, window, 3, 3)
+    inward = turned[now].transpose(-1, -2)  # (window, 3, 3), from the base's frame to the hand's
+    apart = _apply(inward, position - position[now])
+    relative = inward @ turned
+    vector = 0.5 * torch.stack(
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        -1,
+    )
+    linear, angular = _apply(inward, windows.arm[..., POSE : POSE + 3]), _apply(inward, windows.arm[..., POSE + 3 :])
+    return torch.cat([apart, vector, linear, angular], -1), inward[..., 2]
+
+
+def without_plan(windows: Windows) -> Windows:
+    """Return the windows with every row of the plan replaced by the last row of the past: nothing is told of it."""
+    now = windows.arm[windows.context - 1 : windows.context]
+    return windows._replace(arm=torch.cat([windows.arm[: windows.context], now.expand(windows.horizon, -1, -1)]))
+
+
+def with_plans_of(windows: Windows, others: Tensor) -> Windows:
+    """Return the windows with the plans of ``others`` (window,), begun where the hand is now: plausible, and wrong.
+
+    Positions, orientations and velocities of the other plan are turned as one rigid motion from its own start to here.
+    """
+    now = windows.context - 1
+    here, there = windows.arm[now], windows.arm[now, others]  # (window, 13)
+    plan = windows.arm[windows.context :, others]
+    bridge = _product(here[..., 3:POSE], _conjugate(there[..., 3:POSE]))  # (window, 4)
+    turn = rotations(bridge)
+    moved = torch.cat(
+        [
+            here[..., :3] + _apply(turn, plan[..., :3] - there[..., :3]),
+            _product(bridge.expand(len(plan), -1, -1), plan[..., 3:POSE]),
+            _apply(turn, plan[..., POSE : POSE + 3]),
+            _apply(turn, plan[..., POSE + 3 :]),
+        ],
+        -1,
+    )
+    return windows._replace(arm=torch.cat([windows.arm[: windows.context], moved]))
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Return ``matrices`` (window, 3, 3) times ``vectors`` (row, window, 3)."""
+    return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def _conjugate(quaternions: Tensor) -> Tensor:
+    return quaternions * quaternions.new_tensor([-1.0, -1.0, -1.0, 1.0])
+
+
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    """Return the quaternion (…, 4) that turns by ``second`` and then by ``first``."""
+    a, b = first[..., :3], second[..., :3]
+    vector = first[..., 3:] * b + second[..., 3:] * a + torch.linalg.cross(a, b)
+    scalar = first[..., 3:] * second[..., 3:] - (a * b).sum(-1, keepdim=True)
+    return torch.cat([vector, scalar], -1)

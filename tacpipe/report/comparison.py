@@ -1,0 +1,280 @@
+"""Methods and baselines beside each other: errors, skill over persistence, and how sure both are.
+
+Runs of a method are pooled: the sums of a recording that several runs were judged on are added and stay together, and
+intervals come from drawing whole recordings anew (`tacpipe.metrics`).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe import metrics
+from tacpipe.metrics import Interval
+from tacpipe.report import methods as by_method
+from tacpipe.report.error_sums import BASELINE, MODEL
+from tacpipe.report.methods import Method, Run
+
+Floats = NDArray[np.floating[Any]]
+
+SHOWN_STEPS = (1, 3, 5, 10)
+_draws = functools.lru_cache(maxsize=8)(metrics.draws)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The error sums of one predictor over runs, beside those of persistence on the same windows."""
+
+    recordings: tuple[str, ...]
+    windows: NDArray[np.int64]  # (recording,), those of several runs added
+    distinct_windows: int  # each counted once
+    runs: int
+    steps: tuple[int, ...]
+    channels: int
+    squared: Floats  # (recording, step)
+    absolute: Floats  # (recording, step)
+    baseline: Floats  # (recording, step), squared errors of persistence
+
+    @property
+    def mse(self) -> Floats:
+        """The mean squared error of each step, (step,)."""
+        found: Floats = self.squared.sum(axis=0) / (self.windows.sum() * self.channels)
+        return found
+
+    @property
+    def mae(self) -> Floats:
+        """The mean absolute error of each step, (step,)."""
+        found: Floats = self.absolute.sum(axis=0) / (self.windows.sum() * self.channels)
+        return found
+
+    @property
+    def baseline_mse(self) -> Floats:
+        """The mean squared error of persistence at each step, (step,)."""
+        found: Floats = self.baseline.sum(axis=0) / (self.windows.sum() * self.channels)
+        return found
+
+    def at(self, values: Floats, steps: Sequence[int]) -> Floats:
+        """Return the columns of ``values`` (…, step) that belong to ``steps``."""
+        return values[..., [self.steps.index(step) for step in steps]]
+
+    def of(self, recordings: Sequence[str]) -> Pool:
+        """Return the pool of these of its recordings alone."""
+        rows = [self.recordings.index(name) for name in recordings]
+        parts = {name: getattr(self, name)[rows] for name in ("windows", "squared", "absolute", "baseline")}
+        told = (self.distinct_windows, self.runs, self.steps, self.channels)
+        windows, squared, absolute, baseline = parts.values()
+        return Pool(tuple(recordings), windows, *told, squared, absolute, baseline)
+
+
+@dataclass(frozen=True)
+class Row:
+    """How one method or baseline does."""
+
+    name: str
+    predictor: str
+    method: Method  # whose runs tell of it
+    pool: Pool  # counts, both sensors
+    standard: Pool | None  # all channels in units of their training standard deviation
+    skill: Interval  # of each shown step, then of their mean
+    spread: float  # standard deviation of the mean skill over runs, NaN for a single one
+    standard_skill: Interval | None = None  # the same as ``skill`` of standardised channels, where shear counts too
+
+    @property
+    def score(self) -> float:
+        """The mean skill over the shown steps."""
+        return float(self.skill.mean[-1])
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation over runs; the latter is NaN for a single one."""
+
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class Represented:
+    """A row of Table 1: errors in a representation's own scaled space."""
+
+    method: Method
+    validation: Spread
+    test: Spread
+    known: Spread | None  # test recordings of known objects alone
+    persistence: Spread
+
+
+def shown_steps(runs: Sequence[Run]) -> tuple[int, ...]:
+    """Return the steps to tell of, those that all runs predict."""
+    return tuple(step for step in SHOWN_STEPS if all(step in run.errors.steps for run in runs))
+
+
+def pool(runs: Sequence[Run], predictor: str, group: str = "both", known: bool | None = None) -> Pool | None:
+    """Return the pooled sums of a predictor; None where no run has any.
+
+    ``known`` takes the recordings of known objects alone, or of unseen ones; None takes both.
+    """
+    parts = [found for run in runs if (found := _part(run, predictor, group, known)) is not None]
+    if not parts:
+        return None
+    names = sorted({name for part in parts for name in part.recordings})
+    steps = tuple(step for step in parts[0].steps if all(step in part.steps for part in parts))
+    place = {name: index for index, name in enumerate(names)}
+    windows, most = np.zeros((2, len(names)), dtype=np.int64)
+    sums = np.zeros((3, len(names), len(steps)))
+    for part in parts:
+        rows = [place[name] for name in part.recordings]
+        windows[rows] += part.windows
+        most[rows] = np.maximum(most[rows], part.windows)
+        for index, values in enumerate((part.squared, part.absolute, part.baseline)):
+            sums[index][rows] += part.at(values, steps)
+    return Pool(tuple(names), windows, int(most.sum()), len(parts), steps, parts[0].channels, *sums)
+
+
+def skill(pooled: Pool, steps: Sequence[int]) -> Interval:
+    """Return the skill over persistence at ``steps``, then its mean over these, with intervals by recording."""
+    count = len(pooled.recordings)
+    mean = _skills(np.ones((1, count)), pooled, steps)[0]
+    if count < 2:
+        return Interval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
+    return Interval(mean, *metrics.bounds(_skills(_draws(count), pooled, steps)))
+
+
+def difference(one: Pool, other: Pool, steps: Sequence[int]) -> Interval | None:
+    """Return by how much the skill of ``one`` exceeds that of ``other``, each resample drawing the same recordings.
+
+    Only recordings that both were judged on count; None where there is none.
+    """
+    common = [name for name in one.recordings if name in set(other.recordings)]
+    if not common:
+        return None
+    pair = one.of(common), other.of(common)
+    even = np.ones((1, len(common)))
+    mean = (_skills(even, pair[0], steps) - _skills(even, pair[1], steps))[0]
+    if len(common) < 2:
+        return Interval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
+    drawn = _draws(len(common))
+    return Interval(mean, *metrics.bounds(_skills(drawn, pair[0], steps) - _skills(drawn, pair[1], steps)))
+
+
+def rows(methods: Sequence[Method], steps: Sequence[int], known: bool | None) -> list[Row]:
+    """Return every method and every baseline, the highest mean skill first.
+
+    Baselines are those of the runs of one method (`tacpipe.report.methods.reference`), because a split has the same for
+    all; those that go through a codec are told for each codec.
+    """
+    found = [_row(one.name, MODEL, one, steps, known) for one in methods]
+    source = by_method.reference(methods)
+    found += [_row(name, name, source, steps, known) for name in _predictors(source) if not own(name)]
+    for one in methods:  # what else was made of the model's own forecast
+        others = [name for name in _predictors(one) if name.startswith(f"{MODEL}_")]
+        found += [_row(f"{one.name} · {name[len(MODEL) + 1 :]}", name, one, steps, known) for name in others]
+    for codec in sorted({str(one.codec["name"]) for one in methods}):
+        source = by_method.reference([one for one in methods if one.codec["name"] == codec])
+        through = [name for name in _predictors(source) if name.startswith("codec")]
+        found += [_row(f"{name} {codec}", name, source, steps, known) for name in through]
+    held = [row for row in found if row is not None]
+    return sorted(held, key=lambda row: (np.isnan(row.score), -row.score, row.name))
+
+
+def represented(method: Method) -> Represented | None:
+    """Return a method's errors in its own scaled space; None where the results do not tell them."""
+    pooled = [found for run in method.runs if (found := pool([run], MODEL, "feature")) is not None]
+    if not pooled:
+        return None
+    known = [found for run in method.runs if (found := pool([run], MODEL, "feature", known=True)) is not None]
+    # the recurrent model is trained by this very error, so its loss tells it too
+    validation = [run.config.get("validation", {}) for run in method.runs]
+    told = [one.get("mse_feature", one.get("loss") if method.recurrent else None) for one in validation]
+    return Represented(
+        method,
+        spread([float(one) for one in told if one is not None]),
+        spread([float(one.mse.mean()) for one in pooled]),
+        spread([float(one.mse.mean()) for one in known]) if known else None,
+        spread([float(one.baseline_mse.mean()) for one in pooled]),
+    )
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Return mean and standard deviation of one value a run.
+
+    >>> spread([1.0, 3.0])
+    Spread(mean=2.0, sd=1.4142135623730951)
+    """
+    return Spread(
+        float(np.mean(values)) if values else float("nan"),
+        float(np.std(values, ddof=1)) if len(values) > 1 else float("nan"),
+    )
+
+
+def anticipation(method: Method, predictor: str) -> dict[str, float] | None:
+    """Return recall, leads and false alarms of a predictor, averaged over runs by their numbers of events."""
+    told = [run.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
+    held = [one for one in told if one and one.get("events")]
+    if not held:
+        return None
+    found: dict[str, float] = {"events": sum(float(one["events"]) for one in held)}
+    for name in ("recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute"):
+        pairs = [(float(one[name]), float(one["events"])) for one in held if one.get(name) is not None]
+        values, weights = zip(*pairs, strict=True) if pairs else ((float("nan"),), (1.0,))
+        found[name] = float(np.average(values, weights=weights))
+    return found
+
+
+def _part(run: Run, predictor: str, group: str, known: bool | None) -> Pool | None:
+    """Return the sums of one run."""
+    errors = run.errors
+    sums, baseline = errors.of(predictor, group), errors.of(BASELINE, group)
+    held = (errors.windows > 0) & (True if known is None else errors.known == known)
+    if sums is None or baseline is None or not held.any():
+        return None
+    names = tuple(name for name, kept in zip(errors.recordings, held, strict=True) if kept)
+    windows = errors.windows[held]
+    told = (int(windows.sum()), 1, errors.steps, errors.channels[group])
+    return Pool(names, windows, *told, sums[0][held], sums[1][held], baseline[0][held])
+
+
+def _skills(weights: NDArray[Any], pooled: Pool, steps: Sequence[int]) -> Floats:
+    """Return skill at ``steps`` and its mean, (draw, step + 1), each recording counted as ``weights`` (draw, it) say."""
+    found = metrics.skill(
+        weights @ pooled.at(pooled.squared, steps), weights @ pooled.at(pooled.baseline, steps)
+    )  # (draw, step)
+    return np.hstack([found, found.mean(axis=1, keepdims=True)])
+
+
+def _predictors(method: Method) -> list[str]:
+    """Return the baselines of a method's runs, in the order in which they come."""
+    return list(dict.fromkeys(name for run in method.runs for name in run.errors.predictors if name != MODEL))
+
+
+def _row(name: str, predictor: str, method: Method, steps: Sequence[int], known: bool | None) -> Row | None:
+    """Return how a predictor does in the runs of a method; None where it has no errors in counts."""
+    pooled = pool(method.runs, predictor, known=known)
+    if pooled is None:
+        return None
+    each = [found for run in method.runs if (found := pool([run], predictor, known=known)) is not None]
+    scores = [float(_skills(np.ones((1, len(one.recordings))), one, steps)[0, -1]) for one in each]
+    standard = pool(method.runs, predictor, "standard", known)
+    told = skill(standard, steps) if standard else None
+    return Row(name, predictor, method, pooled, standard, skill(pooled, steps), spread(scores).sd, told)
+
+
+def own(predictor: str) -> bool:
+    """Say whether a predictor is a model's or a codec's own, and not a baseline that is the same for all of a split."""
+    return predictor.startswith((MODEL, "codec"))
+
+
+def best(found: Sequence[Row]) -> Row | None:
+    """Return the best method among rows, those that were shown a wrong plan left out."""
+    return next((row for row in found if row.predictor == MODEL and row.method.actions != "shuffled"), None)
+
+
+def baseline_above(found: Sequence[Row], row: Row) -> Row | None:
+    """Return the best baseline that does better than ``row``; the codec's own, which know the future, do not count."""
+    others = (one for one in found if not own(one.predictor))
+    return next((one for one in others if one.score > row.score), None)

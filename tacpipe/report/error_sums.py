@@ -1,0 +1,105 @@
+"""The error sums of one result, as ``errors.parquet`` holds them, in arrays."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Floats = NDArray[np.floating[Any]]
+
+FILE = "errors.parquet"
+MODEL, BASELINE = "model", "persistence"
+COLUMNS = (
+    "recording",
+    "known",
+    "seen",
+    "predictor",
+    "group",
+    "step",
+    "windows",
+    "channels",
+    "squared",
+    "absolute",
+)
+
+
+@dataclass(frozen=True)
+class ErrorSums:
+    """Sums over windows and channels; NaN where a predictor has no errors in a group of channels."""
+
+    predictors: tuple[str, ...]
+    groups: tuple[str, ...]
+    recordings: tuple[str, ...]  # that the model was not trained on
+    steps: tuple[int, ...]
+    known: NDArray[np.bool_]  # (recording,): other recordings of its object were trained on
+    windows: NDArray[np.int64]  # (recording,)
+    channels: Mapping[str, int]  # by group
+    squared: Floats  # (predictor, group, recording, step)
+    absolute: Floats  # (predictor, group, recording, step)
+
+    def of(self, predictor: str, group: str) -> tuple[Floats, Floats] | None:
+        """Return squared and absolute sums, both (recording, step); None where there are none."""
+        if predictor not in self.predictors or group not in self.groups:
+            return None
+        at = self.predictors.index(predictor), self.groups.index(group)
+        squared, absolute = self.squared[at], self.absolute[at]
+        return None if np.isnan(squared).any() else (squared, absolute)
+
+
+def read(content: bytes) -> ErrorSums:
+    """Return the sums that a file holds, without those of recordings that the model was trained on.
+
+    Raises `TacpipeError` where a column is missing, or where predictors were not judged on the same windows.
+    """
+    import pyarrow.parquet as pq
+
+    schema = pq.read_schema(io.BytesIO(content))
+    missing = [name for name in COLUMNS if name not in schema.names]
+    if missing:
+        raise TacpipeError(f"{FILE} has no column {' and no '.join(missing)}. Evaluate the model again.")
+    table = pq.read_table(io.BytesIO(content), columns=list(COLUMNS))
+    table = table.filter(np.logical_not(table["seen"].to_numpy()))
+    (predictors, predictor), (groups, group), (recordings, recording) = (
+        _coded(table[name]) for name in ("predictor", "group", "recording")
+    )
+    steps, step = np.unique(table["step"].to_numpy(), return_inverse=True)
+    windows = np.zeros(len(recordings), dtype=np.int64)
+    windows[recording] = table["windows"].to_numpy()
+    uneven = np.flatnonzero(windows[recording] != table["windows"].to_numpy())
+    if len(uneven):
+        raise TacpipeError(
+            f"In {FILE}, predictors were judged on different windows of {recordings[recording[uneven[0]]]}, so they "
+            f"cannot be compared. Evaluate the model again."
+        )
+    known = np.zeros(len(recordings), dtype=np.bool_)
+    known[recording] = table["known"].to_numpy()
+    sums = np.full((2, len(predictors), len(groups), len(recordings), len(steps)), np.nan)
+    for index, name in enumerate(("squared", "absolute")):
+        sums[index, predictor, group, recording, step] = table[name].to_numpy()
+    return ErrorSums(
+        predictors,
+        groups,
+        recordings,
+        tuple(int(one) for one in steps),
+        known,
+        windows,
+        {groups[code]: int(width) for code, width in zip(group, table["channels"].to_numpy(), strict=True)},
+        sums[0],
+        sums[1],
+    )
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+    """Return the distinct values of a text column in the order in which they come, and the place of each row's."""
+    encoded = column.combine_chunks().dictionary_encode()
+    return tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64)

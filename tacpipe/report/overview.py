@@ -1,0 +1,323 @@
+"""Many results beside each other: the part of the page that comes before single ones."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.metrics import Interval
+from tacpipe.report import comparison, figures, markup, sweep, tables, traces
+from tacpipe.report import methods as by_method
+from tacpipe.report.comparison import Row
+from tacpipe.report.error_sums import BASELINE, MODEL
+from tacpipe.report.methods import Method, Run
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+LINES = 4  # methods in a figure of skill, the paper's not counted
+FIGURE_STEPS = (3, 5, 10)  # those of the paper's figures 5 and 6
+FLOOR = -1.0  # skill at which figures end
+COMPONENTS = 40  # bars of the explained variance
+
+
+class Overview:
+    """What the results of one page have in common, sorted for telling."""
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self.methods = by_method.grouped(runs)
+        self.timeline = by_method.main_timeline(runs)
+        self.main = [one for one in self.methods if one.timeline == self.timeline]
+        self.steps = comparison.shown_steps(runs)
+        known = np.concatenate([run.errors.known for method in self.main for run in method.runs])
+        self.parts: list[bool | None] = [part for part in (True, False) if (known == part).any()]
+        self.rows = {part: comparison.rows(self.main, self.steps, part) for part in self.parts}
+        self.paper = by_method.papers(self.main)
+
+    def best(self) -> Method | None:
+        """Return the method that does best on unseen objects, or on known ones where there are no others."""
+        row = comparison.best(self.rows[self.parts[-1]])
+        return row.method if row else None
+
+    def told_apart(self) -> list[Run]:
+        """Return the runs that are worth a section of their own: of the best method and the paper's, a median one."""
+        chosen = dict.fromkeys(one.name for one in (self.best(), self.paper) if one)
+        return [self.median(method) for name in chosen for method in self.methods if method.name == name]
+
+    def row_of(self, method: Method, part: bool | None) -> Row | None:
+        """Return a method's row on known or unseen objects."""
+        return next((row for row in self.rows[part] if row.predictor == MODEL and row.method is method), None)
+
+    def median(self, method: Method) -> Run:
+        """Return the run whose mean skill is in the middle, of an even number the one below."""
+        scored = []
+        for index, run in enumerate(method.runs):
+            pooled = comparison.pool([run], MODEL)
+            score = float(comparison.skill(pooled, self.steps).mean[-1]) if pooled else float("-inf")
+            scored.append((score, index))
+        return method.runs[sorted(scored)[(len(scored) - 1) // 2][1]]
+
+
+def render(overview: Overview, codecs: Sequence[sweep.Tree], simulated: bool) -> str:
+    """Return the comparison of all results."""
+    sentences, word = headline(overview)
+    badge = ' <span class="badge">simulated</span>' if simulated else ""
+    runs = sum(len(one.runs) for one in overview.methods)
+    parts = [
+        f"<h2>{len(overview.methods)} methods in {runs} results{badge}</h2>",
+        f'<p class="headline {word}">{"<br>".join(map(escape, sentences))}</p>',
+        markup.note(_basis(overview, simulated)),
+        _skill_figures(overview),
+        "<h3>The paper's table</h3>",
+        tables.representations(overview.main),
+        markup.note(
+            "Each row is in its own representation's space, scaled to ±1 on the training recordings, as in the paper. Rows "
+            "of different spaces cannot be compared: a space that leaves out what is hard to foresee has the lower "
+            "error. Persistence in the same space says what a row is worth: below 1 in the column beside it, the model "
+            "is better. The paper's own recordings are not public; its numbers stand here as printed."
+        ),
+        _comparable(overview),
+        _ablations(overview),
+        tables.anticipation(overview.main),
+        _paper_traces(overview),
+        codec_section(codecs),
+    ]
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+def headline(overview: Overview) -> tuple[list[str], str]:
+    """Return what came out, a sentence or two for known objects and for unseen ones, and a word for the latter."""
+    sentences, word = [], ""
+    averaged = _steps(overview.steps)
+    for part in overview.parts:
+        row = comparison.best(overview.rows[part])
+        if row is None:
+            continue
+        told = f"On {tables.OBJECTS[part]}, {row.name} {_against(row)}, averaged over {averaged}"
+        paper = overview.row_of(overview.paper, part) if overview.paper else None
+        if paper is row:
+            told += "; it is the paper's method"
+        elif paper:
+            told += f"; the paper's method, {paper.name}, has {_told(paper)}"
+        above = comparison.baseline_above(overview.rows[part], row)
+        if above:
+            told += f". No method is as good as the baseline {above.name}, which has {_told(above)}"
+        if row.standard_skill is not None:
+            told += f". In standardised channels, where shear counts as pressure does, {_skill(row.standard_skill)}"
+        sentences.append(told + ".")
+        word = _word(row)
+    return sentences, word
+
+
+def codec_section(codecs: Sequence[sweep.Tree]) -> str:
+    """Return what codecs hold and lose: Figure 4 of the paper, and loss by number of latents; empty without codecs."""
+    found = sweep.losses(codecs)
+    if not codecs:
+        return ""
+    drawn = []
+    pca, autoencoder = sweep.papers(codecs, "PCA", 20), sweep.papers(codecs, "AE-C1", 8)
+    if pca and pca.get("explained_ratio"):
+        kept, ratio = int(pca["latents"]), pca["explained_ratio"]
+        caption = (
+            f"Variance by principal component, as in Figure 4 of the paper. The {kept} that are kept hold "
+            f"{100 * sum(ratio[:kept]):.1f} %; in the paper 20 hold 82 %."
+        )
+        drawn.append(markup.figure(figures.explained_variance(ratio[:COMPONENTS], kept), caption))
+    for name, codec in (("PCA", pca), ("AE-C1", autoencoder)):
+        if codec:
+            caption = (
+                f"Covariance between the {codec['latents']} latents of {name} on training rows; the colour's strength "
+                f"is the square root of its size, blue above 0 and orange below."
+            )
+            drawn.append(markup.figure(figures.covariance(np.array(codec["latent_covariance"])), caption))
+    series: dict[str, dict[int, float]] = {}
+    for one in found:
+        series.setdefault(one.series, {})[one.latents] = one.mse_standardised
+    if any(len(widths) > 1 for widths in series.values()):
+        caption = "Error of encoding and decoding, where 1 is what no latent at all would give. Lower is better."
+        drawn.append(markup.figure(figures.loss_by_width(series), caption))
+    rows = tables.losses(found) if found else ""
+    return f'<h3>Representations</h3><div class="pair">{"".join(drawn)}</div>{rows}'
+
+
+def _basis(overview: Overview, simulated: bool) -> str:
+    """Return what the comparison rests on."""
+    settings = "; ".join(f"{name} {values}" for name, values in tables.settings(overview.methods).items())
+    windows = []
+    for part in overview.parts:
+        pools = [row.pool for row in overview.rows[part] if row.predictor == MODEL]
+        recordings = len({name for pool in pools for name in pool.recordings})
+        most = max((pool.distinct_windows for pool in pools), default=0)
+        windows.append(
+            f"{recordings:,} recording{'s' if recordings != 1 else ''} of {tables.OBJECTS[part]} ({most:,} windows)"
+        )
+    text = (
+        f"Judged on {' and '.join(windows)}, none of which its model was trained on; a recording may be known to one "
+        f"run and unseen to another. Settings: {settings}. Skill is 1 − squared error / squared error of persistence, "
+        f"both in counts over all channels. Intervals are 95 %, from drawing whole recordings anew, with the errors of a "
+        f"recording in several runs kept together; they do not tell of other seeds, the sd over runs does. The best of "
+        f"many methods was picked on these very recordings, which flatters it a little. The recorded motion stands for "
+        f"the plan: all this holds for an arm that follows its plan perfectly."
+    )
+    if simulated:
+        text += " These recordings were simulated: nothing here is evidence about a real sensor."
+    return text
+
+
+def _against(row: Row) -> str:
+    """Return how a method does against persistence, no more surely than its interval."""
+    return {
+        "unclear": f"cannot be told from persistence: {_told(row)}",
+        "better": f"is {markup.gain(row.score)} than persistence: {_told(row)}",
+        "worse": f"is {markup.gain(row.score)} than persistence: {_told(row)}",
+    }.get(_word(row), f"has {_told(row)}, on a single recording")
+
+
+def _word(row: Row) -> str:
+    """Return ``better``, ``worse`` or ``unclear``; empty without an interval."""
+    low, high = float(row.skill.low[-1]), float(row.skill.high[-1])
+    if np.isnan([low, high]).any():
+        return ""
+    return "better" if low > 0 else "worse" if high < 0 else "unclear"
+
+
+def _told(row: Row) -> str:
+    """Return a row's mean skill and its interval in words."""
+    return _skill(row.skill)
+
+
+def _skill(found: Interval) -> str:
+    """Return the last of some skills, their mean, and its interval in words."""
+    mean, low, high = (float(getattr(found, name)[-1]) for name in ("mean", "low", "high"))
+    interval = (
+        "" if np.isnan([low, high]).any() else f" (95 % interval {markup.decimals(low)} to {markup.decimals(high)})"
+    )
+    return f"skill {markup.decimals(mean)}{interval}"
+
+
+def _steps(steps: Sequence[int]) -> str:
+    """Return steps in words.
+
+    >>> _steps((1, 3, 10)), _steps((1,))
+    ('t+1, t+3 and t+10', 't+1')
+    """
+    names = [f"t+{step}" for step in steps]
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
+
+
+def _skill_figures(overview: Overview) -> str:
+    """Return the skill by step of the best methods, the paper's and the best baseline, a figure a kind of objects."""
+    drawn = []
+    chosen = {part: _chosen(overview, part, LINES) for part in overview.parts}
+    order = list(dict.fromkeys(row.name for rows in chosen.values() for row in rows))
+    for part, rows in chosen.items():
+        lines: dict[str, dict[str, Sequence[float]]] = {}
+        cut = []
+        for row in rows:
+            found = comparison.skill(row.pool, row.pool.steps)
+            lines[row.name] = {name: getattr(found, name)[:-1].tolist() for name in ("mean", "low", "high")}
+            if float(np.nanmin(found.mean)) < FLOOR:
+                cut.append(row.name)
+        steps = min((row.pool.steps for row in rows), key=len)
+        short = {name: {key: values[: len(steps)] for key, values in told.items()} for name, told in lines.items()}
+        rate_hz = float(rows[0].method.config.get("rate_hz") or 0)
+        ahead = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
+        caption = f"Skill on {tables.OBJECTS[part]} over the time ahead, with 95 % intervals over recordings."
+        if cut:
+            caption += f" The figure ends at {markup.skill(FLOOR)}, above some of {' and '.join(cut)}."
+        svg = figures.skill_of_methods(short, ahead, "ms" if rate_hz else "steps", order, FLOOR)
+        drawn.append(markup.figure(svg, caption))
+    return f'<div class="pair">{"".join(drawn)}</div>'
+
+
+def _chosen(overview: Overview, part: bool | None, count: int) -> list[Row]:
+    """Return the rows of the ``count`` best methods, of the paper's and of the best baseline that sees no future."""
+    rows = overview.rows[part]
+    found = [row for row in rows if row.predictor == MODEL][:count]
+    paper = overview.row_of(overview.paper, part) if overview.paper else None
+    if paper and all(paper is not row for row in found):
+        found.append(paper)
+    plain = [row for row in rows if row.predictor != BASELINE and not comparison.own(row.predictor)]
+    return found + plain[:1]
+
+
+def _comparable(overview: Overview) -> str:
+    """Return the tables in which all methods and baselines can be compared, and those of the best by channel."""
+    source = by_method.reference(overview.main)
+    parts = [
+        "<h3>All in counts</h3>",
+        markup.note(
+            f"Every representation is taken back to counts of all channels before it is judged, so all rows can be "
+            f"compared. Baselines, in grey, are those of the {len(source.runs)} runs of {source.name}; those of a codec "
+            f"are told for each, and codec and codec_anchored know the true future. Errors without a step are means "
+            f"over all steps."
+        ),
+    ]
+    parts += [tables.comparable(overview.rows[part], overview.steps, part) for part in overview.parts]
+    for part in overview.parts:
+        first, paper = comparison.best(overview.rows[part]), overview.paper
+        row = overview.row_of(paper, part) if paper else None
+        chosen = [one for one in (first, row if row is not first else None) if one]
+        if chosen:
+            parts.append(tables.channel_groups(chosen, overview.steps, part))
+    others = sorted({one.timeline for one in overview.methods} - {overview.timeline})
+    for timeline in others:
+        methods = [one for one in overview.methods if one.timeline == timeline]
+        parts.append(f"<h3>On the {escape(timeline)} timeline, whose steps last differently</h3>")
+        for known in overview.parts:
+            rows = comparison.rows(methods, overview.steps, known)
+            parts.append(tables.comparable(rows, overview.steps, known))
+    return "\n".join(parts)
+
+
+def _ablations(overview: Overview) -> str:
+    """Return what the plan and the timeline change."""
+    found = [
+        tables.actions(overview.methods, overview.steps, overview.parts),
+        tables.timelines(overview.methods, overview.steps, overview.parts),
+    ]
+    told = (
+        "Differences are paired: each resample draws the same recordings for both. An interval above 0 says that the "
+        "plan helps."
+    )
+    return f"<h3>Ablations</h3>{markup.note(told)}{''.join(found)}" if any(found) else ""
+
+
+def _paper_traces(overview: Overview) -> str:
+    """Return Figures 5 and 6 of the paper: the first two components, and the second and fourth latent of AE-C1."""
+    wanted = (
+        ("PCA", (0, 1), "Figure 5 in the paper's form: the first two principal components"),
+        ("AE-C1", (1, 3), "Figure 6 in the paper's form: the second and the fourth latent of AE-C1"),
+    )
+    drawn = []
+    for row, latents, title in wanted:
+        found = [
+            one
+            for one in overview.main
+            if one.recurrent and one.actions == "planned" and by_method.paper_row(one.codec) == row
+        ]
+        if not found:
+            continue
+        run = overview.median(found[0])
+        name = _median_recording(run.dataset)
+        svg = traces.draw(run.dataset.shards[name], latents, FIGURE_STEPS) if name else ""
+        if svg:
+            caption = f"{title}, on {name}, the recording of median skill of {found[0].name}. {traces.UNSHIFTED}"
+            drawn.append(markup.figure(svg, caption))
+    return f"<h3>The paper's figures</h3>{''.join(drawn)}" if drawn else ""
+
+
+def _median_recording(result: Dataset) -> str | None:
+    """Return the recording of median skill among those that the model has not seen."""
+    trials: list[dict[str, Any]] = list(csv.DictReader(io.StringIO(result.files.get("trials.csv", b"").decode())))
+    judged = sorted(
+        (float(one["skill"]), one["recording"])
+        for one in trials
+        if one["seen"] == "false" and one["skill"] and one["recording"] in result.shards
+    )
+    return judged[len(judged) // 2][1] if judged else None

@@ -1,0 +1,319 @@
+"""One result: what came out in a sentence, then figures, tables, and where the numbers come from."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.report import figures, markup, traces
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Tree = Mapping[str, Any]
+
+SHOWN_STEPS = (1, 3, 5, 10)
+TRACE_STEPS = (1, 5, 10)
+EXPLAINED = {
+    "model": "the trained model",
+    "persistence": "nothing changes: the last frame is held",
+    "codec_persistence": "the last frame is held after going through the codec",
+    "codec": "the true future through the codec, which is what compression alone costs",
+    "model_anchored": "the model's forecast, moved so that it goes on from the last frame",
+    "codec_anchored": "the true future through the codec, moved so that it goes on from the last frame",
+    "context_mean": "the mean of the frames the model reads",
+    "train_mean": "the mean of the training recordings",
+    "damped_trend": "the last frames' trend goes on and fades",
+    "last_value_linear": "a linear map of the frames the model reads, the last frame taken off them",
+    "ridge": "ridge regression of the changes to come on those of the frames the model reads",
+    "ridge_actions": "the same with the planned motion",
+}
+OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
+
+
+def headline(metrics: Tree, rate_hz: float = 0.0) -> tuple[str, str]:
+    """Return the result in a sentence or two, and a word for it: ``better``, ``worse`` or ``unclear``.
+
+    It speaks of the last step's squared error in counts; the 95 % interval is over recordings.
+    """
+    told = metrics.get("skill", {}).get("mse_counts", {})
+    steps = [int(name[1:]) for name in told if name != "mean"]
+    if not steps:
+        return (
+            "No recording was left to judge the model on: it has seen all that were given, or none holds a window.",
+            "",
+        )
+    step = max(steps)
+    one = told[f"t{step}"]
+    when = f"t+{step}" + (f" ({1000 * step / rate_hz:.0f} ms ahead)" if rate_hz else "")
+    recordings = metrics["counts"]["recordings"]
+    if "low" not in one:
+        return (
+            f"The model is {markup.gain(one['mean'])} than persistence at {when}, on a single recording: no interval.",
+            "",
+        )
+    interval = f"95 % interval {markup.skill(one['low'])} to {markup.skill(one['high'])} over {recordings} recordings"
+    if one["low"] <= 0 <= one["high"]:
+        sentence = (
+            f"The model cannot be told from persistence at {when}: skill {markup.skill(one['mean'])}, {interval}."
+        )
+        return sentence, "unclear"
+    word = "better" if one["low"] > 0 else "worse"
+    told = f"skill {markup.skill(one['mean'])}, {interval}"
+    return f"The model is {markup.gain(one['mean'])} than persistence at {when}: {told}.", word
+
+
+def render(result: Dataset, number: int, of: int, drawn: int) -> str:
+    """Return the part of the page that one result has: the ``number``-th ``of`` so many, with ``drawn`` traces."""
+    metrics = json.loads(result.files["metrics.json"])
+    config = json.loads(result.files["config.json"]) if "config.json" in result.files else {}
+    rate_hz = float(config.get("rate_hz", 0.0))
+    sentence, word = headline(metrics, rate_hz)
+    badge = ' <span class="badge">simulated</span>' if simulated(result) else ""
+    name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
+    if isinstance(config.get("codec"), Mapping):
+        name += f" · {config['codec'].get('name', config['codec'].get('kind', ''))}"
+    trials = list(csv.DictReader(io.StringIO(result.files.get("trials.csv", b"").decode())))
+    parts = [
+        f"<h2>{f'{number}. ' if of > 1 else ''}{escape(name.replace('_', ' '))}{badge}</h2>",
+        f'<p class="headline {word}">{escape(sentence)}</p>',
+        _floor(metrics),
+        _counts(metrics, simulated(result)),
+        _horizon_figures(metrics, rate_hz),
+        _error_tables(metrics),
+        _objects(metrics),
+        _trials(trials),
+        _traces(result, trials, drawn),
+        _seen(metrics),
+        _training(result.files),
+        _provenance(result.manifest),
+    ]
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+def simulated(result: Dataset) -> bool:
+    """Say whether any recording of a result was simulated."""
+    return any(bool(shard.attributes.get("simulated")) for shard in result.shards.values())
+
+
+def _counts(metrics: Tree, badge: bool) -> str:
+    """Return how much the result rests on."""
+    counts = metrics.get("counts", {})
+    text = (
+        f"{counts.get('recordings', 0)} recordings that the model has not seen, {counts.get('windows', 0)} windows; "
+        f"because windows overlap, they are worth about {counts.get('effective_windows', 0)}. "
+        "Intervals come from drawing whole recordings anew. "
+        "Skill is 1 − squared error of the model / squared error of persistence."
+    )
+    if badge:
+        text += " These recordings were simulated: nothing here is evidence about a real sensor."
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def _floor(metrics: Tree) -> str:
+    """Return a warning where the codec alone loses more than persistence errs, empty otherwise."""
+    if "codec" not in metrics:
+        return ""
+    floor, baseline = (_both(metrics[name]["mse_counts"]) for name in ("codec", "persistence"))
+    steps = _steps(floor)
+    lost = [step for step in steps if floor[f"t{step}"] >= baseline[f"t{step}"]]
+    if not lost:
+        return ""
+    which = "at every step" if lost == steps else f"up to t+{max(lost)}"
+    text = (
+        f"The codec alone loses more than persistence errs {which} (squared error of the true future through the codec: "
+        f"{markup.number(floor['mean'])} counts² on average), so a model of its latents can hardly win there in counts."
+    )
+    return f"<p>{escape(text)}</p>"
+
+
+def _steps(scores: Tree) -> list[int]:
+    return sorted(int(name[1:]) for name in scores if name != "mean")
+
+
+def _both(scores: Tree) -> Tree:
+    """Return the errors over all channels; results of before this was called ``both`` call it ``all``."""
+    found: Tree = scores["both"] if "both" in scores else scores["all"]
+    return found
+
+
+def _predictors(metrics: Tree) -> list[str]:
+    """Return the names of model and baselines, model first, then persistence."""
+    found = [
+        name
+        for name, scores in metrics.items()
+        if name != "skill" and isinstance(scores, Mapping) and "mse_counts" in scores
+    ]
+    order = list(EXPLAINED)
+    return sorted(found, key=lambda name: (order.index(name) if name in order else len(order), name))
+
+
+def _horizon_figures(metrics: Tree, rate_hz: float) -> str:
+    """Return error and skill over the time ahead, side by side."""
+    names = _predictors(metrics)
+    if not names:
+        return ""
+    steps = _steps(_both(metrics[names[0]]["mse_counts"]))
+    ahead_ms = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
+    errors = {
+        name: [np.sqrt(_both(metrics[name]["mse_counts"])[f"t{step}"]) for step in steps]
+        for name in names
+        if name not in OFF_SCALE
+    }
+    parts = [
+        markup.figure(
+            figures.errors_by_horizon(errors, ahead_ms, "root mean squared error (counts)"),
+            "Error over all channels and unseen recordings. Lower is better.",
+        )
+    ]
+    told = metrics["skill"]["mse_counts"]
+    if all("low" in told.get(f"t{step}", {}) for step in steps):
+        skill = {part: [told[f"t{step}"][part] for step in steps] for part in ("mean", "low", "high")}
+        caption = "Skill over persistence, with its 95 % interval over recordings."
+        parts.append(markup.figure(figures.skill_by_horizon(skill, ahead_ms), caption))
+    return f'<div class="pair">{"".join(parts)}</div>'
+
+
+def _error_tables(metrics: Tree) -> str:
+    """Return errors by predictor, skill with intervals, and errors by sensor and axis."""
+    names = _predictors(metrics)
+    if not names:
+        return ""
+    groups = metrics[names[0]]["mae_counts"]
+    shown = [f"t{step}" for step in _steps(_both(groups)) if step in SHOWN_STEPS] + ["mean"]
+    heads = [name.replace("t", "t+") if name != "mean" else name for name in shown]
+    parts = []
+    for measure, title in (
+        ("mae_counts", "Mean absolute error (counts)"),
+        ("mse_counts", "Mean squared error (counts²)"),
+    ):
+        rows = [[name, *(markup.number(_both(metrics[name][measure])[step]) for step in shown)] for name in names]
+        parts.append(markup.table(title, ["", *heads], rows))
+    told = [name for name in names if "mse_feature" in metrics[name]]
+    rows = [[name, *(markup.number(metrics[name]["mse_feature"][step]) for step in shown)] for name in told]
+    parts.append(markup.table("Mean squared error (latents scaled to ±1, as in the paper)", ["", *heads], rows))
+    rows = []
+    for measure, skill in metrics["skill"].items():
+        rows.append([measure, *(markup.interval(skill.get(step, {})) for step in shown)])
+    parts.append(markup.table("Skill over persistence, with 95 % interval", ["", *heads], rows))
+    rows = [
+        [f"{name}, {group}", *(markup.number(metrics[name]["mae_counts"][group][step]) for step in shown)]
+        for group in groups
+        if group not in ("both", "all")
+        for name in names[:2]
+    ]
+    parts.append(markup.table("Mean absolute error by sensor and axis (counts)", ["", *heads], rows))
+    legend = "; ".join(f"{name}: {EXPLAINED[name]}" for name in names if name in EXPLAINED)
+    return f'<h3>Errors</h3><p class="note">{escape(legend)}.</p>' + "".join(parts)
+
+
+def _objects(metrics: Tree) -> str:
+    """Return errors and skill on objects that the model was trained on beside those on others, where it is told."""
+    parts = {name: metrics[name] for name in ("known", "unseen") if "skill" in metrics.get(name, {})}
+    if not parts:
+        return ""
+    rows = []
+    for name, part in parts.items():
+        steps = [f"t{step}" for step in _steps(_both(part["model"]["mae_counts"])) if step in SHOWN_STEPS] + ["mean"]
+        objects = f"{name} objects ({part['counts']['recordings']} recordings)"
+        for predictor in _predictors(part)[:2]:
+            errors = _both(part[predictor]["mae_counts"])
+            rows.append([f"{objects}, {predictor} (counts)", *(markup.number(errors[step]) for step in steps)])
+        told = part["skill"]["mse_counts"]
+        rows.append([f"{objects}, skill", *(markup.interval(told.get(step, {})) for step in steps)])
+    heads = [step.replace("t", "t+") if step != "mean" else step for step in steps]
+    return markup.table("Known objects and unseen ones: mean absolute error, and skill", ["", *heads], rows)
+
+
+def _trials(trials: Sequence[Mapping[str, str]]) -> str:
+    """Return the skill on each unseen recording."""
+    judged = [one for one in trials if one["seen"] == "false" and one["skill"]]
+    if not judged:
+        return ""
+    skill, windows = [float(one["skill"]) for one in judged], [int(one["windows"]) for one in judged]
+    better = sum(value > 0 for value in skill)
+    caption = (
+        f"Skill on each recording; better than persistence on {better} of {len(skill)}. Larger dots: more windows."
+    )
+    keys = ("mse_counts_model", "mse_counts_persistence")
+    rows = [
+        [
+            one["recording"],
+            one["windows"],
+            *(markup.number(float(one[key])) for key in keys),
+            markup.skill(float(one["skill"])),
+        ]
+        for one in sorted(judged, key=lambda one: float(one["skill"]))
+    ]
+    heads = ["recording", "windows", "model (counts²)", "persistence (counts²)", "skill"]
+    return (
+        "<h3>By recording</h3>"
+        + markup.figure(figures.skill_by_trial(skill, windows), caption)
+        + markup.table("All recordings, the worst first", heads, rows)
+    )
+
+
+def _traces(result: Dataset, trials: Sequence[Mapping[str, str]], count: int) -> str:
+    """Return example predictions of the recordings of median, lowest and highest skill."""
+    judged = sorted(
+        (one for one in trials if one["seen"] == "false" and one["skill"] and one["recording"] in result.shards),
+        key=lambda one: float(one["skill"]),
+    )
+    if not judged or not count:
+        return ""
+    chosen = {"median": judged[len(judged) // 2], "lowest": judged[0], "highest": judged[-1]}
+    drawn: dict[str, str] = {}
+    for rank, one in list(chosen.items())[:count]:
+        name = one["recording"]
+        if name not in drawn:
+            caption = f"{name}, the recording of {rank} skill ({markup.skill(float(one['skill']))}). {traces.UNSHIFTED}"
+            drawn[name] = markup.figure(traces.draw(result.shards[name], (0, 1), TRACE_STEPS), caption)
+    return "<h3>Predictions</h3>" + "".join(drawn.values())
+
+
+def _seen(metrics: Tree) -> str:
+    """Return the errors on recordings that the model was trained on, which prove nothing."""
+    seen = metrics.get("seen", {})
+    told = seen.get("skill", {}).get("mse_counts", {}).get("mean", {})
+    if "mean" not in told:
+        return ""
+    text = (
+        f"Left out of all above: {seen['counts']['recordings']} recordings that the model was trained or stopped on. "
+        f"Its skill on these is {markup.skill(told['mean'])}, averaged over all steps."
+    )
+    return f'<h3>Recordings the model has seen</h3><p class="note">{escape(text)}</p>'
+
+
+def _training(files: Mapping[str, bytes]) -> str:
+    """Return the losses by epoch, where the result holds them."""
+    if "history.jsonl" not in files:
+        return ""
+    history = [json.loads(line) for line in files["history.jsonl"].splitlines()]
+    if not history:
+        return ""
+    best = min(history, key=lambda line: line["val_loss"])
+    caption = f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
+    return "<h3>Training</h3>" + markup.figure(figures.losses(history), caption)
+
+
+def _provenance(manifest: Tree) -> str:
+    """Return the chain of stages behind a result, with params and digests."""
+    steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
+    rows = []
+    for step in steps:
+        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in (step.get("params") or {}).items())
+        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
+        rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
+    table = markup.table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows)
+    named = [("this result", str(manifest.get("digest", "")))]
+    for argument, inputs in manifest.get("inputs", {}).items():
+        several = inputs if isinstance(inputs, list) else [inputs]
+        named += [(argument, one["dataset"] if isinstance(one, dict) else str(one)) for one in several]
+    items = "".join(f"<li>{escape(name)}: <code>{escape(digest)}</code></li>" for name, digest in named if digest)
+    return f'<h3>Where it comes from</h3><div class="words">{table}</div><ul>{items}</ul>'

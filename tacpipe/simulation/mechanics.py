@@ -1,0 +1,228 @@
+"""Stick and slip between two fingers and the object that they hold.
+
+The fingers press along y with N each, so that Coulomb friction holds up to 2 mu N in the plane of x and z. What they
+must bring up there is D = m (a + g e_z), with a the acceleration of the hand in its own frame. It is a hybrid of two
+states, stepped with the velocity taken implicitly:
+
+- *stick*: a critically damped spring about an anchor (k = 2e4 N/m, c = 2 sqrt(k m)) carries the load; slip starts
+  where the spring's force exceeds 2 mu_s N. The damper's does not count: for some ms after a jolt it adds a few percent;
+- *slip*: friction of 2 mu_k N against the relative velocity. Where it would turn the velocity round, the object
+  sticks again, and the anchor is set so that the spring carries the load of that moment.
+
+Not LuGre: its break-away force depends on how fast the load comes, and it creeps at rest. The spring stands for the
+stiffness of a contact at rest; its deflection (0.3 mm at 6 N) is no displacement here, which slip alone makes.
+
+Along y the object is clamped: its acceleration is the difference of the two normal forces, and their sum stays 2 N.
+While the object stands on the table, the table bears its weight, and hands it over within `TABLE_M` of rise. Once it has
+moved by `DROP_M` the fingers have lost it: contact forces are zero, it falls, and lies where it lands.
+
+A grasp beside the centre of mass twists the object about y as well. The two soft fingers hold (2/3) mu N R each, as
+uniform pressure on a disc of radius R does. The twist has a friction limit of its own, not one in common with the shear.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+GRAVITY_M_S2 = 9.81
+UPWARDS_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])  # what the table or the hand does to an object at rest
+STIFFNESS_N_M = 2e4
+KINETIC = 0.8  # mu_k / mu_s
+DROP_M = 0.025
+TABLE_M = 0.001  # rise over which the table hands the object's weight over to the fingers
+PATCH_M = 0.008  # R, radius of the patch that twists
+GYRATION_M = 0.06  # radius of gyration of a small bottle
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """What the fingers hold, and how."""
+
+    mass_kg: float
+    friction: float  # mu_s
+    grip_n: Floats  # (time,), N: the normal force of each finger while nothing accelerates along y
+    lever_m: float = 0.0  # how far the centre of mass lies beside the grasp, along x
+
+    @property
+    def limit_n(self) -> Floats:
+        """The largest force in the plane that both fingers hold in stick, 2 mu_s N (time,)."""
+        limit: Floats = 2 * self.friction * self.grip_n
+        return limit
+
+    def demand_n(self, acceleration_m_s2: Floats, borne: Floats | float = 1.0) -> Floats:
+        """Return the force (time, axis) in the hand's frame that moves the object as the hand moves.
+
+        ``acceleration_m_s2`` (time, axis) is that of the hand in its frame; ``borne`` (time,) is the share of the
+        weight that the table has handed over.
+        """
+        pull: Floats = self.mass_kg * (acceleration_m_s2 + UPWARDS_M_S2)
+        pull[:, 2] *= borne
+        return pull
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What the fingers do to the object, and what it does between them; in the frame of the hand."""
+
+    force_n: Floats  # (time, axis) on the object, of both fingers together
+    normal_n: Floats  # (time, finger)
+    displacement_m: Floats  # (time, 2) of the object against the fingers, along x and z
+    velocity_m_s: Floats  # (time, 2), likewise
+    slip: Flags  # (time,), held and slipping
+    dropped: Flags  # (time,)
+    torque_nm: Floats  # (time,) about y, of both fingers together
+    rotation_rad: Floats  # (time,) about y, of the object against the fingers
+
+    @property
+    def onset(self) -> int | None:
+        """The row in which the first slip starts, or None."""
+        return int(self.slip.argmax()) if self.slip.any() else None
+
+
+def onset_m_s2(mass_kg: float, grip_n: float, friction: float) -> float:
+    """Return the upward acceleration at which an object begins to slip, 2 mu_s N / m - g.
+
+    >>> round(onset_m_s2(0.36, 6.0, 0.45), 2)
+    5.19
+    """
+    return 2 * friction * grip_n / mass_kg - GRAVITY_M_S2
+
+
+def carry(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None = None, *, rate_hz: float = 1000.0) -> Contact:
+    """Return the contact while the hand accelerates by ``acceleration_m_s2`` (time, axis), in its own frame.
+
+    ``rise_m`` (time,) is the hand's height above the place where the object stands on the table; without it there is no
+    table, and the object begins in stick under its load.
+    """
+    moves = _slide(grasp, acceleration_m_s2, rise_m, 1 / rate_hz)  # (time, 7)
+    held = moves[:, 6] < 2
+    along = acceleration_m_s2[:, 1] * grasp.mass_kg * (grasp.grip_n > 0) * held
+    force = np.column_stack([moves[:, 0], along, moves[:, 1]])
+    pressed = (grasp.grip_n > 0) * held
+    normal = np.column_stack([grasp.grip_n + along / 2, grasp.grip_n - along / 2]) * pressed[:, None]
+    torque, rotation = _twist(grasp, force, held, 1 / rate_hz)
+    return Contact(
+        force, np.maximum(normal, 0.0), moves[:, 2:4], moves[:, 4:6], moves[:, 6] == 1, ~held, torque, rotation
+    )
+
+
+def run_profile(
+    acceleration_m_s2: Floats, mass_kg: float, grip_n: float, friction: float, *, rate_hz: float = 1000.0
+) -> Contact:
+    """Return the contact of an object in the air under a commanded acceleration: (time,) upwards, or (time, axis)."""
+    commanded = np.asarray(acceleration_m_s2, dtype=np.float64)
+    if commanded.ndim == 1:
+        commanded = np.column_stack([np.zeros((len(commanded), 2)), commanded])
+    grasp = Grasp(mass_kg, friction, np.full(len(commanded), grip_n))
+    return carry(grasp, commanded, rate_hz=rate_hz)
+
+
+def _slide(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None, step_s: float) -> Floats:
+    """Return force x and z, displacement x and z, velocity x and z, and state (time, 7).
+
+    The state is 0 in stick or before contact, 1 in slip and 2 once dropped. A loop over plain numbers: which state a row
+    is in hangs on the row before.
+    """
+    rows = len(acceleration_m_s2)
+    moves = np.zeros((rows, 7))
+    if not (grasp.grip_n > 0).any():
+        return moves
+    first = int((grasp.grip_n > 0).argmax())
+    mass, rate = grasp.mass_kg, step_s / grasp.mass_kg
+    damping = 2 * math.sqrt(STIFFNESS_N_M * mass)
+    yielding = 1 / (1 + rate * damping + rate * step_s * STIFFNESS_N_M)
+    pull_x = (mass * acceleration_m_s2[:, 0]).tolist()
+    pull_z = (mass * (acceleration_m_s2[:, 2] + GRAVITY_M_S2)).tolist()
+    limits = grasp.limit_n.tolist()
+    rises = rise_m.tolist() if rise_m is not None else [1.0] * rows
+    sx = sz = vx = vz = 0.0  # displacement by slip and relative velocity
+    borne = min(max(rises[first] / TABLE_M, 0.0), 1.0)
+    ex, ez = -pull_x[first] / STIFFNESS_N_M, -pull_z[first] * borne / STIFFNESS_N_M  # deflection of the spring
+    slipping = False
+    found = []
+    for row in range(first, rows):
+        borne = min(max((rises[row] + sz) / TABLE_M, 0.0), 1.0)
+        dx, dz, limit = pull_x[row], pull_z[row] * borne, limits[row]
+        if not slipping:
+            vx = (vx - rate * (STIFFNESS_N_M * ex + dx)) * yielding
+            vz = (vz - rate * (STIFFNESS_N_M * ez + dz)) * yielding
+            ex, ez = ex + step_s * vx, ez + step_s * vz
+            fx, fz = -STIFFNESS_N_M * ex - damping * vx, -STIFFNESS_N_M * ez - damping * vz
+            slipping = (ex * ex + ez * ez) * STIFFNESS_N_M**2 > limit * limit
+        if slipping:
+            free_x, free_z = vx - rate * dx, vz - rate * dz
+            speed, braked = (free_x**2 + free_z**2) ** 0.5, rate * KINETIC * limit
+            if speed <= braked:
+                slipping, vx, vz, fx, fz = False, 0.0, 0.0, dx, dz
+                ex, ez = -dx / STIFFNESS_N_M, -dz / STIFFNESS_N_M
+            else:
+                vx, vz = free_x * (1 - braked / speed), free_z * (1 - braked / speed)
+                fx, fz = -KINETIC * limit * free_x / speed, -KINETIC * limit * free_z / speed
+                sx, sz = sx + step_s * vx, sz + step_s * vz
+                if sx * sx + sz * sz > DROP_M**2:
+                    break
+        found.append((fx, fz, sx, sz, vx if slipping else 0.0, vz if slipping else 0.0, float(slipping)))
+    moves[first : first + len(found)] = found
+    if first + len(found) < rows:
+        fall = _fall(acceleration_m_s2[first + len(found) :], rises[first + len(found) :], (sx, sz), (vx, vz), step_s)
+        moves[first + len(found) :, 2:6] = fall
+        moves[first + len(found) :, 6] = 2
+    return moves
+
+
+def _fall(
+    acceleration_m_s2: Floats,
+    rises: list[float],
+    displacement_m: tuple[float, float],
+    velocity_m_s: tuple[float, float],
+    step_s: float,
+) -> Floats:
+    """Return displacement x and z and velocity x and z of an object let go (time, 4), until it lands and then lies."""
+    velocity = np.array(velocity_m_s) - np.cumsum(acceleration_m_s2[:, ::2] + [0.0, GRAVITY_M_S2], axis=0) * step_s
+    displacement = np.array(displacement_m) + np.cumsum(velocity, axis=0) * step_s
+    height = np.array(rises)
+    landed = height + displacement[:, 1] <= 0
+    if landed.any():
+        row = int(landed.argmax())
+        displacement[row:, 1] = -height[row:]
+        displacement[row:, 0] = displacement[row, 0]
+        velocity[row:] = 0.0
+        velocity[row + 1 :, 1] = -np.diff(height[row:]) / step_s
+    return np.column_stack([displacement, velocity])
+
+
+def _twist(grasp: Grasp, force_n: Floats, held: Flags, step_s: float) -> tuple[Floats, Floats]:
+    """Return torque about y and rotation of the object against the fingers (time,).
+
+    The centre of mass hangs ``lever_m`` beside the grasp at angle 0 and swings down as the object turns; friction holds
+    it up to the limit of the soft fingers, and brakes it beyond. Once the object is dropped, the angle stays.
+    """
+    rows = len(force_n)
+    torques, angles = np.zeros(rows), np.zeros(rows)
+    if not grasp.lever_m:
+        return torques, angles
+    rate = step_s / (grasp.mass_kg * (GYRATION_M**2 + grasp.lever_m**2))
+    limits = (2 * (2 / 3) * grasp.friction * grasp.grip_n * PATCH_M).tolist()
+    force_x, force_z = force_n[:, 0].tolist(), force_n[:, 2].tolist()
+    angle = speed = 0.0
+    for row in range(int(held.sum())):
+        demand = grasp.lever_m * (force_z[row] * math.cos(angle) - force_x[row] * math.sin(angle))
+        limit, torque = limits[row], demand
+        if speed or abs(demand) > limit:
+            free, braked = speed + rate * demand, rate * KINETIC * limit
+            if abs(free) > braked:
+                speed = free - math.copysign(braked, free)
+                torque = math.copysign(KINETIC * limit, free)
+            else:
+                speed = 0.0
+            angle += step_s * speed
+        torques[row], angles[row] = torque, angle
+    angles[int(held.sum()) :] = angle
+    return torques, angles

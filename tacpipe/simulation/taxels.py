@@ -1,0 +1,155 @@
+"""The skin of a finger: how a 4x4 grid of taxels shares out what presses and pulls at it, and what it counts.
+
+A Gaussian centred where the object touches shares the pressure; the object's displacement and a torque move it. Shear is
+elastic: the object moves the skins of both fingers by one and the same length, each taxel pulls back in proportion, up
+to mu times its pressure, and what the capped ones cannot bear the others do. So slip starts at the rim, where the
+pressure is least, and is complete where the object slips. The history of partial slip (Cattaneo and Mindlin) is left out.
+Pressure also bulges the skin outwards, by forces that add up to nothing.
+
+A count is ``base + C (f + q |f| f)`` with the neighbours' cross-talk, drift and noise, rounded; a share of the pressure
+in f follows late (creep). C (axis, axis) is a matrix a taxel. Without drift and noise `forces` gives f back.
+
+Axes: a taxel's x is the hand's x, its y the hand's z, its z the pressure. Taxels are numbered row by row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.formats import channels
+
+Floats = NDArray[np.float64]
+
+PITCH_M = 0.0047  # of the taxels; an assumption
+PAD_M = 2 * PITCH_M  # half the width of a pad: the centre of what presses on it stays within
+PLACES_M = np.stack(np.meshgrid(*[(np.arange(4) - 1.5) * PITCH_M] * 2, indexing="ij"), axis=-1).reshape(
+    -1, 2
+)  # (taxel, 2)
+SIGMA_M = (0.004, 0.006)  # of the Gaussian that shares the pressure
+CENTRE_M = 0.003  # largest distance of its centre from the pad's, along either axis
+TWIST_M_NM = 0.02  # by which a torque shifts it
+GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)  # x, y, z; with `BULGE` set for the spread of the published recordings
+OFF_AXIS = 0.05  # of a force that shows on the other axes
+QUADRATIC_N = 0.03  # q as a share of the gain, at one newton
+CROSSTALK = 0.08  # of a taxel's signal that its four neighbours see
+CREEP, CREEP_S = 0.03, 0.5  # share of the pressure that follows late, and how late
+BULGE = 0.4  # of a taxel's pressure that pushes it outwards, for each pitch that it is off the centre
+BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)  # at rest, as the published recordings have it
+BASE_SPREAD_COUNT = 300.0
+DRIFT_COUNT = 2.0  # random walk, counts after one second
+NOISE_COUNT = (1.35, 1.15, 3.4)  # x, y, z; standard deviation of second differences / sqrt(6), quiet xela-psc frames
+
+
+@dataclass(frozen=True)
+class Skin:
+    """One finger's taxels and how the object lies on them."""
+
+    centre_m: Floats  # (2,), where the object touches before it moves
+    sigma_m: float
+    gain_count_n: Floats  # C (taxel, axis, axis)
+    base_count: Floats  # (taxel, axis)
+
+
+def skin(rng: np.random.Generator) -> Skin:
+    """Return a random skin."""
+    mixing = np.eye(3) + OFF_AXIS * rng.uniform(-1, 1, (channels.TAXELS, 3, 3))
+    base = np.array(BASE_COUNT) + rng.uniform(-BASE_SPREAD_COUNT, BASE_SPREAD_COUNT, (channels.TAXELS, 3))
+    centre = rng.uniform(-CENTRE_M, CENTRE_M, 2)
+    return Skin(centre, float(rng.uniform(*SIGMA_M)), mixing * np.array(GAIN_COUNT_N)[:, None], base)
+
+
+def shares(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
+    """Return the share of the normal force that each taxel bears (time, taxel); they add up to one.
+
+    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it.
+    """
+    moved = one.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
+    centre = PAD_M * np.tanh(moved / PAD_M)
+    distance2 = ((PLACES_M - centre[:, None]) ** 2).sum(axis=2)
+    share = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * one.sigma_m**2))
+    whole: Floats = share / share.sum(axis=1, keepdims=True)
+    return whole
+
+
+def shear(cap_n: Floats, load_n: Floats) -> Floats:
+    """Return the shear of each taxel (time, taxel, 2) that together carry ``load_n`` (time, 2).
+
+    Each bears as much as the next, up to its cap (time, taxel). Where all are capped, they share in proportion to it.
+    """
+    total = np.linalg.norm(load_n, axis=1)
+    ordered = np.sort(cap_n, axis=1)
+    taxels = cap_n.shape[1]
+    below = np.cumsum(ordered, axis=1) - ordered  # what the taxels of smaller cap bear if they are capped
+    level = (total[:, None] - below) / (taxels - np.arange(taxels))  # of the rest, were this one not capped
+    fits = level <= ordered  # the first taxel of which this is so is not capped, nor are those behind it
+    borne = np.minimum(cap_n, np.take_along_axis(level, fits.argmax(axis=1)[:, None], axis=1))
+    full = ~fits.any(axis=1)
+    borne[full] = cap_n[full]
+    borne[full] *= (total / np.maximum(cap_n.sum(axis=1), 1e-12))[full, None]
+    direction = load_n / np.maximum(total, 1e-12)[:, None]
+    pulled: Floats = borne[:, :, None] * direction[:, None]
+    return pulled
+
+
+def bulge(pressed_n: Floats) -> Floats:
+    """Return by how much pressure (time, taxel) pushes each taxel outwards (time, taxel, 2), nothing in sum."""
+    total = np.maximum(pressed_n.sum(axis=1, keepdims=True), 1e-12)
+    outwards = PLACES_M - (pressed_n @ PLACES_M / total)[:, None]
+    pushed: Floats = BULGE * pressed_n[:, :, None] * outwards / PITCH_M
+    return pushed
+
+
+def signal(one: Skin, force_n: Floats) -> Floats:
+    """Return the counts above base (time, taxel, axis) that a force on each taxel (time, taxel, axis) gives."""
+    bent = force_n + QUADRATIC_N * np.abs(force_n) * force_n
+    counts: Floats = np.einsum("mn,tna->tma", crosstalk(), np.einsum("tna,nba->tnb", bent, one.gain_count_n))
+    return counts
+
+
+def forces(one: Skin, counts: Floats) -> Floats:
+    """Return the force on each taxel (time, taxel, axis), N, that would give these counts without drift and noise."""
+    above = np.einsum(
+        "mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, channels.TAXELS, 3) - one.base_count
+    )
+    bent = np.einsum("tna,nba->tnb", above, np.linalg.inv(one.gain_count_n))
+    size = (np.sqrt(1 + 4 * QUADRATIC_N * np.abs(bent)) - 1) / (2 * QUADRATIC_N)
+    force: Floats = np.sign(bent) * size
+    return force
+
+
+def crosstalk() -> Floats:
+    """Return what of each taxel's signal each one sees (taxel, taxel)."""
+    row, column = np.divmod(np.arange(channels.TAXELS), 4)
+    apart = np.abs(row[:, None] - row) + np.abs(column[:, None] - column)
+    seen: Floats = np.eye(channels.TAXELS) + CROSSTALK * (apart == 1)
+    return seen
+
+
+def lagged(values: Floats, rate_hz: float) -> Floats:
+    """Return ``values`` (time,) after a first-order lag of `CREEP_S`, at rest in their first value."""
+    steps = np.arange(round(12 * CREEP_S * rate_hz))
+    kernel = np.exp(-steps / (CREEP_S * rate_hz))
+    kernel /= kernel.sum()
+    size = 1 << int(np.ceil(np.log2(len(values) + len(kernel))))
+    above = values - values[0]
+    late: Floats = values[0] + np.fft.irfft(np.fft.rfft(above, size) * np.fft.rfft(kernel, size), size)[: len(values)]
+    return late
+
+
+def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.Generator) -> Floats:
+    """Return noise and drift in counts (time, taxel, axis) of samples taken at ``at_s`` (time,)."""
+    shape = (len(at_s), channels.TAXELS, 3)
+    steps_s = np.diff(at_s, prepend=at_s[:1])
+    drift = np.cumsum(rng.normal(0, 1.0, shape) * np.sqrt(steps_s)[:, None, None], axis=0) * DRIFT_COUNT
+    noise = rng.normal(0, 1.0, shape) * NOISE_COUNT
+    off: Floats = noise * noise_scale + drift * drift_scale
+    return off
+
+
+def digitised(counts: Floats) -> NDArray[np.uint16]:
+    """Return counts (time, taxel, axis) as the device sends them (time, channel): rounded, within 16 bits."""
+    whole: NDArray[np.uint16] = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
+    return whole

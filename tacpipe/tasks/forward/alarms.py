@@ -1,0 +1,118 @@
+"""Whether predictors warn of a change of load before it begins: alarms set on one part, counted on another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.signals import anticipation
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Told
+from tacpipe.tasks.forward.tracks import Track
+
+Floats = NDArray[np.floating[Any]]
+Layout = Sequence[Mapping[str, str]]
+
+WATCHED = (MODEL, BASELINE, "damped_trend", "last_value_linear", "ridge", "ridge_actions")
+
+
+@dataclass
+class Loads:
+    """The mean count of each sensor's axes on all rows, and what was said of it at the last step of the horizon."""
+
+    layout: Layout
+    horizon: int
+    truth: list[Floats] = field(default_factory=list)  # (time, feature) each
+    groups: list[NDArray[np.int64]] = field(default_factory=list)
+    ahead: dict[str, list[Floats]] = field(default_factory=dict)
+    steps_s: list[float] = field(default_factory=list)
+
+    def begin(self, track: Track) -> None:
+        """Add the rows of a recording, of which nothing has been said yet."""
+        truth = self._loads(track.tactile)
+        offset = max((int(one[-1]) + 1 for one in self.groups if len(one)), default=0)
+        self.truth.append(np.where(track.usable[:, None], truth, np.nan))
+        self.groups.append(track.groups + offset)
+        if len(track.t_ns) > 1:
+            self.steps_s.append(float(np.median(np.diff(track.t_ns))) / 1e9)
+        for name in WATCHED:
+            self.ahead.setdefault(name, []).append(np.full_like(truth, np.nan))
+
+    def add(self, some: Told) -> None:
+        """Note what was said of some windows of the recording that was begun last."""
+        for name, prediction in some.predictions.items():
+            if name in WATCHED:
+                self.ahead[name][-1][some.now] = self._loads(prediction.count[:, -1])
+
+    def calibrated(self) -> dict[str, Any]:
+        """Return each load's usual change and, by predictor, the alarm levels that give a false alarm a minute."""
+        if not self.truth:
+            return {}
+        truth, groups = np.concatenate(self.truth), np.concatenate(self.groups)
+        sd = anticipation.difference_sd(truth, groups, horizon=self.horizon)
+        theta = {
+            name: anticipation.calibrate(
+                truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self._rate_hz()
+            ).tolist()
+            for name, ahead in self._said()
+        }
+        # JSON holds no infinity: a level that is never reached says the same
+        levels = {name: [value if math.isfinite(value) else None for value in values] for name, values in theta.items()}
+        return {"sd": sd.tolist(), "theta": levels}
+
+    def scored(self, levels: Mapping[str, Any]) -> dict[str, dict[str, float | int | None]]:
+        """Return how each predictor foretold changes with the ``levels`` that `calibrated` gave."""
+        if not levels or not self.truth:
+            return {}
+        truth, groups, sd = np.concatenate(self.truth), np.concatenate(self.groups), np.array(levels["sd"])
+        found = {}
+        for name, ahead in self._said():
+            if name not in levels["theta"]:
+                continue
+            theta = np.array([math.inf if value is None else value for value in levels["theta"][name]])
+            score = anticipation.score(
+                truth,
+                ahead,
+                groups,
+                horizon=self.horizon,
+                sd=sd,
+                theta=theta,
+                rate_hz=self._rate_hz(),
+                held=self._held(truth),
+            )
+            found[name] = {key: _number(value) for key, value in asdict(score).items()}
+        return found
+
+    def _said(self) -> list[tuple[str, Floats]]:
+        joined = {name: np.concatenate(parts) for name, parts in self.ahead.items()}
+        return [(name, values) for name, values in joined.items() if np.isfinite(values).any()]
+
+    def _rate_hz(self) -> float:
+        return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
+
+    def _held(self, truth: Floats) -> NDArray[np.bool_]:
+        held = np.zeros(len(truth), dtype=bool)
+        held[1:] = (truth[1:] == truth[:-1]).all(axis=1)
+        return held
+
+    def _loads(self, counts: Floats) -> Floats:
+        """Return the mean of each sensor's axes (time, feature) of ``counts`` (time, channel)."""
+        places = [(one.get("stream", ""), one.get("axis", "")) for one in self.layout]
+        return np.stack(
+            [
+                counts[:, [index for index, place in enumerate(places) if place == wanted]].mean(axis=1)
+                for wanted in dict.fromkeys(places)
+            ],
+            axis=1,
+        )
+
+
+def _number(value: float | int) -> float | int | None:
+    """Return ``value`` to 9 digits, None where it is not finite."""
+    if isinstance(value, int):
+        return value
+    return float(f"{value:.9g}") if math.isfinite(value) else None

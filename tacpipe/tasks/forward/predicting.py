@@ -1,0 +1,62 @@
+"""What a forecaster says of recordings, without a word on whether it came true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Recording, Result
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.judging import check_rate
+from tacpipe.tasks.forward.predictors import MODEL, told
+from tacpipe.tasks.forward.training import check_codec
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Floats = NDArray[np.floating[Any]]
+
+
+def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int]) -> Result:
+    """Return a table a recording: when each prediction was known, and each channel's counts above rest ``steps`` later.
+
+    Columns are named like ``xela1_taxel01_z_t5``. Raises `TacpipeError` for a step that the model does not reach and
+    where the recordings are not what it reads.
+    """
+    forecaster = Forecaster.load(model)
+    for step in steps:
+        if not 1 <= step <= forecaster.horizon:
+            raise TacpipeError(
+                f"The model tells 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
+            )
+    check_codec(model, recordings.files)
+    found = {}
+    for name, shard in sorted(recordings.shards.items()):
+        track = tracks.track(shard, forecaster.codec)
+        check_rate(track, forecaster)
+        starts = track.starts(forecaster.context, forecaster.horizon)
+        parts: list[Floats] = [np.zeros((0, len(steps), len(forecaster.codec.channels)))]
+        wanted = [step - 1 for step in steps]
+        parts += [some.predictions[MODEL].count[:, wanted] for some in told(forecaster, track, starts)]
+        found[name] = Recording(
+            _table(forecaster, track.t_ns[starts + forecaster.context - 1], np.concatenate(parts), steps)
+        )
+    return Result(found)
+
+
+def _table(forecaster: Forecaster, t_ns: NDArray[np.int64], counts: Floats, steps: Sequence[int]) -> pa.Table:
+    """Return the table of predicted ``counts`` (window, step, channel)."""
+    fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
+    columns: list[Any] = [pa.array(t_ns)]
+    for channel, name in enumerate(forecaster.codec.channels):
+        for index, step in enumerate(steps):
+            about = {"quantity": "prediction", "unit": "count", "step": str(step), **forecaster.codec.layout[channel]}
+            fields.append(pa.field(f"{name}_t{step}", pa.float32(), metadata=about))
+            columns.append(pa.array(counts[:, index, channel].astype(np.float32)))
+    return pa.Table.from_arrays(columns, schema=pa.schema(fields))

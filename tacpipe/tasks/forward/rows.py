@@ -1,0 +1,100 @@
+"""The rows of several recordings one after the other as tensors, from which windows are picked by index."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models import windows as windows_of
+from tacpipe.models.windows import Windows
+from tacpipe.tasks.forward.tracks import Track
+from tacpipe.training import loop
+
+Floats = NDArray[np.floating[Any]]
+
+ACTIONS = ("planned", "none", "shuffled")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Touch and arm of all rows, and where windows begin."""
+
+    touch: Tensor  # (time, feature)
+    arm: Tensor  # (time, 13)
+    finger: Tensor  # (time,)
+    tactile: Floats  # (time, channel), counts above rest
+    starts: Tensor  # (window,)
+    context: int
+    horizon: int
+    actions: str = "planned"
+
+    @property
+    def part(self) -> loop.Part:
+        """What the training loop reads."""
+        return loop.Part(len(self.starts), self.loss)
+
+    def pick(self, starts: Tensor) -> tuple[Windows, Tensor]:
+        """Return the windows that begin at ``starts`` (window,) and their touch to come (horizon, window, feature)."""
+        steps = torch.arange(self.context + self.horizon, device=starts.device)
+        rows = steps[:, None] + starts  # (row, window)
+        touch, arm = (one.index_select(0, rows.flatten()).view(*rows.shape, -1) for one in (self.touch, self.arm))
+        picked = Windows(touch[: self.context], arm, self.finger[rows[: self.context]])
+        return picked, touch[self.context :]
+
+    def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
+        """Return the mean loss of the windows with these indices."""
+        picked, ahead = self.pick(self.starts[indices.to(self.starts.device)])
+        lost: Tensor = model.loss(acted(picked, self.actions), ahead)  # type: ignore[operator]
+        return lost
+
+    def some(self, most: int) -> Tensor:
+        """Return at most ``most`` starts, evenly spread."""
+        return self.starts[:: max(1, -(-len(self.starts) // most))]
+
+
+def rows(
+    tracks: Sequence[Track],
+    starts: Sequence[NDArray[np.int64]],
+    context: int,
+    horizon: int,
+    *,
+    actions: str = "planned",
+    device: str = "cpu",
+) -> Rows:
+    """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track."""
+    if actions not in ACTIONS:
+        raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
+    offsets = np.cumsum([0] + [len(one.t_ns) for one in tracks])
+
+    def stacked(name: str, width: tuple[int, ...]) -> Floats:
+        return np.concatenate([np.zeros((0, *width), np.float32)] + [getattr(one, name) for one in tracks])
+
+    features = tracks[0].latent.shape[1:] if tracks else (0,)
+    channels = tracks[0].tactile.shape[1:] if tracks else (0,)
+    begins = [one + offset for one, offset in zip(starts, offsets, strict=False)]
+    touch, arm, finger = (
+        torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)).to(device)
+        for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
+    )
+    first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
+    return Rows(touch, arm, finger, stacked("tactile", channels), first, context, horizon, actions)
+
+
+def acted(windows: Windows, actions: str) -> Windows:
+    """Return the windows with the plan that a model trained on ``actions`` is told.
+
+    ``shuffled`` deals the plans out among the windows by torch's generator: the negative control.
+    """
+    if actions == "none":
+        return windows_of.without_plan(windows)
+    if actions == "shuffled":
+        count = windows.touch.shape[1]
+        return windows_of.with_plans_of(windows, torch.randperm(count).to(windows.touch.device))
+    return windows

@@ -1,0 +1,224 @@
+"""How a forecaster comes about: from recordings and params to the files of a model."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_arrays
+from safetensors.torch import save as save_tensors
+from torch import nn
+
+from tacpipe.codecs import codec as codecs
+from tacpipe.errors import TacpipeError
+from tacpipe.models.linear import Baselines
+from tacpipe.models.windows import motion
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.forecaster import BASELINES, CONFIG, TASK, WEIGHTS, Config, Forecaster, network
+from tacpipe.tasks.forward.predictors import told
+from tacpipe.tasks.forward.rows import Rows, rows
+from tacpipe.tasks.forward.tracks import Track
+from tacpipe.training import loop
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Floats = NDArray[np.floating[Any]]
+
+HISTORY = "history.jsonl"
+CALIBRATED = 16_384  # windows that scales are fitted on, evenly spread: they overlap, so hardly a row is left out
+LINEAR = 20_000  # windows that the linear baselines are fitted on
+
+
+def train(
+    params: Mapping[str, Any],
+    training: Dataset,
+    validation: Dataset,
+    workspace: Path,
+    init: Mapping[str, bytes] | None = None,
+) -> dict[str, bytes]:
+    """Return the files of a model trained on ``training`` and stopped by its error on ``validation``.
+
+    ``params`` are those of the stage `train.forward`. Scales and baselines are fitted on the training recordings alone,
+    or scales taken over from the model ``init`` with its weights. Raises `TacpipeError` where recordings lack columns
+    or windows, and where ``init`` has another shape or codec.
+    """
+    if not training.shards:
+        raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
+    codec = tracks.codec_of(next(iter(training.shards.values())).table(), training.files)
+    parts = [
+        [tracks.track(shard, codec) for _, shard in sorted(dataset.shards.items())]
+        for dataset in (training, validation)
+    ]
+    rate_hz = tracks.rate_hz([one for part in parts for one in part])
+    start = _start(init, params, codec, training.files) if init else None
+    reference = start.orientation if start else _reference([one.arm[one.usable, 3:7] for one in parts[0]])
+    parts = [[dataclasses.replace(one, arm=tracks.aligned(one.arm, reference)) for one in part] for part in parts]
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    known, watched = (
+        _windows(part, params, stride, device) for part, stride in zip(parts, (params["stride"], 1), strict=True)
+    )
+    _check_channels(codec, parts[0])
+
+    def build() -> nn.Module:
+        model = network(params, codec).to(device)
+        if start:
+            model.load_state_dict(start.model.state_dict())
+        elif len(known.starts):
+            model.calibrate(*known.pick(known.some(CALIBRATED)))  # type: ignore[operator]
+        return model
+
+    schedule = loop.Schedule(**{field.name: params[field.name] for field in dataclasses.fields(loop.Schedule)})
+    trained = loop.train(build, known.part, watched.part, schedule, workspace)
+    best = min(trained.history, key=lambda line: line["val_loss"])
+    config: Config = {
+        "task": TASK,
+        "architecture": params["architecture"],
+        "params": dict(params),
+        "codec": _told(codec),
+        "context": params["context"],
+        "horizon": params["horizon"],
+        "rate_hz": rate_hz,
+        "timeline": parts[0][0].timeline,
+        "inputs": {
+            "tactile": list(codec.channels),
+            "layout": [dict(one) for one in codec.layout],
+            "orientation_reference": reference.tolist(),
+        },
+        "scaling": _scaling(parts[0]),
+        "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
+        "trained_on": _trained_on((training, validation), start),
+        "objects": sorted({one.object for one in parts[0] if one.object is not None}),
+        "counts": {
+            name: {"recordings": len(part), "windows": len(one.starts)}
+            for name, part, one in zip(("train", "val"), parts, (known, watched), strict=True)
+        },
+    }
+    files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
+    if params["baselines"]:
+        linear = Baselines.fit(_linear(known), _linear(watched))
+        config["baselines"] = linear.chosen
+        files[BASELINES] = save_arrays({name: np.ascontiguousarray(one) for name, one in linear.to_tensors().items()})
+    files |= {WEIGHTS: save_tensors(trained.weights), CONFIG: _json(config)}
+    if params["baselines"]:
+        config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
+    return {
+        **files,
+        CONFIG: _json(config),
+        HISTORY: trained.history_lines,
+    }
+
+
+def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
+    """Return the levels of alarms, set on the validation recordings."""
+    loads = Loads(forecaster.codec.layout, forecaster.horizon)
+    for track in part:
+        loads.begin(track)
+        for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            loads.add(some)
+    return loads.calibrated()
+
+
+def _json(config: Config) -> bytes:
+    return (json.dumps(config, indent=1, sort_keys=True) + "\n").encode()
+
+
+def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:
+    """Refuse latents that another codec made than the model's."""
+    if codecs.TENSORS in model and codecs.TENSORS in recordings and model[codecs.TENSORS] != recordings[codecs.TENSORS]:
+        kind = json.loads(model[codecs.DESCRIPTION])["kind"]
+        raise TacpipeError(
+            "The recordings' latents were made with another codec than the model's, so they mean something else. "
+            f"Run `tacpipe compress {kind} --codec` with the latents that the model was trained on."
+        )
+
+
+def _windows(part: Sequence[Track], params: Mapping[str, Any], stride: int, device: str) -> Rows:
+    """Return the rows of a part and its windows, all or those in contact."""
+    context, horizon, chosen = params["context"], params["horizon"], params["windows"]
+    if chosen not in ("all", "contact"):
+        raise TacpipeError(f"There are no windows {chosen!r}; there are all and contact.")
+    starts = [getattr(one, "starts" if chosen == "all" else "contact_starts")(context, horizon, stride) for one in part]
+    return rows(part, starts, context, horizon, actions=params["actions"], device=device)
+
+
+def _linear(part: Rows) -> tuple[Floats, Floats, Floats]:
+    """Return past touch (window, context, channel), motion (window, row, 12) and touch to come, for the baselines."""
+    starts = part.some(LINEAR)
+    at = starts.cpu().numpy()[:, None]
+    past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)
+    moved = motion(part.pick(starts)[0])[0].transpose(0, 1).cpu().numpy()
+    return part.tactile[past], moved, part.tactile[ahead]
+
+
+def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
+    """Refuse training recordings in which no channel ever moves: there is nothing to predict."""
+    if any(one.usable.any() for one in part) and all(not one.tactile[one.usable].any() for one in part):
+        raise TacpipeError(
+            f"None of the {len(codec.channels)} tactile channels ever moves in {len(part)} training recordings. "
+            "Check the sensor, and that the recordings hold contact."
+        )
+
+
+def _scaling(part: Sequence[Track]) -> dict[str, list[float]]:
+    """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
+    latent = np.concatenate([one.latent[one.usable] for one in part])
+    tactile = np.concatenate([one.tactile[one.usable] for one in part])
+    half, spread = np.ptp(latent.astype(np.float64), axis=0) / 2, tactile.std(axis=0)
+    return {
+        "feature_half": np.where(half > 0, half, 1.0).tolist(),
+        "channel_count": np.where(spread > 0, spread, 1.0).tolist(),
+    }
+
+
+def _told(codec: codecs.Codec) -> dict[str, Any]:
+    """Return what a reader wants to know of a codec, and a short name for it."""
+    frames, latents = int(getattr(codec, "frames", 1)), len(codec.latents)
+    name = {"raw": "raw", "pca": f"PCA-{latents}", "autoencoder": f"AE-C{frames}-{latents}"}.get(codec.kind, codec.kind)
+    if codec.of != "levels":
+        name = f"{name} {codec.of}"
+    return {"kind": codec.kind, "of": codec.of, "frames": frames, "latents": latents, "name": name}
+
+
+def _reference(quaternions: Sequence[Floats]) -> Floats:
+    """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
+    return next((one[0].astype(np.float64) for one in quaternions if len(one)), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str, str]:
+    """Return the digests of all recordings that the model has seen by name, those of the one it began with included."""
+    digests = {shard.name: shard.digest for part in parts for shard in part.shards.values()}
+    before = (
+        {f"{name} of the model before": digest for name, digest in start.config["trained_on"].items()} if start else {}
+    )
+    return {**{name: digest for name, digest in before.items() if digest not in digests.values()}, **digests}
+
+
+def _start(
+    init: Mapping[str, bytes], params: Mapping[str, Any], codec: codecs.Codec, recordings: Mapping[str, bytes]
+) -> Forecaster:
+    """Return the model to begin with. Raises `TacpipeError` where it does not fit what is to be trained."""
+    start = Forecaster.load(init)
+    for name in ("architecture", "hidden", "context", "horizon"):
+        found = start.config["params"][name]
+        if found != params[name]:
+            raise TacpipeError(
+                f"The model of --init has {name} {found} and the one to train {params[name]}; they must be equal. "
+                f"Give --{name} {found}, or begin without --init."
+            )
+    told, wanted = start.config["codec"]["name"], _told(codec)["name"]
+    if told != wanted:
+        raise TacpipeError(
+            f"The model of --init reads {told} and the recordings hold {wanted}, so its weights mean something else. "
+            "Give recordings of the same representation, or begin without --init."
+        )
+    check_codec(init, recordings)
+    codecs.check_channels(start.codec.channels, codec.channels)
+    return start

@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+import numpy as np
+
+from tacpipe.codecs import codec, pca
+
+CHANNELS = [f"c{index}" for index in range(6)]
+WALKS = np.cumsum(np.random.default_rng(2).normal(size=(4, 30, 6)), axis=1) * 20  # (window, time, channel)
+
+
+def latents_and_codec(of: str) -> tuple[np.ndarray, codec.Codec]:
+    levels = np.concatenate(WALKS)
+    rows = np.concatenate(np.diff(WALKS, axis=1)) if of == "increments" else levels
+    fitted = pca.fit(rows, CHANNELS, [], components=6, of=of)
+    return np.stack([fitted.encode(walk, CHANNELS) for walk in WALKS]), fitted
+
+
+def test_latents_of_increments_are_added_up_onto_the_last_frame() -> None:
+    latents, fitted = latents_and_codec("increments")
+    found = codec.decode_ahead(fitted, latents[:, 20:], WALKS[:, 19])
+    assert np.allclose(found, WALKS[:, 20:], atol=1e-2)
+
+
+def test_latents_of_levels_are_counts_whatever_the_last_frame_was() -> None:
+    latents, fitted = latents_and_codec("levels")
+    found = codec.decode_ahead(fitted, latents[:, 20:], np.full((4, 6), 1e6))
+    assert np.allclose(found, WALKS[:, 20:], atol=1e-2)
+
+
+def test_channels_themselves_are_levels_and_stay() -> None:
+    raw = codec.Raw(tuple(CHANNELS), ())
+    assert raw.of == "levels"
+    assert np.array_equal(raw.encode(WALKS[0], CHANNELS, np.ones(30, dtype=bool)), WALKS[0].astype(np.float32))
+    assert np.array_equal(codec.decode_ahead(raw, WALKS, WALKS[:, 0]), WALKS)
+
+
+def test_only_finite_rows_are_projected() -> None:
+    seen = []
+
+    def project(rows: np.ndarray) -> np.ndarray:
+        seen.append(rows)
+        return rows[:, :1]
+
+    found = codec.encode_finite(project, np.array([[1.0, 2.0], [np.nan, 3.0], [4.0, np.inf], [5.0, 6.0]]), 1)
+    assert np.array_equal(found, np.array([[1.0], [np.nan], [np.nan], [5.0]]), equal_nan=True)
+    assert np.array_equal(seen[0], [[1.0, 2.0], [5.0, 6.0]])

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tacpipe.codecs import stretches
+from tacpipe.errors import TacpipeError
+
+
+def by_hand(values: np.ndarray, begins: np.ndarray, of: str, frames: int) -> np.ndarray:
+    """Walk row by row with what a live reader would remember."""
+    told = []
+    held: list[np.ndarray] = []
+    before = values[0]
+    for row, begin in zip(values, begins, strict=True):
+        if begin:
+            held, before = [], row
+        now = row - before if of == "increments" else row
+        held = [*(held or [now] * frames), now][-frames:]
+        before = row
+        told.append(np.concatenate(held))
+    return np.array(told)
+
+
+@given(st.integers(0, 2**16), st.sampled_from(["levels", "increments"]), st.integers(1, 3))
+@settings(max_examples=40, deadline=None)
+def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, of: str, frames: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(12, 2))
+    begins = rng.random(12) < 0.3
+    begins[0] = True
+    assert np.allclose(stretches.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
+
+
+def test_later_rows_change_nothing_before_them() -> None:
+    values = np.random.default_rng(0).normal(size=(10, 3))
+    other = values.copy()
+    other[6:] += 100
+    for of in ("levels", "increments"):
+        for frames in (1, 2, 3):
+            one, two = (stretches.inputs(each, None, of, frames) for each in (values, other))
+            assert np.array_equal(one[:6], two[:6])
+            assert not np.array_equal(one[6:], two[6:])
+
+
+def test_a_stretch_begins_after_a_step_of_more_than_one_and_a_half_times_the_median() -> None:
+    t_ns = np.cumsum([0, 20, 20, 29, 20, 31, 20]).astype(np.int64) * 1_000_000
+    assert stretches.breaks(t_ns).nonzero()[0].tolist() == [0, 5]
+    assert stretches.breaks(t_ns[:1]).tolist() == [True]
+    assert stretches.breaks(t_ns[:0]).tolist() == []
+
+
+def test_no_rows_give_no_inputs_of_the_right_width() -> None:
+    assert stretches.inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
+
+
+def test_another_kind_of_value_is_refused() -> None:
+    with pytest.raises(TacpipeError, match="of is 'speed'; a codec is fitted on levels or increments"):
+        stretches.inputs(np.zeros((2, 1)), None, "speed", 1)

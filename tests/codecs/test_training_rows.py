@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from tacpipe.codecs import training_rows
+from tacpipe.codecs.training_rows import TrainingRows
+from tests.stages.learning_fakes import CHANNELS, FakeShard, motion, table
+
+
+def read(*shards: FakeShard, of: str = "levels", frames: int = 1) -> TrainingRows:
+    return training_rows.read({shard.name: shard for shard in shards}, of, frames)  # type: ignore[misc]
+
+
+def counts(rows: int = 20, seed: int = 0) -> np.ndarray:
+    found: np.ndarray = np.random.default_rng(seed).integers(-500, 500, (rows, len(CHANNELS))).astype(float)
+    return found
+
+
+def test_rows_outside_of_contact_in_gaps_and_not_finite_are_left_out() -> None:
+    values = counts()
+    torn = values.copy()
+    torn[7, 3] = np.nan
+    contact, gap = np.zeros(20), np.zeros(20, dtype=bool)
+    contact[:4], gap[12] = -1, True
+    found = read(FakeShard("a", table(torn, contact=contact, gap=gap))).inputs["a"]
+    assert np.allclose(found, np.delete(values, [0, 1, 2, 3, 7, 12], axis=0))
+
+
+def test_a_frame_before_contact_counts_and_one_in_a_gap_leaves_out_what_is_made_of_it() -> None:
+    values = counts()
+    contact, gap = np.zeros(20), np.zeros(20, dtype=bool)
+    contact[:4], gap[12] = -1, True
+    shard = FakeShard("a", table(values, contact=contact, gap=gap))
+    steps = read(shard, of="increments").inputs["a"]
+    kept = [row for row in range(4, 20) if row not in (12, 13)]
+    assert np.allclose(steps, np.diff(values, axis=0, prepend=values[:1])[kept])
+    pairs = read(shard, frames=3).inputs["a"]
+    kept = [row for row in range(4, 20) if row not in (12, 13, 14)]
+    assert np.allclose(pairs, np.hstack([np.roll(values, lag, axis=0) for lag in (2, 1, 0)])[kept])
+
+
+def test_a_table_without_contacts_counts_whole() -> None:
+    content = table(counts())
+    assert len(read(FakeShard("a", content.drop_columns(["contact"]))).inputs["a"]) == 20
+
+
+def test_held_out_recordings_are_always_the_same_and_a_share_of_them() -> None:
+    names = [f"trial-{index:02d}" for index in range(20)]
+    rows = {name: counts(2, index) for index, name in enumerate(names)}
+    one = TrainingRows(tuple(CHANNELS), (), rows)
+    two = TrainingRows(tuple(CHANNELS), (), {name: rows[name] for name in reversed(names)})
+    assert one.held_out == two.held_out
+    assert len(one.held_out) == 3
+    train, val = one.parts
+    assert np.array_equal(val, np.concatenate([rows[name] for name in sorted(one.held_out)]))
+    assert len(train) + len(val) == 40
+
+
+@pytest.mark.parametrize(("recordings", "held"), [(1, 0), (2, 1), (3, 1), (7, 1), (13, 2)])
+def test_few_recordings_hold_out_one_and_a_single_one_none(recordings: int, held: int) -> None:
+    rows = TrainingRows(tuple(CHANNELS), (), {f"t{index}": counts(2) for index in range(recordings)})
+    assert len(rows.held_out) == held
+
+
+def test_channels_that_never_move_are_named_in_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    values = [counts(), counts(seed=1)]
+    for one in values:
+        one[:, 4] = 0.0
+    with caplog.at_level(logging.WARNING):
+        read(*(FakeShard(f"t{index}", table(one)) for index, one in enumerate(values)))
+    assert f"1 of 12 tactile channels never move in the training recordings: {CHANNELS[4]}." in caplog.text
+
+
+def test_channels_that_move_in_one_of_the_recordings_are_no_cause_for_a_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    still = counts()
+    still[:, 4] = 0.0
+    read(FakeShard("a", table(still)), motion(0))
+    assert caplog.text == ""

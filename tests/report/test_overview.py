@@ -1,0 +1,131 @@
+"""What the comparison of many results says."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from tacpipe.report import overview, tables
+from tacpipe.report.methods import Run
+from tacpipe.report.overview import Overview
+from tests.report.result_fakes import WINDOWS, errors, result
+from tests.report.test_comparison import RATIO
+
+
+def over(*results: Any) -> Overview:
+    return Overview([Run.read(one) for one in results])
+
+
+def cells(html: str, name: str) -> list[str]:
+    """The cells of the row that begins with ``name``, intervals left out."""
+    found = re.search(rf"<tr[^>]*><td>{re.escape(name)}</td>(.*?)</tr>", html)
+    assert found, name
+    return [re.sub(r"<br>.*", "", cell) for cell in re.findall(r"<td>(.*?)</td>", found[1])]
+
+
+def test_the_headline_names_the_best_method_the_papers_and_a_better_baseline() -> None:
+    sentences, word = overview.headline(over(result("raw", ratio=RATIO), result("PCA-20", ratio=2.0)))
+    assert len(sentences) == 2
+    assert sentences[0] == (
+        "On known objects, recurrent · raw is 69 % better than persistence: skill +0.688 (95 % interval +0.500 to "
+        "+0.750), averaged over t+1 and t+3; the paper's method, recurrent · PCA-20, "
+        "has skill −1.000 (95 % interval −1.000 to −1.000). In standardised channels, where shear counts as pressure "
+        "does, skill +0.688 (95 % interval +0.500 to +0.750)."
+    )
+    assert sentences[1].startswith("On unseen objects, recurrent · raw cannot be told from persistence: skill +0.000 (")
+    assert (
+        "No method is as good as the baseline ridge, which has skill +0.250 (95 % interval +0.250 to +0.250)."
+        in (sentences[1])
+    )
+    assert word == "unclear"
+
+
+def test_a_papers_method_that_is_best_is_not_told_twice() -> None:
+    sentences, word = overview.headline(over(result("PCA-20", 0), result("PCA-20", 1)))
+    assert "it is the paper's method" in sentences[0]
+    assert word == "better"
+
+
+def test_told_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:
+    results = [result("raw", seed, ratio=ratio) for seed, ratio in enumerate((0.5, 0.25, 0.375))]
+    results += [result("PCA-20", seed, ratio=2.0) for seed in range(2)]
+    told = over(*results).told_apart()
+    assert [(run.config["codec"]["name"], run.config["params"]["seed"]) for run in told] == [("raw", 2), ("PCA-20", 0)]
+
+
+def test_table_1_holds_the_papers_numbers_beside_ours_and_says_what_was_not_run() -> None:
+    html = tables.representations(over(result("PCA-20", 0), result("PCA-20", 1), result("PCA-8")).methods)
+    ours = ["0.0150\xa0±\xa00.0071", "1.0000\xa0±\xa00.0000", "1.0000\xa0±\xa00.0000", "2.0000\xa0±\xa00.0000", "0.5"]
+    assert cells(html, "PCA-20") == [*ours, "0.0298", "0.0363", "2"]
+    assert cells(html, "PCA-8") == ["0.0100", "1.0000", "1.0000", "2.0000", "0.5", "–", "–", "1"]
+    assert cells(html, "AE-C3") == ["–", "–", "–", "–", "–", "0.0405", "0.0510", "0"]
+    assert html.index("<td>AE-C3") > html.index("<td>PCA-8")
+
+
+def test_the_comparable_table_holds_errors_skill_and_what_they_rest_on() -> None:
+    found = over(result("raw", 0, ratio=RATIO), result("raw", 1, ratio=1.0), result("PCA-20", ratio=2.0))
+    html = tables.comparable(found.rows[True], found.steps, True)
+    # skills 0.6875 and 0 pool to 0.34375; MAE is twice the step times 0.65625, MSE the mean step times that
+    assert cells(html, "recurrent · raw") == [
+        *("+0.344", "0.486", "+0.344", "1.312", "3.938", "1.312", "1.312", "+0.344", "+0.344"),
+        *("2", "2", "40"),
+    ]
+    assert cells(html, "persistence") == [
+        *("+0.000", "0.000", "+0.000", "2", "6", "2", "2", "+0.000", "+0.000"),
+        *("2", "2", "40"),
+    ]
+    assert '<tr class="best"><td>recurrent · raw' in html
+
+
+def test_the_worth_of_the_plan_is_the_difference_to_a_model_without_it() -> None:
+    none = {name: ratio + 0.125 for name, ratio in RATIO.items()}
+    found = over(result("raw", ratio=RATIO), result("raw", ratio=none, params={"actions": "none"}), result("PCA-20"))
+    html = tables.actions(found.methods, found.steps, found.parts)
+    assert cells(html, "recurrent · raw") == ["+0.688", "–", "–", "+0.000", "–", "–", "1"]
+    assert cells(html, "… none") == ["+0.562", "+0.125", "+0.125", "−0.125", "+0.125", "+0.125", "1"]
+    assert "PCA-20" not in html
+    assert tables.actions(over(result("raw"), result("PCA-20")).methods, found.steps, found.parts) == ""
+
+
+def test_other_timelines_are_told_apart_from_the_main_one() -> None:
+    results = [result("raw", seed, ratio=RATIO) for seed in range(2)]
+    found = over(*results, result("raw", ratio=0.25, timeline="fresh", rate_hz=10.0))
+    assert found.timeline == "uniform"
+    assert [one.name for one in found.main] == ["recurrent · raw"]
+    html = tables.timelines(found.methods, found.steps, found.parts)
+    assert cells(html, "recurrent · raw · fresh")[:2] == ["100", "+0.750"]
+    assert cells(html, "recurrent · raw")[:2] == ["20", "+0.688"]
+    whole = overview.render(found, [], simulated=False)
+    assert "On the fresh timeline, whose steps last differently" in whole
+    assert "recurrent · raw is 69 % better" in whole
+
+
+def test_the_page_says_what_it_rests_on() -> None:
+    html = overview.render(over(result(seed=3), result(seed=11)), [], simulated=True)
+    for told in (
+        "2 recordings of known objects (40 windows) and 2 recordings of unseen objects (40 windows)",
+        "epochs 5; hidden 200; seed 3, 11",
+        "an arm that follows its plan perfectly",
+        "nothing here is evidence about a real sensor",
+        '<span class="badge">simulated</span>',
+        "<td>persistence</td><td>8</td><td>0</td>",  # anticipation: 4 events a run
+    ):
+        assert told in html
+
+
+def test_without_unseen_objects_only_known_ones_are_told() -> None:
+    known = [result(seed=seed) for seed in range(2)]
+    for one in known:
+        one.files["errors.parquet"] = errors({"model": dict.fromkeys(WINDOWS, 0.5)}, known=tuple(WINDOWS))
+    found = over(*known)
+    assert found.parts == [True]
+    assert len(overview.headline(found)[0]) == 1
+    best = found.best()
+    assert best is not None and best.name == "recurrent · PCA-20"
+
+
+def test_figures_5_and_6_are_drawn_from_the_papers_representations() -> None:
+    html = overview.render(over(result("PCA-20"), result("AE-C1-8"), result("raw")), [], simulated=False)
+    assert html.count("Predictions beside the truth") == 2
+    figure_6 = html[html.index("Figure 5 in the paper") :]
+    assert ">z01<" in figure_6 and ">z03<" in figure_6 and ">z00<" not in figure_6

@@ -1,0 +1,151 @@
+"""Clocks, holds and slips of the simulated rig, told from what its streams show, against what truly happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe.formats import channels
+from tacpipe.registry import load
+from tacpipe.simulation import faults, pick_and_move, taxels
+from tacpipe.stage import Attribute, Recording
+
+TRIALS = 20
+simulate, synchronize = load("simulate.forward"), load("synchronize")
+contacts, slips = load("segment.contacts"), load("segment.slips")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A recording that lies in memory, as a stage reads one."""
+
+    tables: dict[str, pa.Table]
+    name: str = "trial"
+    attributes: dict[str, Attribute] = field(default_factory=dict)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        return tuple(sorted(self.tables))
+
+    def table(self, stream: str = "") -> pa.Table:
+        return self.tables[stream]
+
+
+def recorded(trial: int, **rig: Any) -> Recording:
+    found: Recording = simulate(simulate.params(**rig), trial)
+    return found
+
+
+def synced(recording: Recording, **params: Any) -> Recording:
+    found: Recording = synchronize(synchronize.params(**params), Shard(recording.streams))
+    return found
+
+
+def labelled(trial: int, **rig: Any) -> pa.Table:
+    table = synced(recorded(trial, **rig)).streams[""]
+    return slips(slips.params(), Shard({"": contacts(contacts.params(), Shard({"": table}))}))
+
+
+def column(table: pa.Table, name: str) -> np.ndarray:
+    return np.asarray(table.column(name).to_numpy() > 0)
+
+
+@pytest.mark.parametrize(
+    ("rig", "least"),
+    [
+        ({"effort": 1.15}, 0.95),
+        ({"effort": 0.9, "grip_loss_probability": 1.0, "grip_loss": 0.3}, 0.95),
+        ({"effort": 1.15, "noise_scale": 5.0}, 0.80),
+    ],
+)
+def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], least: float) -> None:
+    tables = [labelled(trial, **rig) for trial in range(TRIALS)]
+    found = np.concatenate([column(table, "slip") for table in tables])
+    truth = np.concatenate([column(table, "gt_slip") for table in tables])
+    assert 2 * (found & truth).sum() / (found.sum() + truth.sum()) >= least
+
+
+def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
+    for trial in range(TRIALS):
+        table = labelled(trial, effort=1.15)
+        found, truth = column(table, "dropped"), column(table, "gt_dropped")
+        assert found.any() == truth.any()
+        assert abs(int(found.argmax()) - int(truth.argmax())) <= 2
+
+
+def test_where_nothing_slips_there_is_at_most_one_false_frame_a_minute() -> None:
+    tables = [labelled(trial, friction_scale=4.0) for trial in range(TRIALS)]
+    assert not any(column(table, "gt_slip").any() for table in tables)
+    minutes = sum(table.num_rows for table in tables) / 50 / 60
+    for name in ("slip", "slip_online", "dropped"):
+        assert sum(column(table, name).sum() for table in tables) <= minutes
+
+
+def test_the_offset_of_each_clock_is_known_to_a_fraction_of_a_sample() -> None:
+    half_ms = {"xela1": 10.0, "xela2": 10.0, "robot": 0.5, "proximity": 1.25}
+    for trial in range(TRIALS):
+        recording = recorded(trial)
+        found = synced(recording).attributes
+        for stream, limit_ms in half_ms.items():
+            offset_ms, true_ns = (
+                found[f"{stream}_clock_offset_ms"],
+                recording.attributes[f"gt_{stream}_clock_offset_ns"],
+            )
+            assert isinstance(offset_ms, float) and isinstance(true_ns, int)
+            assert abs(offset_ms + true_ns / 1e6) < 0.05 * limit_ms  # half a sample is asked for
+
+
+def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return how far the channels of each finger, then of the arm, lie from the truth on the grid, in units of its sd."""
+    rig = {"noise_scale": 0.0, "hold_probability": 0.0, "friction_scale": 4.0}
+    table = synced(recorded(trial, **rig), clock=clock).streams[""]
+    scene = pick_and_move.perform(0, trial, pick_and_move.Rig(**rig))  # type: ignore[arg-type]
+    true_ns = table.column("t_ns").to_numpy() - pick_and_move.START_NS - trial * pick_and_move.TRIAL_NS
+    fingers = []
+    for finger, skin in enumerate(scene.skins):
+        signal = taxels.signal(skin, pick_and_move.touch(scene, finger, true_ns)).reshape(len(true_ns), -1)
+        names = [name for name in table.column_names if name.startswith(f"xela{finger + 1}_taxel")]
+        counts = np.column_stack([table.column(name).to_numpy() for name in names])
+        apart = counts - np.asarray(skin.base_count).reshape(1, -1) - signal
+        fingers.append(np.abs(apart).ravel() / (signal - signal[0]).std())
+    arm = []
+    for i, axis in enumerate("xyz"):
+        path = np.interp(true_ns, scene.path.t_ns, scene.path.position_m[:, i])
+        if path.std() > 1e-3:  # an axis that moves
+            arm.append(np.abs(table.column(f"robot_position_{axis}_m").to_numpy() - path) / path.std())
+    return fingers, arm
+
+
+def test_on_the_grid_signals_are_within_a_percent_of_the_truth_and_by_arrival_they_are_not() -> None:
+    found = {clock: [errors(trial, clock) for trial in range(8)] for clock in ("auto", "arrival")}
+    fingers, arms = (
+        {clock: np.percentile(np.concatenate([e for both in of for e in both[i]]), 99) for clock, of in found.items()}
+        for i in (0, 1)
+    )
+    assert fingers["auto"] < 0.01
+    assert arms["auto"] < 0.0005
+    assert arms["arrival"] > 5 * arms["auto"]
+    assert fingers["arrival"] > fingers["auto"]
+
+
+def test_held_frames_are_found() -> None:
+    hits = found = held = 0
+    for trial, probability in ((0, 0.07), (1, 0.07), (2, 0.75)):
+        streams = dict(recorded(trial, hold_probability=0.0).streams)
+        kinds = [kind for kind in streams["xela1"].schema if "taxel" in kind.name]
+        counts = np.column_stack([streams["xela1"].column(kind.name).to_numpy() for kind in kinds])
+        counts, repeated = faults.hold(counts, probability, np.random.default_rng(trial))
+        first = streams["xela1"].select(["t_ns", "t_device_ns", "seq"])
+        again = channels.stream(first.column("t_ns").to_numpy(), counts.T, kinds)
+        for name in ("t_device_ns", "seq"):
+            again = again.append_column(first.schema.field(name), first.column(name))
+        table = synced(Recording({**streams, "xela1": again}), grid="logged").streams[""]
+        rows = np.searchsorted(first.column("seq").to_numpy(), table.column("xela1_seq").to_numpy())
+        marked = column(table, "xela1_held")
+        hits, found, held = hits + (marked & repeated[rows]).sum(), found + marked.sum(), held + repeated[rows].sum()
+    assert hits / found >= 0.99
+    assert hits / held >= 0.99

@@ -1,0 +1,204 @@
+"""What Python users get: counts to come from windows and plans, or a sentence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.signals import kinematics
+from tacpipe.tasks.forward import Forecaster, load, tracks
+from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.tasks.forward.trials import (
+    CONTEXT,
+    HORIZON,
+    LENGTH,
+    Floats,
+    asked,
+    compressed,
+    counts,
+    foretold,
+    panda,
+    poses,
+    trained,
+)
+
+TEST = motion(20)
+
+
+@pytest.fixture(scope="module")
+def latents() -> Mapping[str, Any]:
+    """Training recordings by what their latents stand for."""
+    return {of: compressed(*(motion(seed) for seed in range(3)), of=of) for of in ("levels", "increments")}
+
+
+@pytest.fixture(scope="module")
+def models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mapping[str, bytes]]:
+    """The files of models by architecture and representation."""
+    found: dict[str, Mapping[str, bytes]] = {}
+    for name in ("gru raw", "taxelwise raw", "recurrent raw", "gru levels", "recurrent levels", "gru increments"):
+        architecture, of = name.split()
+        training = latents.get(of)
+        watched = None if training is None else compressed(motion(10), files=training.files, of=of)
+        folder, fast = tmp_path_factory.mktemp("model"), {"learning_rate": 0.02, "epochs": 3}
+        found[name] = trained(folder, training, watched, architecture=architecture, **fast)
+    return found
+
+
+@pytest.fixture(scope="module")
+def forecaster(models: Mapping[str, Mapping[str, bytes]]) -> Forecaster:
+    return load(models["gru raw"])
+
+
+def windows(count: int = 3) -> tuple[Floats, Floats]:
+    """Random windows and plans with poses alone."""
+    rng = np.random.default_rng(0)
+    arm = np.concatenate([rng.normal(0, 0.1, (count, LENGTH, 3)), rng.normal(1, 0.05, (count, LENGTH, 4))], axis=-1)
+    arm[..., 3:] /= np.linalg.norm(arm[..., 3:], axis=-1, keepdims=True)
+    touch = rng.normal(0, 100, (count, CONTEXT, len(CHANNELS)))
+    return np.concatenate([touch, arm[:, :CONTEXT]], axis=-1), arm[:, CONTEXT:]
+
+
+NAMES = ("gru raw", "taxelwise raw", "recurrent raw", "gru levels", "recurrent levels")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_predict_says_what_is_judged(
+    name: str, models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
+) -> None:
+    made = load(models[name])
+    shard = TEST if "raw" in name else compressed(TEST, files=latents["levels"].files).shards[TEST.name]
+    found, starts, some = foretold(made, shard)
+    predicted = made.predict(*asked(found, starts))
+    assert predicted.shape == (72, HORIZON, len(CHANNELS))
+    assert predicted.dtype == np.float64
+    assert np.allclose(predicted, some.predictions["model"].count, atol=0.05)
+    assert np.abs(predicted - found.tactile[some.now][:, None]).max() > 5
+
+
+def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_window(
+    models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
+) -> None:
+    made = load(models["gru increments"])
+    shard = compressed(TEST, files=latents["increments"].files, of="increments").shards[TEST.name]
+    found, starts, some = foretold(made, shard)
+    predicted, wanted = made.predict(*asked(found, starts)), some.predictions["model"].count
+    # the first window begins where the recording does, so that nothing is lost
+    assert np.allclose(predicted[0], wanted[0], atol=0.05)
+    assert np.abs(predicted - wanted).mean() < 0.2 * np.abs(predicted - found.tactile[some.now][:, None]).mean()
+
+
+def test_one_window_needs_no_axis(forecaster: Forecaster) -> None:
+    window, plan = windows()
+    together = forecaster.predict(window, plan)
+    assert forecaster.predict(window[1], plan[1]).shape == (HORIZON, len(CHANNELS))
+    assert np.allclose(forecaster.predict(window[1], plan[1]), together[1], atol=1e-3)
+
+
+def test_velocities_that_are_left_out_are_differences_of_poses(forecaster: Forecaster) -> None:
+    window, plan = windows()
+    arm = np.concatenate([window[..., len(CHANNELS) :], plan], axis=1)
+    t_ns = np.arange(LENGTH) * 20_000_000
+    velocity = np.stack([kinematics.differences(t_ns, one[:, :3], one[:, 3:]) for one in arm])
+    finger = np.zeros((3, CONTEXT, 1))
+    whole = np.concatenate([window, velocity[:, :CONTEXT], finger], axis=-1)
+    told = forecaster.predict(whole, np.concatenate([plan, velocity[:, CONTEXT:]], axis=-1))
+    assert np.allclose(forecaster.predict(window, plan), told, atol=1e-3)
+
+
+def test_the_columns_that_it_names_are_those_that_it_reads(forecaster: Forecaster) -> None:
+    assert forecaster.window_columns == (*CHANNELS, *tracks.ARM, "robot_finger_m")
+    assert forecaster.plan_columns == tracks.ARM
+    assert (forecaster.context, forecaster.horizon, forecaster.actions) == (CONTEXT, HORIZON, "planned")
+
+
+@pytest.mark.parametrize("name", ["gru raw", "taxelwise raw", "recurrent raw"])
+def test_a_quaternion_s_sign_and_length_do_not_matter(name: str, models: Mapping[str, Mapping[str, bytes]]) -> None:
+    made, (window, plan) = load(models[name]), windows()
+    before = made.predict(window, plan)
+    turned = slice(len(CHANNELS) + 3, len(CHANNELS) + 7)
+    window[:, 1::2, turned] *= -1
+    plan[..., 3:] *= 2
+    assert np.allclose(made.predict(window, plan), before, atol=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_touch_after_now_does_not_change_what_is_predicted_now(
+    name: str, models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
+) -> None:
+    made, now = load(models[name]), 40
+    tactile = counts(TEST)
+    tactile[now + 1 :] += 500
+    later = FakeShard(TEST.name, table(tactile, poses(TEST)))
+    shards: list[Any] = [TEST, later]
+    if "levels" in name:
+        shards = [compressed(one, files=latents["levels"].files).shards[TEST.name] for one in shards]
+    (_, _, before), (_, _, after) = (foretold(made, one) for one in shards)
+    known = now - CONTEXT + 2  # windows whose last frame of the past is not after ``now``
+    for predictor, said in before.predictions.items():
+        if not predictor.startswith("codec"):  # which tells what the codec loses of the truth
+            changed = after.predictions[predictor].count
+            assert np.allclose(changed[:known], said.count[:known], atol=1e-2), predictor
+    model = before.predictions["model"].count[known]
+    assert not np.allclose(after.predictions["model"].count[known], model, atol=1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_plan_of_a_step_changes_only_it_and_later_ones(
+    name: str, models: Mapping[str, Mapping[str, bytes]]
+) -> None:
+    made, (window, plan) = load(models[name]), windows()
+    zeros = np.zeros((3, CONTEXT, 7))
+    window, plan = np.concatenate([window, zeros], axis=-1), np.concatenate([plan, np.zeros((3, HORIZON, 6))], axis=-1)
+    before, changed = made.predict(window, plan), plan.copy()
+    changed[:, 2, [0, 7, 12]] += 1
+    after = made.predict(window, changed)
+    assert np.allclose(after[:, :2], before[:, :2], atol=1e-4)
+    assert (np.abs(after[:, 2:] - before[:, 2:]).max(axis=(0, 2)) > 1e-3).all()
+
+
+def spoiled(at: tuple[int, ...], value: float, of_plan: bool = False) -> tuple[Floats, Floats]:
+    window, plan = windows()
+    (plan if of_plan else window)[at] = value
+    return window, plan
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (spoiled((1, 2, 3), np.nan), r"The window holds nan in row 2, column 3 \(counted from 0\)"),
+        (spoiled((1, 2, 3), np.inf, True), "The plan holds inf in row 2, column 3"),
+        ((windows()[0], windows()[1][:, :3]), r"The plan has the shape \(3, 3, 7\); this model reads 4 rows of 13"),
+        ((windows()[0][:, 1:], windows()[1]), r"The window has the shape \(3, 4, 19\); this model reads 5 rows of 26"),
+        ((windows()[0][..., 1:], windows()[1]), r"The window has the shape \(3, 5, 18\)"),
+        ((windows()[0], windows()[1][0]), r"The plan has the shape \(4, 7\)"),
+        ((windows()[0], np.zeros((3, HORIZON, 13)) + 1), "must both hold velocities, or neither"),
+        ((windows()[0], windows(2)[1]), "There are 3 windows and 2 plans"),
+        ((windows()[0], np.zeros((3, HORIZON, 7))), "The plan holds a quaternion of length 0"),
+    ],
+)
+def test_what_cannot_be_read_is_one_sentence(given: tuple[Floats, Floats], said: str, forecaster: Forecaster) -> None:
+    with pytest.raises(TacpipeError, match=said):
+        forecaster.predict(*given)
+
+
+def test_a_model_of_another_task_is_refused(models: Mapping[str, Mapping[str, bytes]]) -> None:
+    files = models["gru raw"]
+    config = {**json.loads(files["config.json"]), "task": "material"}
+    with pytest.raises(TacpipeError, match="trained for material"):
+        Forecaster.load({**files, "config.json": json.dumps(config).encode()})
+
+
+def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:
+    pose, joints = panda(80)
+    tactile = 1000 * (pose[:, :1] - pose[0, :1]) + np.random.default_rng(0).normal(0, 1, (80, len(CHANNELS)))
+    shard = FakeShard("panda", table(tactile, pose, extra=joints))
+    made = load(trained(tmp_path, dataset(shard), dataset(shard), epochs=1))
+    found, starts, some = foretold(made, shard)
+    assert np.allclose(made.predict(*asked(found, starts)), some.predictions["model"].count, atol=0.05)
+    assert found.arm[0, 7:].any()

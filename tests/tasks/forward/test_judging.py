@@ -1,0 +1,349 @@
+"""What is judged is what numpy computes from the recordings' columns, and everything stands where it is looked for."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe import tables
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks.forward import Forecaster, tracks
+from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.tasks.forward.trials import (
+    CONTEXT,
+    HORIZON,
+    LENGTH,
+    Floats,
+    compressed,
+    counts,
+    foretold,
+    judged,
+    poses,
+    trained,
+)
+
+LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
+
+
+def held(seed: int, object_name: str | None) -> FakeShard:
+    one = motion(seed)
+    return dataclasses.replace(one, attributes={"trial": seed} | ({"object": object_name} if object_name else {}))
+
+
+TRAIN, TEST = [held(seed, "cup") for seed in range(4)], [held(20, "cup"), held(21, "jug"), held(22, "cup")]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder, fast = tmp_path_factory.mktemp("model"), {"learning_rate": 0.02, "epochs": 15, "patience": 15}
+    return trained(folder, dataset(*TRAIN), dataset(held(10, "cup"), held(11, "cup")), **fast)
+
+
+@pytest.fixture(scope="module")
+def latents() -> Mapping[str, Any]:
+    return {of: compressed(*TRAIN, of=of) for of in ("levels", "increments")}
+
+
+@pytest.fixture(scope="module")
+def latent_models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
+    found = {}
+    for name in ("gru levels", "recurrent levels", "gru increments"):
+        architecture, of = name.split()
+        watched = compressed(held(10, "cup"), files=latents[of].files, of=of)
+        found[name] = trained(tmp_path_factory.mktemp("model"), latents[of], watched, architecture=architecture)
+    return found
+
+
+def sliding(values: Floats) -> Floats:
+    """All windows (window, row, channel) of rows (time, channel)."""
+    return np.lib.stride_tricks.sliding_window_view(values, LENGTH, axis=0).swapaxes(1, 2)
+
+
+def oracle(*shards: FakeShard) -> dict[str, Floats]:
+    """Errors (window, step, channel) of the two that need no fit, from the columns."""
+    windows = np.concatenate([sliding(counts(one)) for one in shards])
+    ahead = windows[:, CONTEXT:]
+    return {
+        "persistence": windows[:, CONTEXT - 1, None] - ahead,
+        "context_mean": windows[:, :CONTEXT].mean(axis=1, keepdims=True) - ahead,
+    }
+
+
+def test_persistence_and_context_mean_are_what_numpy_computes_from_the_columns(model: dict[str, bytes]) -> None:
+    metrics, _ = judged(model, *TEST)
+    groups = {
+        "both": np.ones(len(CHANNELS), dtype=bool),
+        "sensor1": np.array([name.startswith("xela1") for name in CHANNELS]),
+        "sensor2": np.array([name.startswith("xela2") for name in CHANNELS]),
+        **{axis: np.array([name.endswith(axis) for name in CHANNELS]) for axis in "xyz"},
+    }
+    scale = np.array(json.loads(model["config.json"])["scaling"]["channel_count"])
+    for predictor, errors in oracle(*TEST).items():
+        assert set(metrics[predictor]["mse_counts"]) == set(groups)
+        for group, mask in groups.items():
+            mae, mse = metrics[predictor]["mae_counts"][group], metrics[predictor]["mse_counts"][group]
+            for step in range(HORIZON):
+                some = errors[:, step, mask]
+                assert mae[f"t{step + 1}"] == pytest.approx(np.abs(some).mean(), rel=1e-6)
+                assert mse[f"t{step + 1}"] == pytest.approx(np.square(some).mean(), rel=1e-6)
+            assert mae["mean"] == pytest.approx(np.abs(errors[..., mask]).mean(), rel=1e-6)
+        wanted = np.square(errors / scale).mean()
+        assert metrics[predictor]["mse_standard"]["mean"] == pytest.approx(wanted, rel=1e-6)
+    assert metrics["counts"] == {
+        "windows": 3 * 72,
+        "recordings": 3,
+        "recordings_without_window": 0,
+        "effective_windows": 3 * 72 // HORIZON,
+    }
+
+
+def test_the_model_s_errors_are_those_of_a_loop_over_predict(model: dict[str, bytes]) -> None:
+    metrics, result = judged(model, *TEST)
+    forecaster, errors = Forecaster.load(model), []
+    for shard in TEST:
+        arm = tracks.track(shard, forecaster.codec).arm  # type: ignore[arg-type]
+        rows = np.hstack([counts(shard), arm, np.zeros((len(arm), 1))])
+        for start in range(len(rows) - LENGTH + 1):
+            past, future = slice(start, start + CONTEXT), slice(start + CONTEXT, start + LENGTH)
+            errors.append(forecaster.predict(rows[past], arm[future]) - counts(shard)[future])
+    model_error, base = np.array(errors), oracle(*TEST)["persistence"]
+    for step in range(HORIZON):
+        name = f"t{step + 1}"
+        wanted = np.abs(model_error[:, step]).mean()
+        assert metrics["model"]["mae_counts"]["both"][name] == pytest.approx(wanted, rel=1e-3)
+        skill = 1 - np.square(model_error[:, step]).mean() / np.square(base[:, step]).mean()
+        assert metrics["skill"]["mse_counts"][name]["mean"] == pytest.approx(skill, rel=1e-3)
+    lines = list(csv.DictReader(io.StringIO(result.files["horizons.csv"].decode())))
+    assert {line["predictor"] for line in lines} == {"model", "persistence", "context_mean"} | LINEAR
+    assert [line["horizon_ms"] for line in lines[:HORIZON]] == ["20.0", "40.0", "60.0", "80.0"]
+    named = {(line["predictor"], line["step"]): line for line in lines}
+    told = float(named["ridge", "2"]["mae_counts"])
+    assert told == metrics["ridge"]["mae_counts"]["both"]["t2"]
+
+
+def test_the_model_beats_persistence_where_the_plan_tells_all(model: dict[str, bytes]) -> None:
+    metrics, _ = judged(model, *TEST)
+    assert metrics["skill"]["mse_counts"]["t4"]["low"] > 0.5
+    assert metrics["model"]["mse_counts"]["both"]["t4"] < 0.5 * metrics["persistence"]["mse_counts"]["both"]["t4"]
+
+
+def test_the_sums_of_the_errors_table_are_the_means_of_the_metrics(model: dict[str, bytes]) -> None:
+    shards = [*TEST, TRAIN[0]]
+    metrics, result = judged(model, *shards)
+    found = tables.from_parquet(result.files["errors.parquet"]).to_pandas()
+    assert set(found["recording"]) == {one.name for one in shards}
+    assert set(found["object"]) == {"cup", "jug"}
+    parts = {
+        "": found[~found["seen"]],
+        "known": found[~found["seen"] & found["known"]],
+        "unseen": found[~found["seen"] & ~found["known"]],
+        "seen": found[found["seen"]],
+    }
+    for name, part in parts.items():
+        tree = metrics[name] if name else metrics
+        for (predictor, group, step), rows in part.groupby(["predictor", "group", "step"]):
+            cells = (rows["windows"] * rows["channels"]).sum()
+            squared, absolute = rows["squared"].sum() / cells, rows["absolute"].sum() / cells
+            scores = tree[predictor]
+            if group in ("standard", "feature", "latent"):
+                assert squared == pytest.approx(scores[f"mse_{group}"][f"t{step}"], rel=1e-6)
+            else:
+                assert squared == pytest.approx(scores["mse_counts"][group][f"t{step}"], rel=1e-6)
+                assert absolute == pytest.approx(scores["mae_counts"][group][f"t{step}"], rel=1e-6)
+
+
+def test_objects_that_the_model_was_trained_on_and_others_are_told_apart(model: dict[str, bytes]) -> None:
+    metrics, result = judged(model, *TEST)
+    assert (metrics["known"]["counts"]["recordings"], metrics["unseen"]["counts"]["recordings"]) == (2, 1)
+    alone, _ = judged(model, TEST[0], TEST[2])
+    assert metrics["known"]["model"] == alone["model"]
+    assert not {"known", "unseen", "seen"} & set(alone)
+    rows = {row["recording"]: row for row in csv.DictReader(io.StringIO(result.files["trials.csv"].decode()))}
+    assert (rows["trial-21"]["object"], rows["trial-21"]["known"], rows["trial-20"]["known"]) == (
+        "jug",
+        "false",
+        "true",
+    )
+    unnamed, _ = judged(model, held(20, None), TEST[1])
+    assert unnamed["known"]["counts"]["recordings"] == 1  # nobody said what is held
+
+
+def test_recordings_that_the_model_has_seen_are_told_apart(model: dict[str, bytes]) -> None:
+    alone, _ = judged(model, *TEST)
+    mixed, result = judged(model, *TEST, TRAIN[0], held(10, "cup"))
+    assert {name: value for name, value in mixed.items() if name != "seen"} == alone
+    assert mixed["seen"]["counts"]["recordings"] == 2
+    assert result.recordings[TRAIN[0].name].attributes["seen"] is True
+    assert result.recordings[TEST[0].name].attributes == {"trial": 20, "object": "cup", "seen": False}
+    only, _ = judged(model, TRAIN[0])
+    assert "model" not in only and "anticipation" not in only
+    assert only["counts"]["recordings"] == 0 and only["seen"]["counts"]["recordings"] == 1
+
+
+def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]) -> None:
+    metrics, result = judged(model, *TEST)
+    for predictor in ("model", "persistence"):
+        for group in ("sensor1", "sensor2", "both"):
+            assert set(metrics[predictor]["mae_counts"][group]) == {"t1", "t2", "t3", "t4", "mean"}
+    assert set(metrics) == {
+        *({"model", "persistence", "context_mean"} | LINEAR),
+        *("counts", "skill", "anticipation", "known", "unseen"),
+    }
+    assert set(metrics["model"]) == {"mse_counts", "mae_counts", "mse_standard", "mse_latent", "mse_feature"}
+    assert set(metrics["ridge"]) == {"mse_counts", "mae_counts", "mse_standard"}
+    assert set(result.files) == {
+        *("metrics.json", "horizons.csv", "trials.csv", "errors.parquet", "config.json", "history.jsonl"),
+    }
+
+
+def test_alarms_are_counted_for_the_model_and_whatever_it_has_to_beat(model: dict[str, bytes]) -> None:
+    metrics, _ = judged(model, *TEST)
+    assert set(metrics["anticipation"]) == {"model", "persistence", *(LINEAR - {"train_mean"})}
+    for found in metrics["anticipation"].values():
+        assert set(found) == {
+            *("events", "recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute"),
+        }
+
+
+def test_features_are_measured_in_half_their_training_range(model: dict[str, bytes]) -> None:
+    metrics, _ = judged(model, *TEST)
+    half = np.ptp(np.concatenate([counts(one) for one in TRAIN]), axis=0) / 2
+    wanted = np.square(oracle(*TEST)["persistence"] / half).mean()
+    assert metrics["persistence"]["mse_feature"]["mean"] == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    [
+        ("gru levels", {"codec", "codec_persistence", "codec_anchored"}),
+        ("recurrent levels", {"codec", "codec_persistence", "codec_anchored", "model_anchored"}),
+        ("gru increments", {"codec"}),
+    ],
+)
+def test_what_the_codec_alone_loses_stands_beside_the_model(
+    name: str, rows: set[str], latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
+) -> None:
+    of = name.split()[1]
+    codec, test = latents[of], compressed(*TEST, files=latents[of].files, of=of)
+    metrics, result = judged(latent_models[name], *test.shards.values(), files=codec.files)
+    assert set(metrics) - LINEAR - {"known", "unseen", "counts", "skill", "anticipation", "context_mean"} == {
+        *("model", "persistence"),
+        *rows,
+    }
+    assert set(metrics) > LINEAR
+    assert metrics["codec"]["mse_latent"]["mean"] == 0
+    assert metrics["codec"]["mse_counts"]["both"]["mean"] > 0
+    for predictor, errors in oracle(*TEST).items():
+        wanted = np.abs(errors).mean()
+        assert metrics[predictor]["mae_counts"]["both"]["mean"] == pytest.approx(wanted, rel=1e-6)
+    assert "codec.json" in result.files
+    found = result.recordings["trial-20"].streams[""]
+    assert found.column_names[:5] == ["t_ns", "contact", "z00", "z00_t1", "z00_t3"]
+
+
+def test_what_the_codec_loses_is_what_numpy_computes(
+    latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
+) -> None:
+    codec = Forecaster.load(latent_models["gru levels"]).codec
+    test = compressed(*TEST, files=latents["levels"].files)
+    metrics, _ = judged(latent_models["gru levels"], *test.shards.values(), files=latents["levels"].files)
+    lost = {one.name: codec.decode(codec.encode(counts(one), CHANNELS)) - counts(one) for one in TEST}
+    windows = np.concatenate([sliding(one) for one in lost.values()])
+    for predictor, wanted in (
+        ("codec", windows[:, CONTEXT:]),
+        ("codec_anchored", windows[:, CONTEXT:] - windows[:, CONTEXT - 1, None]),
+        ("codec_persistence", windows[:, CONTEXT - 1, None] + oracle(*TEST)["persistence"]),
+    ):
+        found = metrics[predictor]["mse_counts"]["both"]["mean"]
+        assert found == pytest.approx(np.square(wanted).mean(), rel=1e-3), predictor
+
+
+def test_latents_of_another_codec_are_refused(
+    latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
+) -> None:
+    other = compressed(*TEST)
+    with pytest.raises(TacpipeError, match="another codec than the model's"):
+        judged(latent_models["gru levels"], *other.shards.values(), files=other.files)
+    with pytest.raises(TacpipeError, match="trial-20: There is no column z00"):
+        judged(latent_models["gru levels"], *TEST)
+
+
+def test_a_model_of_raw_channels_reads_recordings_that_have_latents_too(
+    model: dict[str, bytes], latents: Mapping[str, Any]
+) -> None:
+    test = compressed(*TEST, files=latents["levels"].files)
+    metrics, _ = judged(model, *test.shards.values(), files=latents["levels"].files)
+    assert metrics == judged(model, *TEST)[0]
+
+
+def test_a_signal_that_stays_has_no_error_and_no_skill(model: dict[str, bytes]) -> None:
+    still = FakeShard("still", table(np.full((40, len(CHANNELS)), 12.0)))
+    metrics, result = judged(model, still)
+    assert metrics["persistence"]["mse_counts"]["both"]["mean"] == 0
+    assert metrics["context_mean"]["mae_counts"]["x"]["t3"] == 0
+    assert metrics["skill"]["mse_counts"] == {}
+    assert b"nan" not in result.files["trials.csv"].lower()
+    json.loads(result.files["metrics.json"], parse_constant=pytest.fail)
+
+
+def test_recordings_without_a_window_are_counted_and_do_no_harm(model: dict[str, bytes]) -> None:
+    empty = FakeShard("a-empty", table(np.zeros((0, len(CHANNELS)))))
+    short = FakeShard("short", motion(1, rows=LENGTH - 1).content)
+    metrics, result = judged(model, empty, *TEST, short)
+    wanted, _ = judged(model, *TEST)
+    assert metrics["counts"] == wanted["counts"] | {"recordings_without_window": 2}
+    assert metrics["model"] == wanted["model"]
+    for name in ("a-empty", "short"):
+        found = result.recordings[name].tables
+        assert isinstance(found, pa.Table)
+        assert found.num_rows == 0
+    none, _ = judged(model, empty)
+    assert none == {"counts": {"windows": 0, "recordings": 0, "recordings_without_window": 1, "effective_windows": 0}}
+
+
+def test_every_window_is_judged_in_contact_or_not(model: dict[str, bytes]) -> None:
+    free = FakeShard("trial-20", table(counts(TEST[0]), poses(TEST[0]), contact=np.full(80, -1)), TEST[0].attributes)
+    metrics, result = judged(model, free)
+    assert metrics["model"] == judged(model, TEST[0])[0]["model"]
+    found = result.recordings["trial-20"].streams[""]
+    assert set(found["contact"].to_pylist()) == {-1}
+
+
+def test_predictions_stand_at_the_time_they_are_known(model: dict[str, bytes]) -> None:
+    _, result = judged(model, TEST[0])
+    _, _, some = foretold(Forecaster.load(model), TEST[0])
+    found, name = result.recordings[TEST[0].name].streams[""], CHANNELS[0]
+    assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
+    assert [column for column in found.column_names if column.startswith(name)] == [name, f"{name}_t1", f"{name}_t3"]
+    assert np.allclose(found[f"{name}_t3"].to_numpy(), some.features[:, 2, 0], rtol=1e-5)
+    assert np.allclose(found[name].to_numpy(), counts(TEST[0])[4:-4, 0], atol=1e-2)
+
+
+def test_recordings_of_another_rate_or_grid_are_refused(model: dict[str, bytes]) -> None:
+    content = TEST[0].content
+    fast = content.set_column(0, content.schema.field(0), [np.arange(80) * 10_000_000])
+    with pytest.raises(TacpipeError, match=r"100 rows a second and the model was trained at 50.*--rate-hz 50"):
+        judged(model, FakeShard("fast", fast))
+    with pytest.raises(TacpipeError, match=r"fresh has a fresh grid and the model was trained on a uniform one"):
+        judged(model, FakeShard("fresh", content, {"grid": "fresh"}))
+
+
+def test_recordings_of_another_layout_are_refused(model: dict[str, bytes]) -> None:
+    fewer = FakeShard("fewer", TEST[0].content.drop_columns(CHANNELS[-3:]))
+    with pytest.raises(TacpipeError, match="fewer: The codec does not fit this table"):
+        judged(model, fewer)
+
+
+def test_judging_again_gives_the_same_bytes_for_a_control_too(tmp_path: Path) -> None:
+    files = trained(tmp_path, actions="shuffled")
+    (_, first), (_, again) = judged(files, *TEST), judged(files, *TEST)
+    assert first.files == again.files

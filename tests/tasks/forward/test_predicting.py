@@ -1,0 +1,67 @@
+"""Predictions of recordings as tables: what the forecaster says, at the time when it was known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tacpipe import registry
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks import forward
+from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.tasks.forward.trials import HORIZON, compressed, foretold, trained
+
+TEST = motion(20)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return trained(tmp_path_factory.mktemp("model"))
+
+
+def test_each_row_holds_what_the_model_says_of_the_steps_asked_for(model: dict[str, bytes]) -> None:
+    found = forward.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
+    _, _, some = foretold(forward.load(model), TEST)
+    assert found.column_names[:3] == ["t_ns", f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t4"]
+    assert found.num_columns == 1 + 2 * len(CHANNELS)
+    assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
+    for channel, name in enumerate(CHANNELS):
+        for step in (1, 4):
+            wanted = some.predictions["model"].count[:, step - 1, channel]
+            assert np.allclose(found[f"{name}_t{step}"].to_numpy(), wanted, rtol=1e-5)
+    about = found.schema.field(f"{CHANNELS[0]}_t4").metadata
+    assert about[b"quantity"] == b"prediction" and about[b"step"] == b"4" and about[b"taxel"] == b"1"
+
+
+def test_a_model_of_latents_tells_counts(tmp_path: Path) -> None:
+    training = compressed(*(motion(seed) for seed in range(3)))
+    model = trained(tmp_path, training, compressed(motion(9), files=training.files))
+    given = compressed(TEST, files=training.files)
+    found = forward.predict(model, given, [HORIZON]).recordings[TEST.name].streams[""]
+    assert found.column_names == ["t_ns", *(f"{name}_t{HORIZON}" for name in CHANNELS)]
+    with pytest.raises(TacpipeError, match="another codec"):
+        forward.predict(model, compressed(TEST), [1])
+
+
+def test_a_recording_without_a_window_has_a_table_without_rows(model: dict[str, bytes]) -> None:
+    short = FakeShard("short", table(np.zeros((3, len(CHANNELS)))))
+    found = forward.predict(model, dataset(short), [1]).recordings["short"].streams[""]
+    assert (found.num_rows, found.num_columns) == (0, 1 + len(CHANNELS))
+
+
+@pytest.mark.parametrize("step", [0, HORIZON + 1, -1])
+def test_steps_that_the_model_does_not_reach_are_refused(step: int, model: dict[str, bytes]) -> None:
+    with pytest.raises(TacpipeError, match=rf"tells 1 to {HORIZON} steps ahead, not {step}\."):
+        forward.predict(model, dataset(TEST), [1, step])
+
+
+def test_the_stage_reads_steps_as_a_list(model: dict[str, bytes]) -> None:
+    stage = registry.load("predict")
+    found = stage(stage.params(steps="1, 3"), dataset(files=model), dataset(TEST))
+    assert f"{CHANNELS[-1]}_t3" in found.recordings[TEST.name].streams[""].column_names
+    with pytest.raises(TacpipeError, match="it must be whole numbers with commas"):
+        stage(stage.params(steps="one"), dataset(files=model), dataset(TEST))
+    with pytest.raises(TacpipeError, match="This is no model"):
+        stage(stage.params(), dataset(), dataset(TEST))

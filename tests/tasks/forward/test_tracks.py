@@ -1,0 +1,203 @@
+"""A recording as a forecaster reads it: which rows, which columns, how fast the hand moves, and how often rows come."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe.codecs import codec as codecs
+from tacpipe.errors import TacpipeError
+from tacpipe.signals import kinematics
+from tacpipe.tasks.forward import tracks
+from tests.stages.learning_fakes import CHANNELS, FakeShard, table
+from tests.tasks.forward.trials import panda, track
+
+RNG = np.random.default_rng(0)
+TACTILE = RNG.normal(size=(30, len(CHANNELS)))
+JOINTED = RNG.normal(size=(60, len(CHANNELS)))
+
+
+def timed(t_ns: np.ndarray) -> pa.Table:
+    content = table(RNG.normal(size=(len(t_ns), len(CHANNELS))))
+    return content.set_column(0, content.schema.field(0), [t_ns.astype(np.int64)])
+
+
+def test_a_dataset_without_codec_gives_counts_above_rest() -> None:
+    found = track(table(TACTILE))
+    assert np.allclose(found.tactile, TACTILE, atol=2e-3)
+    assert np.allclose(found.latent, found.tactile)
+
+
+def test_windows_cross_neither_gaps_nor_missing_rows_and_contact_does_not_matter() -> None:
+    contact, gap = np.repeat([-1, 0, 1], 10), np.zeros(30, dtype=bool)
+    gap[15] = True
+    found = track(table(TACTILE, contact=contact, gap=gap))
+    assert found.starts(3, 2).tolist() == [*range(11), *range(16, 26)]
+    t_ns = np.arange(30) * 20_000_000
+    t_ns[12:] += 60_000_000
+    assert track(timed(t_ns)).starts(5, 5).tolist() == [0, 1, 2, *range(12, 21)]
+
+
+def test_windows_in_contact_lie_within_one_contact() -> None:
+    contact, gap = np.repeat([-1, 0, 1, -1], [5, 10, 8, 7]), np.zeros(30, dtype=bool)
+    gap[18] = True
+    found = track(table(TACTILE, contact=contact, gap=gap))
+    assert found.contact_starts(2, 2, 1).tolist() == [*range(5, 12), *range(19, 20)]
+    assert found.contact_starts(2, 2, 3).tolist() == [5, 8, 11, 19]
+    none = track(table(TACTILE, contact=np.full(30, -1)))
+    assert none.contact_starts(2, 2, 1).tolist() == []
+    assert len(none.starts(2, 2)) == 27
+
+
+def test_windows_start_every_stride_rows_of_each_run() -> None:
+    gap = np.zeros(30, dtype=bool)
+    gap[10] = True
+    assert track(table(TACTILE, gap=gap)).starts(2, 2, 4).tolist() == [0, 4, 11, 15, 19, 23]
+
+
+def test_rows_that_are_not_finite_are_unusable_and_rows_without_contact_are_not() -> None:
+    pose = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (30, 1))
+    pose[4, 0], pose[8, 3:] = np.nan, 0.0
+    tactile = TACTILE.copy()
+    tactile[13, 2] = np.nan
+    finger = np.full(30, 0.04)
+    finger[20] = np.nan
+    contact = np.full(30, -1)
+    found = track(table(tactile, pose, contact=contact, extra={"robot_finger_m": finger}))
+    # the row after one without a pose has no velocity either
+    assert np.flatnonzero(~found.usable).tolist() == [4, 5, 8, 9, 13, 20]
+    assert found.finger[0] == pytest.approx(0.04)
+
+
+def test_the_finger_s_width_is_zero_where_it_is_not_recorded() -> None:
+    assert not track(table(TACTILE)).finger.any()
+
+
+def test_what_is_held_and_the_grid_are_told_by_attributes() -> None:
+    found = track(table(TACTILE), grid="fresh", object="bottle-200g")
+    assert (found.timeline, found.object) == ("fresh", "bottle-200g")
+    found = track(table(TACTILE))
+    assert (found.timeline, found.object) == ("uniform", None)
+
+
+def test_a_recording_without_rows_has_no_windows() -> None:
+    found = track(table(TACTILE[:0]))
+    assert found.starts(2, 2).tolist() == []
+    assert found.contact_starts(2, 2, 1).tolist() == []
+    assert tracks.rate_hz([found]) == 0.0
+
+
+def test_quaternions_that_flip_their_sign_are_one_pose() -> None:
+    angle = np.linspace(0, 3, 30)
+    pose = np.zeros((30, 7))
+    pose[:, 3], pose[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    flipped = pose.copy()
+    flipped[::3, 3:] *= -1
+    arms = [track(table(TACTILE, one)).arm for one in (pose, flipped)]
+    aligned = [tracks.aligned(arm, pose[0, 3:]) for arm in arms]
+    assert np.allclose(aligned[0], aligned[1])
+    assert np.allclose(aligned[0][:, :7], pose, atol=1e-6)
+    opposite = tracks.aligned(arms[0], -pose[0, 3:])
+    assert np.allclose(opposite[:, 3:7], -pose[:, 3:], atol=1e-6)
+    assert np.array_equal(opposite[:, 7:], arms[0][:, 7:])
+
+
+def test_velocities_are_those_of_the_joints_where_the_arm_is_a_panda() -> None:
+    pose, joints = panda()
+    found = track(table(JOINTED, pose, extra=joints)).arm[:, 7:]
+    rough = track(table(JOINTED, pose)).arm[:, 7:]
+    assert found[0].any() and not rough[0].any()
+    middle = (rough[1:-1] + rough[2:]) / 2  # central differences
+    assert np.allclose(found[1:-1], middle, atol=0.01)
+    assert np.abs(found).max() > 0.1
+
+
+@pytest.mark.parametrize("broken", ["another arm", "no speeds", "no joints"])
+def test_velocities_are_differences_of_poses_on_any_other_arm(broken: str) -> None:
+    pose, joints = panda()
+    if broken == "another arm":
+        joints = {
+            name: values + 0.5 * ("joint2_rad" in name) * np.sin(np.arange(60)) for name, values in joints.items()
+        }
+    else:
+        left_out = "velocity" if broken == "no speeds" else "joint"
+        joints = {name: values for name, values in joints.items() if left_out not in name}
+    found = track(table(JOINTED, pose, extra=joints))
+    wanted = kinematics.differences(found.t_ns, pose[:, :3], found.arm[:, 3:7].astype(float))
+    assert np.allclose(found.arm[:, 7:], wanted, atol=1e-4)
+
+
+def test_a_gap_in_the_joints_leaves_the_other_rows_their_velocities() -> None:
+    pose, joints = panda()
+    joints["robot_joint3_rad"][20] = np.nan
+    whole, torn = track(table(JOINTED, pose, extra=panda()[1])), track(table(JOINTED, pose, extra=joints))
+    assert np.flatnonzero(~torn.usable).tolist() == [20]
+    assert np.array_equal(np.delete(torn.arm, 20, 0), np.delete(whole.arm, 20, 0))
+
+
+@pytest.mark.parametrize(
+    ("grid", "step", "windows"),
+    [("uniform", 1.4, 25), ("uniform", 1.6, 20), ("logged", 2.9, 25), ("logged", 3.1, 20), ("fresh", 3.1, 20)],
+)
+def test_how_far_apart_rows_may_be_depends_on_their_grid(grid: str, step: float, windows: int) -> None:
+    t_ns = np.arange(30.0) * 20e6
+    t_ns[12:] += (step - 1) * 20e6
+    assert len(track(timed(t_ns), grid=grid).starts(3, 3)) == windows
+
+
+def test_ground_truth_is_never_read() -> None:
+    content = table(TACTILE, extra={"gt_slip": np.zeros(30)})
+    with pytest.raises(TacpipeError, match="ground truth"):
+        tracks.inputs(content, ["gt_slip"])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (table(TACTILE, rest=None), "trial: Channel xela1_taxel01_x has no rest level"),
+        (table(TACTILE).drop_columns(["contact"]), "trial: There is no column contact"),
+        (table(TACTILE).drop_columns(["robot_position_x_m"]), "trial: There is no column robot_position_x_m"),
+    ],
+)
+def test_what_is_absent_is_named_with_its_recording(content: pa.Table, said: str) -> None:
+    with pytest.raises(TacpipeError, match=said):
+        track(content)
+
+
+def test_tables_and_codecs_that_do_not_belong_together_are_refused() -> None:
+    bare = table(TACTILE)
+    latent = bare.append_column(bare.schema.field(0).with_name("z00").with_metadata({"quantity": "latent"}), bare[0])
+    with pytest.raises(TacpipeError, match="1 latent columns but its dataset no codec"):
+        tracks.codec_of(latent, {})
+    with pytest.raises(TacpipeError, match="no tactile channel"):
+        tracks.codec_of(bare.select(["t_ns"]), {})
+    other = codecs.Raw(tuple(reversed(CHANNELS)), ())
+    with pytest.raises(TacpipeError, match="trial: The codec does not fit"):
+        tracks.track(FakeShard("trial", bare), other)  # type: ignore[arg-type]
+
+
+def at(name: str, found_hz: float, timeline: str) -> tracks.Track:
+    """A track without anything but its rows' times."""
+    t_ns = np.rint(np.arange(30) * 1e9 / found_hz).astype(np.int64)
+    return dataclasses.replace(track(table(TACTILE), name), t_ns=t_ns, timeline=timeline)
+
+
+@pytest.mark.parametrize("timeline", ["logged", "fresh"])
+def test_rows_as_logged_or_fresh_may_come_at_different_rates(timeline: str) -> None:
+    given = [at(name, found_hz, timeline) for name, found_hz in (("a", 32.0), ("b", 41.0), ("c", 46.0))]
+    assert tracks.rate_hz(given) == pytest.approx(41.0, rel=1e-6)
+
+
+def test_rates_on_a_grid_that_differ_are_named_with_their_recordings() -> None:
+    slow = at("slow", 25.0, "uniform")
+    assert tracks.rate_hz([slow, slow]) == 25.0
+    with pytest.raises(TacpipeError, match=r"slow runs at 25\.00 Hz and fast at 50\.00 Hz"):
+        tracks.rate_hz([slow, at("fast", 50.0, "uniform")])
+
+
+def test_grids_of_several_kinds_do_not_mix() -> None:
+    with pytest.raises(TacpipeError, match="not of one grid: raw is logged, even is uniform"):
+        tracks.rate_hz([at("raw", 50.0, "logged"), at("even", 50.0, "uniform")])

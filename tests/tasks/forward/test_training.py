@@ -1,0 +1,283 @@
+"""How a model comes about: what it learns from, what it holds, and that the same params give the same bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from safetensors.numpy import load
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models.forecasts import ARCHITECTURES
+from tacpipe.tasks import forward
+from tacpipe.training import checkpoint
+from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.tasks.forward.trials import HORIZON, compressed, judged, params, trained
+
+TRAIN, VAL = [motion(seed) for seed in range(3)], [motion(10), motion(11)]
+FILES = {"model.safetensors", "baselines.safetensors", "config.json", "history.jsonl"}
+
+
+def config(files: dict[str, bytes]) -> dict[str, Any]:
+    value: dict[str, Any] = json.loads(files["config.json"])
+    return value
+
+
+def losses(files: dict[str, bytes]) -> list[float]:
+    return [json.loads(line)["val_loss"] for line in files["history.jsonl"].splitlines()]
+
+
+def strolling(seed: int) -> FakeShard:
+    """A recording in which nothing but the plan tells where the arm goes, and each channel feels where it is."""
+    rng = np.random.default_rng(seed)
+    pose = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (80, 1))
+    pose[:, 0] += rng.normal(0, 0.005, 80).cumsum()
+    return FakeShard(f"stroll-{seed}", table((pose[:, :1] - 0.5) * np.linspace(500, 4000, len(CHANNELS)), pose))
+
+
+def test_a_tiny_deterministic_set_is_learned_by_heart(tmp_path: Path) -> None:
+    one = dataset(motion(3, rows=24))
+    sizes = {"hidden": 24, "epochs": 200, "patience": 200, "learning_rate": 0.01, "cycle": False, "baselines": False}
+    found = losses(trained(tmp_path, one, one, architecture="recurrent", batch=32, **sizes))
+    assert min(found) < 0.001 < found[0]
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_every_model_is_tensors_and_json_alone(architecture: str, tmp_path: Path) -> None:
+    files = trained(tmp_path, dataset(*TRAIN[:1]), architecture=architecture, epochs=1)
+    assert set(files) == FILES
+    for name, content in files.items():
+        if name.endswith(".safetensors"):
+            assert all(np.isfinite(values).all() for values in load(content).values())
+        else:
+            lines = content.splitlines() if name.endswith(".jsonl") else [content]
+            assert all(json.loads(line, parse_constant=pytest.fail) for line in lines)
+    assert config(files)["architecture"] == architecture
+
+
+def test_the_config_tells_what_was_trained_on_what(tmp_path: Path) -> None:
+    given = [dataclasses.replace(one, attributes={"object": f"bottle-{index % 2}"}) for index, one in enumerate(TRAIN)]
+    found = config(trained(tmp_path, dataset(*given), dataset(*VAL), stride=2))
+    assert (found["task"], found["rate_hz"], found["timeline"]) == ("forward", 50.0, "uniform")
+    assert found["codec"] == {"kind": "raw", "of": "levels", "frames": 1, "latents": 12, "name": "raw"}
+    assert found["inputs"]["tactile"] == CHANNELS
+    assert found["inputs"]["layout"][0] == {"stream": "xela1", "taxel": "1", "axis": "x"}
+    assert found["objects"] == ["bottle-0", "bottle-1"]
+    assert found["trained_on"] == {shard.name: shard.digest for shard in (*TRAIN, *VAL)}
+    assert found["counts"] == {
+        "train": {"recordings": 3, "windows": 3 * 36},
+        "val": {"recordings": 2, "windows": 2 * 72},  # validation and test have every window, whatever the stride
+    }
+    assert found["params"] == params(stride=2)
+    assert set(found["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
+    assert set(found["anticipation"]) == {"sd", "theta"}
+
+
+def test_scales_are_those_of_numpy_over_the_training_rows(tmp_path: Path) -> None:
+    found = config(trained(tmp_path, dataset(*TRAIN), epochs=1))["scaling"]
+    columns = [[one.content[name].to_numpy() for name in CHANNELS] for one in TRAIN]
+    values = np.concatenate(columns, axis=1).astype(np.float64)  # (channel, time)
+    assert np.allclose(found["channel_count"], values.std(axis=1), rtol=1e-6)
+    assert np.allclose(found["feature_half"], np.ptp(values, axis=1) / 2, rtol=1e-5)
+
+
+def test_validation_recordings_change_neither_scales_nor_baselines_other_than_alpha(tmp_path: Path) -> None:
+    wild = FakeShard("wild", table(np.random.default_rng(0).normal(0, 1e4, (40, len(CHANNELS)))))
+    tame, wide = (
+        trained(tmp_path / str(len(part)), dataset(*TRAIN), dataset(*part), epochs=1) for part in (VAL, [*VAL, wild])
+    )
+    assert config(tame)["scaling"] == config(wide)["scaling"]
+    assert config(tame)["inputs"] == config(wide)["inputs"]
+    first, second = load(tame["baselines.safetensors"]), load(wide["baselines.safetensors"])
+    for name, values in first.items():
+        if not name.startswith("ridge"):
+            assert np.array_equal(values, second[name]), name
+    for name in ("ridge.centre", "ridge.bias", "ridge_actions.centre", "ridge_actions.bias"):
+        assert np.array_equal(first[name], second[name]), name
+    scales, others = load(tame["model.safetensors"]), load(wide["model.safetensors"])
+    for name in scales:
+        if name.endswith(("_scale", "_mean")):
+            assert np.array_equal(scales[name], others[name]), name
+
+
+def test_a_channel_that_never_moves_and_one_recording_without_rows_do_no_harm(tmp_path: Path) -> None:
+    def dead(one: FakeShard) -> FakeShard:
+        at = one.content.column_names.index(CHANNELS[4])
+        still = pa.array(np.full(one.content.num_rows, 16003.0, np.float32))
+        return dataclasses.replace(one, content=one.content.set_column(at, one.content.schema.field(at), still))
+
+    given = dataset(*map(dead, TRAIN))
+    files = trained(tmp_path / "dead", given, dataset(dead(VAL[0])), architecture="taxelwise")
+    assert config(files)["scaling"]["channel_count"][4] == 1.0
+    metrics, _ = judged(files, dead(motion(20)))
+    assert np.isfinite(metrics["model"]["mse_standard"]["mean"])
+    empty = FakeShard("empty", table(np.zeros((0, len(CHANNELS)))))
+    with_empty = trained(tmp_path / "a", dataset(empty, *TRAIN), dataset(empty, *VAL), epochs=1)
+    without = trained(tmp_path / "b", dataset(*TRAIN), dataset(*VAL), epochs=1)
+    assert with_empty["model.safetensors"] == without["model.safetensors"]
+
+
+def test_a_single_training_window_is_enough(tmp_path: Path) -> None:
+    files = trained(tmp_path, dataset(motion(0, rows=9)), architecture="taxelwise", epochs=1)
+    assert config(files)["counts"]["train"] == {"recordings": 1, "windows": 1}
+
+
+def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
+    contact = np.repeat([-1, 0, -1], [30, 30, 20])
+    one = motion(0)
+    at = one.content.column_names.index("contact")
+    content = one.content.set_column(at, one.content.schema.field(at), pa.array(contact.astype(np.int32)))
+    given = dataset(dataclasses.replace(one, content=content))
+    windows = {
+        chosen: config(trained(tmp_path / chosen, given, given, epochs=1, windows=chosen))["counts"]["train"]["windows"]
+        for chosen in ("all", "contact")
+    }
+    assert windows == {"all": 72, "contact": 22}
+    with pytest.raises(TacpipeError, match="no windows 'some'; there are all and contact"):
+        trained(tmp_path / "some", given, given, windows="some")
+
+
+@pytest.mark.parametrize("actions", ["planned", "none", "shuffled"])
+def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_path: Path) -> None:
+    sizes = {"epochs": 15, "patience": 15, "learning_rate": 0.01, "baselines": False}
+    files = trained(tmp_path, dataset(*map(strolling, range(3))), dataset(strolling(10)), actions=actions, **sizes)
+    metrics, _ = judged(files, strolling(20), strolling(21))
+    skill = metrics["skill"]["mse_counts"][f"t{HORIZON}"]["mean"]
+    assert skill > 0.9 if actions == "planned" else skill < 0.2
+
+
+def test_actions_that_do_not_exist_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="There are no actions 'guessed'"):
+        trained(tmp_path, actions="guessed")
+
+
+@pytest.mark.parametrize("architecture", ["recurrent", "taxelwise", "gru"])
+def test_training_again_gives_the_same_bytes_and_another_seed_does_not(architecture: str, tmp_path: Path) -> None:
+    first, again, other = (
+        trained(tmp_path / name, architecture=architecture, epochs=1, seed=seed)
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    )
+    assert first == again
+    assert first["model.safetensors"] != other["model.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("architecture", "actions"), [("recurrent", "planned"), ("taxelwise", "planned"), ("gru", "shuffled")]
+)
+def test_an_interrupted_training_goes_on_where_it_was(
+    architecture: str, actions: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {"architecture": architecture, "actions": actions, "epochs": 4, "hidden": 8}
+    whole = trained(tmp_path / "whole", **asked)
+    written, write = iter(range(2)), checkpoint.write
+
+    def killed(*args: Any) -> None:
+        write(*args)
+        if next(written, None) is None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(checkpoint, "write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "killed", **asked)
+    monkeypatch.setattr(checkpoint, "write", write)
+    assert trained(tmp_path / "killed", **asked) == whole
+
+
+@pytest.mark.parametrize("architecture", ["recurrent", "taxelwise"])
+def test_a_model_begins_with_another_and_remembers_what_that_has_seen(architecture: str, tmp_path: Path) -> None:
+    asked: dict[str, Any] = {"architecture": architecture, "epochs": 6, "learning_rate": 0.01, "cycle": False}
+    first = trained(tmp_path / "first", **asked)
+    given = params(**{**asked, "epochs": 1, "learning_rate": 1e-9})
+    tuned = forward.train(given, dataset(motion(5)), dataset(motion(10)), tmp_path / "tuned", first)
+    for name, values in load(first["model.safetensors"]).items():
+        assert np.allclose(load(tuned["model.safetensors"])[name], values, atol=1e-6), name
+    assert losses(tuned)[0] == pytest.approx(min(losses(first)), rel=1e-4)
+    assert config(tuned)["trained_on"] == {
+        **{f"{one.name} of the model before": one.digest for one in TRAIN},
+        "trial-05": motion(5).digest,
+        "trial-10": motion(10).digest,
+    }
+
+
+def test_a_model_that_begins_with_another_is_trained_by_its_own_loss_and_dropout(tmp_path: Path) -> None:
+    first = trained(tmp_path / "first")
+    found = {
+        name: forward.train(params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / name, first)
+        for name, changed in (("same", {}), ("loss", {"loss": "squared"}), ("dropout", {"dropout": 0.5}))
+    }
+    assert losses(found["loss"]) != losses(found["same"])
+    assert found["dropout"]["model.safetensors"] != found["same"]["model.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"hidden": 8}, "hidden 16 and the one to train 8"),
+        ({"architecture": "lstm"}, "architecture gru and the one to train lstm"),
+        ({"horizon": 3}, "horizon 4 and the one to train 3"),
+    ],
+)
+def test_a_model_of_another_shape_is_nothing_to_begin_with(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match=said):
+        forward.train(params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / "b", trained(tmp_path / "a"))
+
+
+def test_a_model_of_another_representation_is_nothing_to_begin_with(tmp_path: Path) -> None:
+    latents = compressed(*TRAIN)
+    first, watched = trained(tmp_path / "a"), compressed(*VAL, files=latents.files)
+    with pytest.raises(TacpipeError, match="--init reads raw and the recordings hold PCA-3"):
+        forward.train(params(), latents, watched, tmp_path / "b", first)
+    other = compressed(*VAL)
+    model = forward.train(params(), latents, watched, tmp_path / "c")
+    with pytest.raises(TacpipeError, match="another codec"):
+        forward.train(params(), other, other, tmp_path / "d", model)
+
+
+@pytest.mark.parametrize(("of", "name"), [("levels", "PCA-3"), ("increments", "PCA-3 increments")])
+def test_a_model_of_latents_holds_its_codec(of: str, name: str, tmp_path: Path) -> None:
+    training = compressed(*TRAIN, of=of)
+    files = trained(tmp_path, training, compressed(*VAL, files=training.files))
+    assert set(files) == FILES | {"codec.json", "codec.safetensors"}
+    assert files["codec.safetensors"] == training.files["codec.safetensors"]
+    assert config(files)["codec"]["name"] == name
+
+
+def test_baselines_can_be_left_out(tmp_path: Path) -> None:
+    files = trained(tmp_path, baselines=False)
+    assert set(files) == FILES - {"baselines.safetensors"}
+    assert not {"baselines", "anticipation"} & set(config(files))
+    metrics, _ = judged(files, motion(20))
+    assert {"model", "persistence", "context_mean", "skill", "counts"} == set(metrics)
+
+
+def test_ground_truth_columns_change_nothing(tmp_path: Path) -> None:
+    given = [
+        dataclasses.replace(one, content=one.content.append_column("gt_slip", pa.array(np.arange(80.0))))
+        for one in TRAIN
+    ]
+    files = [trained(tmp_path / name, dataset(*part), epochs=1) for name, part in (("a", given), ("b", TRAIN))]
+    assert files[0] == files[1]
+
+
+def test_training_without_recordings_windows_or_touch_is_refused(tmp_path: Path) -> None:
+    empty, short = dataset(), dataset(motion(1, rows=8))
+    with pytest.raises(TacpipeError, match="no training recording"):
+        forward.train(params(), empty, dataset(*VAL), tmp_path)
+    with pytest.raises(TacpipeError, match="validation recordings hold no window"):
+        forward.train(params(), dataset(*TRAIN), empty, tmp_path)
+    with pytest.raises(TacpipeError, match="training recordings hold no window"):
+        forward.train(params(), short, dataset(*VAL), tmp_path)
+    still = dataset(FakeShard("still", table(np.zeros((40, len(CHANNELS))))))
+    with pytest.raises(TacpipeError, match="None of the 12 tactile channels ever moves in 1 training recordings"):
+        forward.train(params(), still, dataset(*VAL), tmp_path)
+
+
+def test_training_on_rows_of_another_rate_or_grid_than_validation_is_refused(tmp_path: Path) -> None:
+    fresh = dataclasses.replace(VAL[0], attributes={"grid": "fresh"})
+    with pytest.raises(TacpipeError, match="not of one grid"):
+        trained(tmp_path, validation=dataset(fresh))

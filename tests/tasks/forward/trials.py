@@ -1,0 +1,110 @@
+"""Small recordings, params and models for the tests of the forward task."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tacpipe import registry
+from tacpipe.codecs import codec as codecs
+from tacpipe.signals import kinematics
+from tacpipe.stage import Result
+from tacpipe.tasks import forward
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.predictors import Told, told
+from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
+
+Floats = NDArray[np.floating[Any]]
+CONTEXT, HORIZON = 5, 4
+LENGTH = CONTEXT + HORIZON
+SMALL = {"architecture": "gru", "hidden": 16, "epochs": 2, "batch": 64, "context": CONTEXT, "horizon": HORIZON}
+
+
+def params(**changed: Any) -> dict[str, Any]:
+    """The params of the training stage, small."""
+    if changed.get("architecture") == "recurrent":
+        changed = {"loss": "squared", **changed}
+    return dataclasses.asdict(registry.load("train.forward").params(**{**SMALL, **changed}))
+
+
+def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:
+    """The files of a small model of swinging arms."""
+    training = training or dataset(*(motion(seed) for seed in range(3)))
+    return forward.train(params(**changed), training, validation or dataset(motion(10)), folder)
+
+
+def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, of: str = "levels") -> Any:
+    """The recordings with three principal components, and the codec's files."""
+    stage = registry.load("compress.pca")
+    assert stage.fit is not None
+    asked = stage.params(components=3, of=of)
+    files = dict(files or stage.fit(asked, dataset(*shards)).files)
+    latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
+    return dataset(*latent, files=files)
+
+
+def track(content: pa.Table, name: str = "trial", **attributes: Any) -> tracks.Track:
+    """The track of a table."""
+    shard: Any = FakeShard(name, content, attributes)
+    return tracks.track(shard, tracks.codec_of(content, {}))
+
+
+def judged(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
+    """``metrics.json`` and the result of judging a model on recordings."""
+    result: Result = forward.evaluate(model, dataset(*shards, files=files))
+    return json.loads(result.files["metrics.json"]), result
+
+
+def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[np.int64], Told]:
+    """What a model says of all windows of a recording, with the windows' first rows."""
+    found = tracks.track(shard, forecaster.codec)
+    starts = found.starts(forecaster.context, forecaster.horizon)
+    (some,) = told(forecaster, found, starts)
+    return found, starts, some
+
+
+def asked(found: tracks.Track, starts: NDArray[np.int64], columns: int = 13) -> tuple[Floats, Floats]:
+    """The windows and plans that `predict` is given for these first rows; without velocities where 7 columns do."""
+    past, plan = (starts[:, None] + np.arange(*ends) for ends in ((0, CONTEXT), (CONTEXT, LENGTH)))
+    finger = [found.finger[past][..., None]] if columns > 7 else []
+    window = np.concatenate([found.tactile[past], found.arm[past][..., :columns], *finger], axis=-1)
+    return window, found.arm[plan][..., :columns]
+
+
+def counts(shard: FakeShard) -> Floats:
+    """Counts above rest as they stand in a recording's columns (time, channel)."""
+    return np.column_stack([shard.content[name].to_numpy() for name in CHANNELS]).astype(np.float64) - REST
+
+
+def poses(shard: FakeShard) -> Floats:
+    """The poses as they stand in a recording's columns (time, 7)."""
+    return np.column_stack([shard.content[name].to_numpy() for name in tracks.POSE])
+
+
+def panda(rows: int = 60) -> tuple[Floats, dict[str, Floats]]:
+    """The hand's poses (time, 7) of a Panda that swings, and the columns of its joints."""
+    time_s, start = np.arange(rows)[:, None] * 0.02, np.array([0.0, -0.4, 0.1, -2.0, 0.0, 1.8, 0.7])
+    size, rate = np.linspace(0.05, 0.2, 7), np.linspace(2, 4, 7)
+    angles, speeds = start + size * np.sin(rate * time_s), size * rate * np.cos(rate * time_s)
+    last = kinematics.joint_frames(kinematics.PANDA, angles)[:, -1]
+    place = last[:, :3, :3] @ np.array([0.0, 0.0, 0.2]) + last[:, :3, 3]
+    columns: dict[str, Floats] = {f"robot_joint{joint + 1}_rad": angles[:, joint] for joint in range(7)}
+    columns |= {f"robot_joint{joint + 1}_velocity_rad_s": speeds[:, joint] for joint in range(7)}
+    return np.hstack([place, Rotation.from_matrix(last[:, :3, :3]).as_quat()]), columns
+
+
+def raw() -> codecs.Codec:
+    """The codec of recordings that have none."""
+    return tracks.codec_of(motion(0).content, {})
+
+
+__all__ = ["CHANNELS", "FakeShard", "dataset", "motion", "table"]
