@@ -1,0 +1,344 @@
+"""What can be learned of the simulated rig: how much the plan tells, what bounds a forecast, and what nobody can foresee.
+
+Forecasters are trained and judged on trials in which nothing slips. Ground truth serves to judge, never to train.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tacpipe.metrics import skill
+from tacpipe.registry import load
+from tacpipe.simulation import taxels, trajectory
+from tacpipe.tasks import forward
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, told
+from tests.simulation.test_rig_labels import Shard
+from tests.stages.learning_fakes import FakeShard, dataset
+
+Floats = NDArray[np.floating[Any]]
+
+HORIZON = 10
+ROW_NS = 20_000_000
+STICK = {"friction_scale": 4.0}
+STILL = {"still": True, "hold_probability": 0.0}
+PLANNED_SLIP = {"effort": 1.05}
+GRIP_LOSS = {"effort": 0.9, "grip_loss_probability": 1.0, "grip_loss": 0.3}
+TRAINING, WATCHED, TESTED = range(30), range(30, 32), range(32, 44)
+SLIPPING = range(100, 124)
+ALOFT_M = 0.002  # from its start, when the hand is on its way
+SMALL = {
+    "hidden": 64,
+    "dropout": 0.0,
+    "batch": 32,
+    "epochs": 14,
+    "learning_rate": 4e-3,
+    "stride": 6,
+    "baselines": False,
+}
+LAGS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 20)  # rows before now of which one who sees the motion without error knows it
+
+simulate, synchronize, contacts = load("simulate.forward"), load("synchronize"), load("segment.contacts")
+
+
+@cache
+def recorded(index: int, grid: str = "uniform", **rig: Any) -> FakeShard:
+    """A segmented trial of the rig."""
+    recording = simulate(simulate.params(**rig), index)
+    synced = synchronize(synchronize.params(grid=grid), Shard(recording.streams))
+    table = contacts(contacts.params(), Shard({"": synced.streams[""]}))
+    return FakeShard(f"trial-{index}", table, dict(recording.attributes) | {"grid": grid})
+
+
+def trials(indices: range, **rig: Any) -> list[FakeShard]:
+    return [recorded(index, **rig) for index in indices]
+
+
+def trained(folder: Path, training: list[FakeShard], watched: list[FakeShard], **params: Any) -> Forecaster:
+    asked = dataclasses.asdict(load("train.forward").params(**{**SMALL, **params}))
+    return Forecaster.load(forward.train(asked, dataset(*training), dataset(*watched), folder))
+
+
+@pytest.fixture(scope="module")
+def forecasters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Forecaster]:
+    """By what they are told of the plan: planned, none or shuffled."""
+    training, watched = trials(TRAINING, **STICK), trials(WATCHED, **STICK)
+    return {
+        actions: trained(tmp_path_factory.mktemp(actions), training, watched, actions=actions)
+        for actions in ("planned", "none", "shuffled")
+    }
+
+
+def column(shard: FakeShard, name: str) -> Floats:
+    return np.asarray(shard.content.column(name).to_numpy(), dtype=np.float64)
+
+
+def columns(shard: FakeShard, pattern: str) -> Floats:
+    return np.column_stack([column(shard, pattern.format(axis)) for axis in "xyz"])
+
+
+def aloft(shard: FakeShard, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which windows begin when the object is in the air: before, the grip tells most of what comes."""
+    position = columns(shard, "robot_position_{}_m")
+    apart = np.linalg.norm(position - position[0], axis=1)
+    found: NDArray[np.bool_] = np.logical_or.accumulate(apart > ALOFT_M)[starts]
+    return found
+
+
+def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False) -> dict[str, Floats]:
+    """The squared errors in counts (window, step) of model and persistence, in the air."""
+    track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
+    starts = track.starts(forecaster.context, forecaster.horizon)
+    chosen = starts if everywhere else starts[aloft(shard, starts)]
+    parts = list(told(forecaster, track, chosen))
+    return {
+        name: np.concatenate(
+            [np.square(some.predictions[name].count - some.truth.count).mean(axis=2) for some in parts]
+        )
+        for name in (MODEL, BASELINE)
+    }
+
+
+def skill_at_the_end(forecaster: Forecaster, *, everywhere: bool = False) -> float:
+    """The skill over persistence ten steps ahead on trials that the forecaster has not seen."""
+    found = [errors(forecaster, shard, everywhere=everywhere) for shard in trials(TESTED, **STICK)]
+    model, baseline = (np.concatenate([one[name][:, -1] for one in found]).mean() for name in (MODEL, BASELINE))
+    return float(skill(np.array([model]), np.array([baseline]))[0])
+
+
+def acceleration_forecast() -> Any:
+    """A network that tells where acceleration goes from its past, position and velocity, all without error.
+
+    It learns from more trajectories than the forecasters do, and sees twice as far back: what it cannot foresee lies in
+    the chance by which trajectories are made.
+    """
+    torch.manual_seed(0)
+    rows = [flight(index) for index in range(240)]
+    seen, change = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*rows, strict=True))
+    mean, spread = seen.mean(0), seen.std(0) + 1e-6
+    network = torch.nn.Sequential(
+        torch.nn.Linear(seen.shape[1], 96),
+        torch.nn.GELU(),
+        torch.nn.Linear(96, 96),
+        torch.nn.GELU(),
+        torch.nn.Linear(96, 3),
+    )
+    optimiser = torch.optim.Adam(network.parameters(), 3e-3)
+    steps = 6 * len(seen) // 512
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
+        some = torch.randint(len(seen), (512,))
+        loss = torch.nn.functional.mse_loss(network((seen[some] - mean) / spread), change[some])
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        falling.step()
+    return lambda given: network((torch.from_numpy(given).float() - mean) / spread).detach().numpy()
+
+
+def flight(index: int) -> tuple[Floats, Floats]:
+    """What is known of a random trajectory in the air at each row, and the change of acceleration to come."""
+    rng = np.random.default_rng([7, index])
+    path = trajectory.trajectory(trajectory.PROTOCOLS[index % 2], 12.0, 1.5, rng)
+    every = round(ROW_NS * trajectory.RATE_HZ / 1e9)
+    position, acceleration = path.position_m[::every], path.acceleration_m_s2[::every]
+    now = np.arange(1_500 // every + 10, len(position) - HORIZON)
+    return known(position, acceleration, now), acceleration[now + HORIZON] - acceleration[now]
+
+
+def known(position: Floats, acceleration: Floats, now: NDArray[np.int64]) -> Floats:
+    before = [acceleration[now - lag] for lag in LAGS]
+    return np.hstack([*before, position[now] - position[0], position[now] - position[now - 1]])
+
+
+def bound_without_plan() -> float:
+    """The skill that is left to one who knows the object, the skin and the past, but not the acceleration to come.
+
+    Touch in the air is linear in acceleration but for a few percent. Its slope is fitted on each test trial itself, so
+    that it is known as nobody can know it; neither noise nor what is not linear is counted.
+    """
+    forecast = acceleration_forecast()
+    missed, moved = 0.0, 0.0
+    for shard in trials(TESTED, **STICK):
+        track = tracks.track(shard, tracks.codec_of(shard.content, {}))  # type: ignore[arg-type]
+        starts = track.starts(10, HORIZON)
+        starts = starts[aloft(shard, starts) & (starts >= max(LAGS))]
+        now = starts + 9
+        acceleration = columns(shard, "gt_acceleration_{}_m_s2")
+        felt = track.tactile[now + HORIZON] - track.tactile[now]
+        change = acceleration[now + HORIZON] - acceleration[now]
+        slope = np.linalg.lstsq(change, felt, rcond=None)[0]
+        told_change = forecast(known(columns(shard, "robot_position_{}_m"), acceleration, now))
+        missed += np.square((change - told_change) @ slope).sum()
+        moved += np.square(felt).sum()
+    return 1 - missed / moved
+
+
+@dataclasses.dataclass(frozen=True)
+class Watch:
+    """How near load comes to slip, (time,): felt, and foretold ten steps before; and what it is where slip begins."""
+
+    felt: Floats
+    ahead: Floats
+    limit: float
+
+
+def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
+    """The pull of the object over the pressure of the fingers, in counts, and the truth's friction in the same unit."""
+    track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
+    ahead = np.full_like(track.tactile, np.nan)
+    for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        ahead[some.now] = some.predictions[MODEL].count[:, -1]
+    felt = pull_over_pressure(track.tactile)
+    pull = np.hypot(column(shard, "gt_force_x_n"), column(shard, "gt_force_z_n"))
+    pressure = column(shard, "gt_finger1_normal_n") + column(shard, "gt_finger2_normal_n")
+    held = (column(shard, "gt_slip") == 0) & (pressure > 2) & (pull > 0.1 * pressure)
+    true = pull[held] / pressure[held]
+    limit = float(felt[held] @ true / (true @ true)) * float(shard.attributes["gt_friction"])
+    return Watch(felt, pull_over_pressure(ahead), limit)
+
+
+def pull_over_pressure(counts: Floats) -> Floats:
+    """The ratio (time,) that friction bounds; ``counts`` are (time, channel)."""
+    x, y, z = (counts[:, axis::3].sum(axis=1) for axis in range(3))
+    ratio: Floats = np.hypot(x, y) / np.maximum(np.abs(z), 1.0)
+    return ratio
+
+
+def median_lead(forecaster: Forecaster, kind: dict[str, Any]) -> float:
+    """The median of the rows by which alarms come before slip, over trials in which the object slips.
+
+    The event is the slip itself, at the first row T of the truth's. An alarm is on in a row in which touch, as foretold
+    ten rows later, would pass what friction holds; the judge knows the friction, the forecaster does not. The lead is T
+    less the first row with an alarm from T - 12, for what a forecast rounds, but never above 10, to T + 9; with none it
+    is -10. The onset of a change of load, as `tacpipe.signals.anticipation` tells it, is another event: the load rises
+    before the object slips, and an exact forecast leads the rise by a few rows only.
+    """
+    found = []
+    for shard in trials(SLIPPING, **kind):
+        slipping = np.flatnonzero(column(shard, "gt_slip") > 0)
+        if not len(slipping):
+            continue
+        seen, onset = watch(forecaster, shard), int(slipping[0])
+        first = max(onset - HORIZON - 2, 0)
+        alarm = seen.ahead[first : onset + HORIZON] > seen.limit
+        found.append(min(onset - first - int(alarm.argmax()), HORIZON) if alarm.any() else -HORIZON)
+    assert len(found) >= len(SLIPPING) - 2
+    return float(np.median(found))
+
+
+def loaded(index: int) -> FakeShard:
+    """A trial without any motion, under a load that the tare does not tell; on the rows of xela1, as it came."""
+    shard = recorded(index, grid="logged", **STILL)
+    rng, content = np.random.default_rng([8, index]), shard.content
+    for position, about in enumerate(content.schema):
+        if (about.metadata or {}).get(b"quantity") == b"tactile":
+            values = content.column(position).to_numpy() + np.round(rng.normal(0, 300))
+            content = content.set_column(position, about, pa.array(values, about.type))
+    return FakeShard(shard.name, content, shard.attributes)
+
+
+def altered(shard: FakeShard, change: dict[str, Floats]) -> FakeShard:
+    """The recording with some values added to its columns."""
+    content = shard.content
+    for name, values in change.items():
+        position = content.column_names.index(name)
+        about = content.schema.field(position)
+        content = content.set_column(
+            position, about, pa.array(content.column(position).to_numpy() + values, about.type)
+        )
+    return FakeShard(shard.name, content, shard.attributes)
+
+
+def said(forecaster: Forecaster, shard: FakeShard) -> tuple[NDArray[np.int64], Floats]:
+    """The rows at which predictions are made, and these (window, step, channel)."""
+    track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
+    parts = list(told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
+    counts = np.concatenate([some.predictions[MODEL].count for some in parts])
+    return np.concatenate([some.now for some in parts]), counts
+
+
+def from_row(shard: FakeShard, row: int, values: Floats | float) -> Floats:
+    added = np.zeros(shard.content.num_rows)
+    added[row:] = values
+    return added
+
+
+def test_who_knows_the_plan_foresees_most_of_the_change_of_load(forecasters: dict[str, Forecaster]) -> None:
+    assert skill_at_the_end(forecasters["planned"]) >= 0.8
+    assert skill_at_the_end(forecasters["planned"], everywhere=True) >= 0.8
+
+
+def test_without_the_plan_no_more_is_foreseen_than_acceleration_can_be(forecasters: dict[str, Forecaster]) -> None:
+    bound = bound_without_plan()
+    assert skill_at_the_end(forecasters["none"]) <= bound
+    assert skill_at_the_end(forecasters["planned"]) > bound + 0.05
+
+
+def test_plans_of_other_windows_help_no_more_than_none(forecasters: dict[str, Forecaster]) -> None:
+    without = skill_at_the_end(forecasters["none"])
+    assert skill_at_the_end(forecasters["shuffled"]) <= without + 0.05
+    assert skill_at_the_end(forecasters["planned"]) >= without + 0.2
+
+
+def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
+    noise = (np.square(taxels.NOISE_COUNT) + 1 / 12).mean()
+    forecaster = trained(tmp_path, [loaded(index) for index in range(8)], [loaded(8)], epochs=6, hidden=32)
+    own = slice(0, len(forecaster.codec.channels) // 2)  # xela1: what stands between its rows is not interpolated
+    squared: dict[str, list[Floats]] = {MODEL: [], BASELINE: []}
+    for index in range(9, 14):
+        shard = loaded(index)
+        track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
+        for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            for name, found in squared.items():
+                found.append(np.square(some.predictions[name].count - some.truth.count)[..., own].mean(axis=2))
+    model, baseline = (np.concatenate(squared[name]).mean(axis=0) / noise for name in (MODEL, BASELINE))  # (step,)
+    assert baseline == pytest.approx(2.0, rel=0.05)
+    assert (model >= (1 + 1 / 10) * 0.95).all()
+    assert (model <= 2.0).all()
+
+
+def test_touch_that_is_to_come_changes_no_forecast(forecasters: dict[str, Forecaster]) -> None:
+    forecaster, shard, row = forecasters["planned"], recorded(TESTED[0], **STICK), 300
+    rng = np.random.default_rng(3)
+    off = {
+        name: from_row(shard, row + 1, rng.normal(0, 500, shard.content.num_rows - row - 1))
+        for name in forecaster.codec.channels
+    }
+    now, before = said(forecaster, shard)
+    _, after = said(forecaster, altered(shard, off))
+    assert np.abs(after[now <= row] - before[now <= row]).max() < 0.01
+    assert np.abs(after[now == row + 1] - before[now == row + 1]).max() > 10
+
+
+@pytest.mark.parametrize("ahead", [1, 4, 10])
+def test_a_plan_changes_no_forecast_before_its_own_step(ahead: int, forecasters: dict[str, Forecaster]) -> None:
+    forecaster, shard, row = forecasters["planned"], recorded(TESTED[0], **STICK), 300
+    off = {f"robot_position_{axis}_m": from_row(shard, row + ahead, 0.01) for axis in "xyz"}
+    now, before = said(forecaster, shard)
+    _, after = said(forecaster, altered(shard, off))
+    moved = np.abs(after - before)[now == row][0].max(axis=1)  # (step,)
+    assert (moved[: ahead - 1] < 0.01).all()
+    assert moved[ahead - 1] > 1
+    assert np.abs(after[now < row + ahead - HORIZON] - before[now < row + ahead - HORIZON]).max() < 0.01
+
+
+def test_a_slip_that_the_plan_makes_is_announced_to_who_knows_it(forecasters: dict[str, Forecaster]) -> None:
+    lead = median_lead(forecasters["planned"], PLANNED_SLIP)
+    assert lead >= 5
+    assert median_lead(forecasters["none"], PLANNED_SLIP) <= lead - 5
+
+
+def test_nobody_announces_that_the_grip_gives_way(forecasters: dict[str, Forecaster]) -> None:
+    assert median_lead(forecasters["planned"], GRIP_LOSS) <= 0
+    assert median_lead(forecasters["none"], GRIP_LOSS) <= 0
