@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -29,6 +30,9 @@ halves = toy_stages:halves
 [tacpipe.formats]
 numbers = toy_stages:read
 """
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: programs that the tests interrupt inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass
