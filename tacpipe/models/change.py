@@ -105,8 +105,7 @@ class SequenceForecast(ChangeForecast):
         past, plan = arm[: windows.context], arm[windows.context :]
         apart = torch.asinh((windows.touch - windows.touch[-1]) / self.change_scale)
         level = ((windows.touch - self.touch_mean) / self.touch_scale).clamp(-CLIPPED, CLIPPED)
-        closing = 300.0 * (windows.finger - windows.finger[-1])  # 3 mm between rows is a fast gripper
-        read = torch.cat([apart, level, held(windows.touch)[..., None], closing[..., None], past], -1)
+        read = torch.cat([apart, level, held(windows.touch)[..., None], closing(windows)[..., None], past], -1)
         if self.cell == "tcn":
             states = self._convolved(read, plan)
         else:
@@ -147,6 +146,11 @@ def spread(rows: Tensor) -> Tensor:
 def _scale(found: Tensor) -> Tensor:
     """Return the spread ``found``, and 1 where nothing moves."""
     return torch.where(found > 0, found, 1.0)
+
+
+def closing(windows: Windows) -> Tensor:
+    """Return the width between the fingers against now, (context, window), in thirds of a centimetre."""
+    return 300.0 * (windows.finger - windows.finger[-1])  # 3 mm between rows is a fast gripper
 
 
 def driven(windows: Windows) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.change import CLIPPED, MOTION, UP, ChangeForecast, spread
+from tacpipe.models.change import CLIPPED, MOTION, UP, ChangeForecast, closing, spread
 from tacpipe.models.windows import Windows, held
 
 TRAITS = 16  # numbers that tell one place on the sensors from another
@@ -111,8 +111,7 @@ class TaxelwiseForecast(ChangeForecast):
         felt = torch.cat([sensors.mean(3), sensors.std(3)], -1).permute(1, 0, 2, 3).flatten(1)
         steps, up = self.arm(windows)
         past = steps[: windows.context].transpose(0, 1).flatten(1)
-        closing = 300.0 * (windows.finger - windows.finger[-1]).T
-        return own, torch.cat([felt, up, past, closing, 1 - held(touch).T], -1)
+        return own, torch.cat([felt, up, past, closing(windows).T, 1 - held(touch).T], -1)
 
 
 def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,27 +11,12 @@ import pytest
 from tacpipe.formats import channels
 from tacpipe.registry import load
 from tacpipe.simulation import faults, pick_and_move, taxels
-from tacpipe.stage import Attribute, Recording
+from tacpipe.stage import Recording
+from tests.stages.conftest import FakeShard
 
 TRIALS = 20
 simulate, synchronize = load("simulate.forward"), load("synchronize")
 contacts, slips = load("segment.contacts"), load("segment.slips")
-
-
-@dataclass(frozen=True)
-class Shard:
-    """A recording that lies in memory, as a stage reads one."""
-
-    tables: dict[str, pa.Table]
-    name: str = "trial"
-    attributes: dict[str, Attribute] = field(default_factory=dict)
-
-    @property
-    def streams(self) -> tuple[str, ...]:
-        return tuple(sorted(self.tables))
-
-    def table(self, stream: str = "") -> pa.Table:
-        return self.tables[stream]
 
 
 def recorded(trial: int, **rig: Any) -> Recording:
@@ -41,13 +25,13 @@ def recorded(trial: int, **rig: Any) -> Recording:
 
 
 def synced(recording: Recording, **params: Any) -> Recording:
-    found: Recording = synchronize(synchronize.params(**params), Shard(recording.streams))
+    found: Recording = synchronize(synchronize.params(**params), FakeShard(recording.streams))
     return found
 
 
 def labelled(trial: int, **rig: Any) -> pa.Table:
     table = synced(recorded(trial, **rig)).streams[""]
-    return slips(slips.params(), Shard({"": contacts(contacts.params(), Shard({"": table}))}))
+    return slips(slips.params(), FakeShard({"": contacts(contacts.params(), FakeShard({"": table}))}))
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:

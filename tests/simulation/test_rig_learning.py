@@ -23,7 +23,7 @@ from tacpipe.tasks import forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, told
-from tests.simulation.test_rig_labels import Shard
+from tests.stages.conftest import FakeShard as Shard
 from tests.stages.learning_fakes import FakeShard, dataset
 
 Floats = NDArray[np.floating[Any]]

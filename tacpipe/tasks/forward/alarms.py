@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.signals import anticipation
+from tacpipe.signals import anticipation, holds
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Told
 from tacpipe.tasks.forward.tracks import Track
 
@@ -82,7 +82,7 @@ class Loads:
                 sd=sd,
                 theta=theta,
                 rate_hz=self._rate_hz(),
-                held=self._held(truth),
+                held=holds.held(truth),
             )
             found[name] = {key: _number(value) for key, value in asdict(score).items()}
         return found
@@ -93,11 +93,6 @@ class Loads:
 
     def _rate_hz(self) -> float:
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
-
-    def _held(self, truth: Floats) -> NDArray[np.bool_]:
-        held = np.zeros(len(truth), dtype=bool)
-        held[1:] = (truth[1:] == truth[:-1]).all(axis=1)
-        return held
 
     def _loads(self, counts: Floats) -> Floats:
         """Return the mean of each sensor's axes (time, feature) of ``counts`` (time, channel)."""

@@ -72,6 +72,16 @@ class Forecaster:
         return tracks.ARM
 
     @property
+    def tells_change(self) -> bool:
+        """Whether it tells what is added to the last row, rather than levels."""
+        return bool(self.model.change_only)
+
+    @property
+    def lossy(self) -> bool:
+        """Whether its features are levels that a codec made, so that the last row too comes back as another."""
+        return self.codec.kind != "raw" and self.codec.of != INCREMENTS
+
+    @property
     def feature_half(self) -> Floats:
         """Half of each feature's training range (feature,): what the paper's error is measured in."""
         return np.array(self.config["scaling"]["feature_half"])
@@ -127,7 +137,7 @@ class Forecaster:
         tells change adds the decoded change to the last row, so that it does not pay for what the codec lost of it.
         """
         levels = codecs.decode_ahead(self.codec, features, last)
-        if getattr(self.model, "change_only", False) and self.codec.kind != "raw" and self.codec.of != INCREMENTS:
+        if self.tells_change and self.lossy:
             return self.anchored(levels, last, last_feature)
         return levels.astype(np.float64, copy=False)
 

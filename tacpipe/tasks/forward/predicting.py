@@ -14,7 +14,7 @@ from tacpipe.stage import Recording, Result
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.judging import check_rate
-from tacpipe.tasks.forward.predictors import MODEL, told
+from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
         starts = track.starts(forecaster.context, forecaster.horizon)
         parts: list[Floats] = [np.zeros((0, len(steps), len(forecaster.codec.channels)))]
         wanted = [step - 1 for step in steps]
-        parts += [some.predictions[MODEL].count[:, wanted] for some in told(forecaster, track, starts)]
+        parts += [some.count[:, wanted] for some in forecasts(forecaster, track, starts)]
         found[name] = Recording(
             _table(forecaster, track.t_ns[starts + forecaster.context - 1], np.concatenate(parts), steps)
         )

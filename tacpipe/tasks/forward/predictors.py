@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.stretches import INCREMENTS
-from tacpipe.models.windows import motion
+from tacpipe.models.windows import Windows, motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.rows import rows
@@ -45,41 +45,64 @@ class Told:
     predictions: dict[str, Prediction]
 
 
-def told(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Told]:
-    """Yield what all predictors say of the windows of ``track`` that begin at ``starts``, some windows at a time."""
+@dataclass(frozen=True)
+class Forecast:
+    """Some windows of a recording, and what the model alone says would come."""
+
+    windows: Windows
+    past: NDArray[np.int64]  # (window, context), rows that are read
+    future: NDArray[np.int64]  # (window, step), rows that are told
+    features: Floats  # (window, step, feature)
+    count: Floats  # (window, step, channel)
+
+    @property
+    def now(self) -> NDArray[np.int64]:
+        """The last row that is read (window,)."""
+        return self.past[:, -1]
+
+
+def forecasts(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Forecast]:
+    """Yield what the model says of the windows of ``track`` that begin at ``starts``, some windows at a time."""
     context, horizon = forecaster.context, forecaster.horizon
+    track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
     found = rows([track], [starts], context, horizon)
-    arm = torch.from_numpy(tracks.aligned(track.arm, forecaster.orientation))
     for first in range(0, len(starts), CHUNK):
         some = starts[first : first + CHUNK]
         past, future = (some[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
         windows = found.pick(torch.from_numpy(some))[0]
-        windows = windows._replace(arm=arm[torch.from_numpy(np.hstack([past, future]).T)])
-        now = past[:, -1]
-        truth = Prediction(track.latent[future], track.tactile[future])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # plans are dealt out alike whenever a control is judged
             features = forecaster.told(windows)
-        predictions = _of_model(forecaster, features, track.tactile[now], track.latent[now])
-        predictions |= _of_codec(forecaster, track.latent[future], track.tactile[now], track.latent[now])
-        predictions["context_mean"] = Prediction(None, _held(track.tactile[past].mean(axis=1), horizon))
+        count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
+        yield Forecast(windows, past, future, features, count)
+
+
+def told(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Told]:
+    """Yield what all predictors say of the windows of ``track`` that begin at ``starts``, some windows at a time."""
+    for some in forecasts(forecaster, track, starts):
+        last, last_feature = track.tactile[some.now], track.latent[some.now]
+        truth = Prediction(track.latent[some.future], track.tactile[some.future])
+        predictions = _of_model(forecaster, some, last, last_feature)
+        predictions |= _of_codec(forecaster, track.latent[some.future], last, last_feature)
+        past = track.tactile[some.past]
+        predictions["context_mean"] = Prediction(None, _held(past.mean(axis=1), forecaster.horizon))
         if forecaster.baselines is not None:
-            moved = motion(windows)[0].transpose(0, 1).numpy()
-            for name, counts in forecaster.baselines.predict(track.tactile[past].astype(np.float32), moved).items():
+            moved = motion(some.windows)[0].transpose(0, 1).numpy()
+            for name, counts in forecaster.baselines.predict(past.astype(np.float32), moved).items():
                 predictions[name] = Prediction(None, counts)
-        yield Told(now, features, truth, predictions)
+        yield Told(some.now, some.features, truth, predictions)
 
 
-def _of_model(forecaster: Forecaster, features: Floats, last: Floats, last_feature: Floats) -> dict[str, Prediction]:
+def _of_model(forecaster: Forecaster, some: Forecast, last: Floats, last_feature: Floats) -> dict[str, Prediction]:
     """Return the model's prediction, and persistence; ``last`` (window, channel) is what is felt now."""
     codec, horizon = forecaster.codec, forecaster.horizon
     still = np.zeros_like(last_feature) if codec.of == INCREMENTS else last_feature
     found = {
-        MODEL: Prediction(features, forecaster.decoded(features, last, last_feature)),
+        MODEL: Prediction(some.features, some.count),
         BASELINE: Prediction(_held(still, horizon), _held(last, horizon)),
     }
-    if codec.kind != "raw" and codec.of != INCREMENTS and not getattr(forecaster.model, "change_only", False):
-        found["model_anchored"] = Prediction(None, forecaster.anchored(codec.decode(features), last, last_feature))
+    if forecaster.lossy and not forecaster.tells_change:
+        found["model_anchored"] = Prediction(None, forecaster.anchored(some.count, last, last_feature))
     return found
 
 
@@ -90,7 +113,7 @@ def _of_codec(forecaster: Forecaster, ahead: Floats, last: Floats, last_feature:
         return {}
     decoded = codecs.decode_ahead(codec, ahead, last)
     found = {"codec": Prediction(ahead, decoded)}
-    if codec.of != INCREMENTS:
+    if forecaster.lossy:
         found["codec_persistence"] = Prediction(None, _held(codec.decode(last_feature), forecaster.horizon))
         found["codec_anchored"] = Prediction(None, forecaster.anchored(decoded, last, last_feature))
     return found

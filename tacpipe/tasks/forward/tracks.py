@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
+from tacpipe.codecs.stretches import breaks
 from tacpipe.errors import TacpipeError
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
@@ -128,7 +129,7 @@ def track(shard: Shard, codec: codecs.Codec) -> Track:
         shard.name,
         t_ns,
         contact,
-        _groups(t_ns, APART.get(timeline, APART["uniform"])),
+        np.cumsum(breaks(t_ns, APART.get(timeline, APART["uniform"]))),
         finite & np.isfinite(finger) & ~tactile.gaps(table),
         latent.astype(np.float32),
         arm,
@@ -196,11 +197,3 @@ def _orientation(quaternions: Floats) -> Floats:
     """Return unit quaternions (time, 4) of continuous sign; those that cannot be normalised become NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return continuous(quaternions.astype(np.float64))
-
-
-def _groups(t_ns: NDArray[np.int64], apart: float) -> NDArray[np.int64]:
-    """Return a number for each row (time,) that changes where rows are missing: a step of ``apart`` times the usual."""
-    if len(t_ns) < 2:
-        return np.zeros(len(t_ns), dtype=np.int64)
-    steps = np.diff(t_ns)
-    return np.concatenate([[0], np.cumsum(steps > apart * np.median(steps))]).astype(np.int64)

@@ -25,7 +25,7 @@ from tacpipe.tasks.forward.forecaster import BASELINES, CONFIG, TASK, WEIGHTS, C
 from tacpipe.tasks.forward.predictors import told
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
-from tacpipe.training import loop
+from tacpipe.training import loop, scaling
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -109,11 +109,7 @@ def train(
     files |= {WEIGHTS: save_tensors(trained.weights), CONFIG: _json(config)}
     if params["baselines"]:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
-    return {
-        **files,
-        CONFIG: _json(config),
-        HISTORY: trained.history_lines,
-    }
+    return {**files, CONFIG: _json(config), HISTORY: trained.history_lines}
 
 
 def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
@@ -171,9 +167,9 @@ def _scaling(part: Sequence[Track]) -> dict[str, list[float]]:
     """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
     latent = np.concatenate([one.latent[one.usable] for one in part])
     tactile = np.concatenate([one.tactile[one.usable] for one in part])
-    half, spread = np.ptp(latent.astype(np.float64), axis=0) / 2, tactile.std(axis=0)
+    spread = tactile.std(axis=0)
     return {
-        "feature_half": np.where(half > 0, half, 1.0).tolist(),
+        "feature_half": scaling.fit(latent).half.tolist(),
         "channel_count": np.where(spread > 0, spread, 1.0).tolist(),
     }
 
