@@ -35,8 +35,7 @@ def _line(folder: Path, rounds: int, batch: int, latents: int) -> timing.Line:
         with tempfile.TemporaryDirectory(dir=folder) as workspace:
             loop.train(
                 lambda: _loaded(RecurrentForward(latents, STATES, HIDDEN), first),
-                loop.Part(WINDOWS, _loss(rows, latents)),
-                loop.Part(1, _loss(rows, latents)),
+                loop.Windows(loop.Part(WINDOWS, _loss(rows, latents)), loop.Part(1, _loss(rows, latents)), batch),
                 schedule,
                 Path(workspace),
             )

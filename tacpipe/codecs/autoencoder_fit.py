@@ -166,8 +166,7 @@ def _trained(
 
     return loop.train(
         lambda: _Mirrored(widths, bias=of == stretches.LEVELS),
-        part(learned),
-        part(watched),
+        loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace,
         weight_decay=network.weight_decay,

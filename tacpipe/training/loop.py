@@ -1,18 +1,19 @@
 """The training loop: Adam, clipped gradients, early stopping, and a checkpoint after every epoch.
 
-Batches are rows of tensors picked by index, so no loader stands between the data and the step. All randomness
-(first weights, dropout, shuffles) comes from torch's generator under one seed, whose state is part of the checkpoint:
-a run that was killed and resumed gives the same bits as one that was not.
+What is learned comes as `Work`: its batches, its loss, and what is watched after each epoch. Batches are rows of tensors
+picked by index, so no loader stands between the data and the step. All randomness (first weights, dropout, shuffles)
+comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and resumed
+gives the same bits as one that was not.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +24,7 @@ from tacpipe.training import checkpoint
 
 RISE = 0.3  # share of all epochs over which the learning rate of a cycle rises
 Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
+Line = dict[str, Any]  # of the history: what became of an epoch, as JSON holds it
 
 
 @dataclass(frozen=True)
@@ -64,12 +66,68 @@ class Part:
     loss: Loss
 
 
+class Work(Protocol):
+    """What is to be learned: batches of an epoch, the loss of each, and what is watched when the epoch is over."""
+
+    def batches(self, epoch: int) -> Sequence[Any]:
+        """Return the batches of an epoch, from 0; what is random in them comes from torch's generator."""
+
+    def loss(self, model: nn.Module, batch: Any, epoch: int) -> tuple[Tensor, int]:
+        """Return the loss to be lowered and the weight of the batch in the epoch's mean."""
+
+    def watch(self, model: nn.Module) -> Line:
+        """Return ``val_loss`` and whatever else the epoch's line of the history shall hold."""
+
+    def ranks(self, line: Line) -> Mapping[str, Sequence[float]]:
+        """Return what an epoch is chosen by, the lowest being best, for each part of the model that is chosen alone.
+
+        A part is named by how its weights' names begin; the part ``""`` is the whole model.
+        """
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The work of most models: training windows in another order every epoch, chosen by the validation loss."""
+
+    training: Part
+    validation: Part
+    batch: int
+
+    def __post_init__(self) -> None:
+        """Refuse parts without windows."""
+        for name, part in (("training", self.training), ("validation", self.validation)):
+            if not part.count:
+                raise TacpipeError(
+                    f"The {name} recordings hold no window. Give more or longer ones, or shorten context and horizon."
+                )
+
+    def batches(self, epoch: int) -> list[Tensor]:
+        """Return indices of all training windows, shuffled."""
+        return list(_pieces(torch.randperm(self.training.count), self.batch))
+
+    def loss(self, model: nn.Module, batch: Tensor, epoch: int) -> tuple[Tensor, int]:
+        """Return the mean loss of the windows with these indices, and their number."""
+        return self.training.loss(model, batch), len(batch)
+
+    def watch(self, model: nn.Module) -> Line:
+        """Return the mean loss over all validation windows."""
+        total: Tensor | float = 0.0
+        for indices in _pieces(torch.arange(self.validation.count), self.batch):
+            total = total + self.validation.loss(model, indices).double() * len(indices)
+        return {"val_loss": float(total) / self.validation.count}
+
+    def ranks(self, line: Line) -> dict[str, tuple[float]]:
+        """Return the validation loss."""
+        return {"": (float(line["val_loss"]),)}
+
+
 @dataclass(frozen=True)
 class Trained:
-    """The weights of the epoch with the lowest validation loss, and the losses of all epochs."""
+    """The weights of the best epoch and of the last, and the history of all epochs."""
 
     weights: dict[str, Tensor]
-    history: list[dict[str, float | int | bool]]
+    history: list[Line]
+    last: dict[str, Tensor]
 
     @property
     def history_lines(self) -> bytes:
@@ -84,7 +142,7 @@ class _Run:
     model: nn.Module
     optimiser: torch.optim.Adam
     best: dict[str, Tensor]
-    history: list[dict[str, float | int | bool]]
+    history: list[Line]
 
     def save(self, folder: Path) -> None:
         slots = self.optimiser.state_dict()["state"]
@@ -117,83 +175,76 @@ class _Run:
 
 
 def train(
-    build: Callable[[], nn.Module],
-    training: Part,
-    validation: Part,
-    schedule: Schedule,
-    workspace: Path,
-    *,
-    weight_decay: float = 0.0,
+    build: Callable[[], nn.Module], work: Work, schedule: Schedule, workspace: Path, *, weight_decay: float = 0.0
 ) -> Trained:
-    """Return the best weights of the model that ``build`` makes, trained to lower ``training``'s loss.
+    """Return the best weights of the model that ``build`` makes, trained to lower the loss of ``work``.
 
-    ``weight_decay`` is Adam's: this share of each weight is added to its gradient.
+    ``weight_decay`` is Adam's: this share of each weight is added to its gradient. Weights that need no gradient stay.
     Goes on from the checkpoint in ``workspace`` if there is one. Leaves torch's own generator as it was.
-    Raises `TacpipeError` where a part has no windows or the loss is no longer finite.
+    Raises `TacpipeError` where the loss is no longer finite.
     """
-    for name, part in (("training", training), ("validation", validation)):
-        if not part.count:
-            raise TacpipeError(
-                f"The {name} recordings hold no window. Give more or longer ones, or shorten context and horizon."
-            )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(schedule.seed)
         model = build()
-        optimiser = torch.optim.Adam(
-            model.parameters(), lr=schedule.learning_rate, weight_decay=weight_decay, fused=True
-        )
+        learned = [weight for weight in model.parameters() if weight.requires_grad]
+        optimiser = torch.optim.Adam(learned, lr=schedule.learning_rate, weight_decay=weight_decay, fused=True)
         run = _Run(model, optimiser, {}, [])
         run.resume(workspace)
         with bar("train", schedule.epochs) as advance:
             advance(len(run.history))
             while not run.over(schedule):
-                line = _epoch(run, training, validation, schedule)
+                line = _epoch(run, work, schedule)
                 run.save(workspace)
                 advance(1, f"validation {line['val_loss']:.5f}")
-    return Trained({name: value.cpu() for name, value in run.best.items()}, run.history)
+    return Trained(
+        {name: value.cpu() for name, value in run.best.items()},
+        run.history,
+        {name: value.detach().cpu() for name, value in run.model.state_dict().items()},
+    )
 
 
-def _epoch(run: _Run, training: Part, validation: Part, schedule: Schedule) -> dict[str, float | int | bool]:
+def _epoch(run: _Run, work: Work, schedule: Schedule) -> Line:
     """Train for one epoch, add its line to the history and return it."""
     run.model.train()
+    epoch = len(run.history)
     total: Tensor | float = 0.0
-    steps = -(-training.count // schedule.batch)
-    for step, indices in enumerate(_batches(torch.randperm(training.count), schedule.batch)):
+    count = 0
+    batches = work.batches(epoch)
+    for step, batch in enumerate(batches):
         for group in run.optimiser.param_groups:
-            group["lr"] = schedule.rate((len(run.history) + step / steps) / schedule.epochs)
-        loss = training.loss(run.model, indices)
+            group["lr"] = schedule.rate((epoch + step / len(batches)) / schedule.epochs)
+        loss, weight = work.loss(run.model, batch, epoch)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(run.model.parameters(), schedule.gradient_clip)
+        if math.isfinite(schedule.gradient_clip):
+            nn.utils.clip_grad_norm_(run.model.parameters(), schedule.gradient_clip)
         run.optimiser.step()
-        total = total + loss.detach().double() * len(indices)
-    line: dict[str, float | int | bool] = {
-        "epoch": len(run.history) + 1,
-        "train_loss": float(total) / training.count,
-        "val_loss": _mean_loss(run.model, validation, schedule.batch),
-    }
+        total = total + loss.detach().double() * weight
+        count += weight
+    run.model.eval()
+    with torch.no_grad():
+        watched = work.watch(run.model)
+    line: Line = {"epoch": epoch + 1, "train_loss": float(total) / count, **watched}
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."
         )
-    line["best"] = line["val_loss"] < min((float(old["val_loss"]) for old in run.history), default=math.inf)
-    if line["best"]:
-        run.best = {name: value.detach().clone() for name, value in run.model.state_dict().items()}
+    better = _better(work.ranks(line), [work.ranks(old) for old in run.history])
+    line["best"] = bool(better)
+    if better:
+        now = run.model.state_dict().items()
+        run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(better))}
     run.history.append(line)
     return line
 
 
-@torch.no_grad()
-def _mean_loss(model: nn.Module, part: Part, batch: int) -> float:
-    """Return the mean loss over all windows of ``part``."""
-    model.eval()
-    total: Tensor | float = 0.0
-    for indices in _batches(torch.arange(part.count), batch):
-        total = total + part.loss(model, indices).double() * len(indices)
-    return float(total) / part.count
+def _better(ranks: Mapping[str, Sequence[float]], before: Iterable[Mapping[str, Sequence[float]]]) -> list[str]:
+    """Return the parts of the model that were never as good as now."""
+    known = list(before)
+    return [part for part, rank in ranks.items() if all(tuple(rank) < tuple(old[part]) for old in known)]
 
 
-def _batches(indices: Tensor, batch: int) -> Iterator[Tensor]:
+def _pieces(indices: Tensor, batch: int) -> Iterator[Tensor]:
     """Yield the indices in pieces of ``batch``, the last maybe shorter."""
     for first in range(0, len(indices), batch):
         yield indices[first : first + batch]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.training import checkpoint
-from tacpipe.training.loop import Loss, Part, Schedule, Trained, train
+from tacpipe.training.loop import Loss, Part, Schedule, Trained, Windows, train
 
 SCHEDULE = Schedule(epochs=6, batch=8, learning_rate=0.01, patience=3, gradient_clip=1.0, seed=4)
 INPUTS = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
@@ -26,7 +26,7 @@ def loss(model: nn.Module, indices: Tensor) -> Tensor:
 
 
 def run(folder: Path, training_loss: Loss = loss, schedule: Schedule = SCHEDULE) -> Trained:
-    return train(build, Part(32, training_loss), Part(40, loss), schedule, folder)
+    return train(build, Windows(Part(32, training_loss), Part(40, loss), schedule.batch), schedule, folder)
 
 
 def interrupted_after(calls: int) -> Loss:
@@ -103,7 +103,7 @@ def test_training_stops_when_validation_no_longer_improves_and_keeps_the_best(tm
         return torch.tensor(next(validation))
 
     schedule = dataclasses.replace(SCHEDULE, epochs=50, batch=100)
-    found = train(build, Part(32, loss), Part(40, scripted), schedule, tmp_path)
+    found = train(build, Windows(Part(32, loss), Part(40, scripted), schedule.batch), schedule, tmp_path)
     assert [line["best"] for line in found.history] == [True, True, False, False, False]
     assert all(torch.equal(found.weights[name], seen[1][name]) for name in seen[1])
 
@@ -113,7 +113,7 @@ def test_the_loss_of_an_epoch_is_the_mean_over_windows_and_not_over_batches(tmp_
         return loss(model, indices) * 0 + len(indices)
 
     schedule = dataclasses.replace(SCHEDULE, epochs=1, batch=20)
-    found = train(build, Part(32, by_size), Part(32, by_size), schedule, tmp_path)
+    found = train(build, Windows(Part(32, by_size), Part(32, by_size), schedule.batch), schedule, tmp_path)
     assert found.history[0]["val_loss"] == found.history[0]["train_loss"] == (20 * 20 + 12 * 12) / 32
 
 
@@ -172,8 +172,52 @@ def test_a_loss_that_is_not_finite_ends_training_with_a_sentence(tmp_path: Path)
         run(tmp_path, lambda model, indices: loss(model, indices) * torch.inf)
 
 
+class TwoHalves:
+    """Two numbers that go down and up again, each with its own best epoch."""
+
+    def batches(self, epoch: int) -> list[int]:
+        return [epoch]
+
+    def loss(self, model: nn.Module, batch: int, epoch: int) -> tuple[Tensor, int]:
+        return sum(((weight - epoch) ** 2).sum() for weight in model.parameters()), 1  # type: ignore[return-value]
+
+    def watch(self, model: nn.Module) -> dict[str, float]:
+        return {"val_loss": 1.0}
+
+    def ranks(self, line: dict[str, float]) -> dict[str, tuple[float, ...]]:
+        return {"a.": (abs(line["epoch"] - 2),), "b.": (abs(line["epoch"] - 4),)}
+
+
+def test_each_part_of_a_model_keeps_the_weights_of_its_own_best_epoch(tmp_path: Path) -> None:
+    def halves() -> nn.Module:
+        return nn.ModuleDict({"a": nn.Linear(1, 1), "b": nn.Linear(1, 1)})
+
+    def kept(epochs: int) -> Trained:
+        schedule = dataclasses.replace(SCHEDULE, epochs=epochs, patience=9, gradient_clip=float("inf"))
+        return train(halves, TwoHalves(), schedule, tmp_path / str(epochs))
+
+    whole, second, fourth = kept(6), kept(2), kept(4)
+    assert torch.equal(whole.weights["a.weight"], second.last["a.weight"])
+    assert torch.equal(whole.weights["b.weight"], fourth.last["b.weight"])
+    assert not torch.equal(whole.last["b.weight"], fourth.last["b.weight"])
+    assert [line["best"] for line in whole.history] == [True, True, True, True, False, False]
+
+
+def test_weights_that_need_no_gradient_stay_as_they_were(tmp_path: Path) -> None:
+    def frozen() -> nn.Module:
+        model = build()
+        model[2].requires_grad_(False)  # type: ignore[index]
+        return model
+
+    torch.manual_seed(SCHEDULE.seed)
+    before = {name: value.clone() for name, value in frozen().state_dict().items()}
+    after = train(frozen, Windows(Part(32, loss), Part(40, loss), 8), SCHEDULE, tmp_path).last
+    assert torch.equal(after["2.weight"], before["2.weight"])
+    assert not torch.equal(after["0.weight"], before["0.weight"])
+
+
 def test_parts_without_windows_and_schedules_without_steps_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="The validation recordings hold no window"):
-        train(build, Part(3, loss), Part(0, loss), SCHEDULE, tmp_path)
+        train(build, Windows(Part(3, loss), Part(0, loss), 8), SCHEDULE, tmp_path)
     with pytest.raises(TacpipeError, match="epochs is 0"):
         dataclasses.replace(SCHEDULE, epochs=0)

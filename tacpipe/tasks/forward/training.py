@@ -76,7 +76,7 @@ def train(
         return model
 
     schedule = loop.Schedule(**{field.name: params[field.name] for field in dataclasses.fields(loop.Schedule)})
-    trained = loop.train(build, known.part, watched.part, schedule, workspace)
+    trained = loop.train(build, loop.Windows(known.part, watched.part, schedule.batch), schedule, workspace)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
         "task": TASK,
