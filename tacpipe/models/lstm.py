@@ -12,7 +12,8 @@ With dh and dc the loss's derivatives by h and c, those by a are
     di = dc g i (1 - i),  df = dc c' f (1 - f),  dg = dc i (1 - g²),  do = dh tanh(c) o (1 - o)
 
 and then dc' = dc f, dh' = Rᵀ da. All factors of dc and dh are known after the forward pass, so they are computed for
-all steps at once; one step back is five operations. The gradient of all weights is one product over all steps.
+many steps at once; one step back is five operations. The gradient of all weights is one product over as many steps.
+How many they are is chosen so that they stay in a core's cache: over all steps, these products wait for memory.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+CACHED = 2**17  # numbers of one kind that a core's cache holds beside others of their kind: half a megabyte
 State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
 Weights = tuple[Tensor, Tensor, Tensor]  # W (4 hidden, input), R (4 hidden, hidden), b (4 hidden,)
 Lead = tuple[Tensor, Tensor]  # inputs of the first step only (window, more), and their columns of W (4 hidden, more)
@@ -121,39 +123,56 @@ class _Layer(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         from_input, from_state, read, gates, cells, tanhs = ctx.saved_tensors
         steps, windows, size = tanhs.shape
-        by_gates, slopes = _empty(gates, *gates.shape), _empty(gates, *tanhs.shape)
-        _factors(gates, read[1:, :, :size], cells, tanhs, by_gates, slopes)
         dh, dc = (tanhs.new_zeros(windows, size) for _ in range(2))
         for total, given in ((dh, by_hidden), (dh, None if by_states is None else by_states[-1]), (dc, by_cell)):
             if given is not None:
                 total += given
         told = None if by_states is None else by_states.unbind()
-        every_slope, every_dc = slopes.unbind(), dc[:, None]
-        of_cell = by_gates.view(steps, windows, 4, size)[:, :, :3].unbind()  # i, f, g
-        of_output, forgets = by_gates[..., 3 * size :].unbind(), gates[..., size : 2 * size].unbind()
-        rows = by_gates.unbind()
-        for step in reversed(range(steps)):
-            dc.addcmul_(dh, every_slope[step])
-            of_cell[step].mul_(every_dc)
-            of_output[step].mul_(dh)
-            dc.mul_(forgets[step])
-            if step and told is not None:
-                torch.addmm(told[step - 1], rows[step], from_state, out=dh)
-            elif step:
-                torch.mm(rows[step], from_state, out=dh)
-        flat = by_gates.view(steps * windows, -1)
-        used = size + from_input.shape[1]
+        by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # of all three weights, as they were multiplied
         needs = ctx.needs_input_grad
-        by_weights = flat.t() @ read[:-1].view(steps * windows, -1)  # of all three, as they were multiplied
+        by_inputs = _empty(gates, steps, windows, from_input.shape[1]) if needs[0] else None
+        some = min(steps, max(1, CACHED // (windows * gates.shape[-1])))
+        every_gates, every_slopes = gates.new_empty(some, *gates.shape[1:]), gates.new_empty(some, windows, size)
+        views = _views(every_gates, every_slopes)
+        forgets = gates[..., size : 2 * size].unbind()
+        for start in reversed(range(0, steps, some)):
+            stop = min(start + some, steps)
+            by_gates = every_gates[: stop - start]
+            before = slice(start, stop)
+            after = read[start + 1 : stop + 1, :, :size]
+            _factors(gates[before], after, cells[before], tanhs[before], by_gates, every_slopes[: stop - start])
+            for step in reversed(range(start, stop)):
+                row, of_cell, of_output, slope = views[step - start]
+                dc.addcmul_(dh, slope)
+                of_cell.mul_(dc[:, None])
+                of_output.mul_(dh)
+                dc.mul_(forgets[step])
+                if step and told is not None:
+                    torch.addmm(told[step - 1], row, from_state, out=dh)
+                elif step:
+                    torch.mm(row, from_state, out=dh)
+            flat = by_gates.view(-1, gates.shape[-1])
+            by_read.addmm_(flat.t(), read[before].view(len(flat), -1))
+            if by_inputs is not None:
+                torch.mm(flat, from_input, out=by_inputs[before].view(len(flat), -1))
+        first, used = every_gates[0], size + from_input.shape[1]
         return (
-            (flat @ from_input).view(steps, windows, -1) if needs[0] else None,
-            rows[0].clone() if needs[1] else None,
-            rows[0] @ from_state if needs[2] else None,
+            by_inputs,
+            first.clone() if needs[1] else None,
+            first @ from_state if needs[2] else None,
             dc if needs[3] else None,
-            by_weights[:, size:used] if needs[4] else None,
-            by_weights[:, :size] if needs[5] else None,
-            by_weights[:, used] if needs[6] else None,
+            by_read[:, size:used] if needs[4] else None,
+            by_read[:, :size] if needs[5] else None,
+            by_read[:, used] if needs[6] else None,
         )
+
+
+def _views(by_gates: Tensor, slopes: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Return da of a step as a whole (window, 4 hidden), of i, f, g (window, 3, hidden) and of o, and its slope."""
+    steps, windows, size = slopes.shape
+    of_cell = by_gates.view(steps, windows, 4, size)[:, :, :3].unbind()
+    of_output = by_gates[..., 3 * size :].unbind()
+    return list(zip(by_gates.unbind(), of_cell, of_output, slopes.unbind(), strict=True))
 
 
 def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_gates: Tensor, slopes: Tensor) -> None:
@@ -165,7 +184,7 @@ def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_ga
     by_i, by_f, by_g, by_o = by_gates.chunk(4, dim=-1)
     torch.addcmul(gates, gates, gates, value=-1, out=by_gates)
     by_i *= g
-    by_f *= cells[:-1]
+    by_f *= cells
     by_o *= tanhs
     torch.mul(i, g, out=by_g)
     torch.addcmul(i, by_g, g, value=-1, out=by_g)
