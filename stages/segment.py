@@ -1,6 +1,7 @@
-"""Mark what happens in synchronized recordings: contacts and slips.
+"""Mark what happens in recordings, contacts and slips, or cut them down to the slide of a finger over a material.
 
-Segments choose what a model is trained on; nothing is thrown away, all rows stay.
+Segments choose what a model is trained on. Contacts and slips throw nothing away, all rows stay; of a slide the frames
+remain that are alike in all recordings.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.stage import stage
+from tacpipe.stage import Attribute, Recording, stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -146,6 +147,79 @@ def slips(params: SlipParams, recording: Shard) -> pa.Table:
         field = pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})
         table = table.append_column(field, pa.array(marks.astype(np.int8)))
     return table
+
+
+@dataclass(frozen=True)
+class SlideParams:
+    """Where a slide begins and ends, which of its frames are kept, and what the protocol of the recordings was.
+
+    The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the finger's
+    pressure reached 40 counts. Half the speed lies in the middle between rest and slide, whose ramp takes 0.1 s. Over 800
+    slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
+    """
+
+    pressure_trigger: float = 40.0  # device counts of static pressure whose first crossing starts the slide
+    moving_share: float = 0.5  # of speed_m_s, from which on the arm slides; told only where the arm was recorded
+    steady_frames: int = 5  # rows that the arm must move so fast, or a single wrong reading would count
+    crop: str = "middle"  # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
+    frames: int = 400  # rows that are kept; recordings without static pressure are kept whole
+    offset_frames: int = 101  # rows between trigger and kept frames with crop offset; the authors' files have 101
+    spike_frames: int = 7  # rows around a tactile reading, odd, whose median takes its place if it is a spike; 1: never
+    spike_deviations: float = 5.0  # scaled median absolute deviations of these rows, beyond which it is a spike
+    spike_count: float = 255.0  # device counts that it must stand out by at least; touch changes readings by 0 to 235
+    speed_m_s: float = 0.025  # metres a second; the protocol's speed
+    speed_tolerance: float = 0.05  # share by which the slide's median speed may differ; published ones do by 0.016
+    min_s: float = 5.5  # seconds; a shorter slide is outside the protocol
+    pressure_low: float = 2.0  # device counts; with a mean pressure below this the finger hardly touched
+    pressure_high: float = 150.0  # device counts; with a mean pressure above this it was pressed too hard
+
+
+@stage(version=1)
+def slides(params: SlideParams, recording: Shard) -> Recording:
+    """Cut a recording down to its slide, all of the same number of frames, with single wrong tactile readings mended.
+
+    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure goes
+    on; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``,
+    its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
+    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
+    """
+    from tacpipe import arm
+    from tacpipe.finger import finger, mended
+    from tacpipe.signals import slides as found
+    from tacpipe.streams import of_quantity, streams_of
+
+    streams = streams_of(recording)
+    table = finger(recording.name, streams)
+    t_ns = table.column("t_ns").to_numpy()  # (time,)
+    table, spikes = mended(table, params.spike_frames, params.spike_deviations, params.spike_count)
+    pressures = of_quantity(table, "static_pressure")
+    if not pressures:
+        return Recording(
+            {"slide": table}, {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
+        )
+    pressure = table.column(pressures[0]).to_numpy()
+    profile = arm.profile(streams, t_ns)
+    try:
+        trigger = found.trigger_row(pressure, params.pressure_trigger)
+        slide = (trigger, len(t_ns))
+        if profile:
+            least_m_s = params.moving_share * params.speed_m_s
+            slide = found.sliding_rows(profile["speed_m_s"], trigger, least_m_s, params.steady_frames) or slide
+        first, stop = found.kept_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {recording.name}: {error}") from error
+    protocol = found.Protocol(
+        params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
+    )
+    rows = slice(first, stop)
+    told = found.told(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, told)
+    attributes: dict[str, Attribute] = {**told, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
+    attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})
+    tables = {"slide": table.slice(first, stop - first).combine_chunks()}
+    if profile:
+        tables["profile"] = arm.profile_table(t_ns, pressure, profile, found.phases(len(t_ns), slide))
+    return Recording(tables, attributes)
 
 
 def _tared(tare: str, values: NDArray[Any], level: NDArray[np.float64], axes: int) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from tacpipe import params as params_of
 from tacpipe import provenance, registry
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.hashing import bytes_digest, digest, file_digest
+from tacpipe.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.manifest import Manifest, shard_path
 from tacpipe.stage import Recording, Result, Stage
 from tacpipe.store import MissingError, Object, Store
@@ -224,7 +224,7 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
             found[name].mkdir(parents=True, exist_ok=True)
     yield found
     for file, path in (task.files or {}).items():
-        if file_digest(path) != inputs[stage.argument("Files")][file]:
+        if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
             raise TacpipeError(f"{path} changed while it was read. Run the same command again.")
 
 

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import time
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
+
+SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
+_remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system said of the file, its digest
 
 
 def canonical(value: Any) -> bytes:
@@ -48,3 +53,25 @@ def file_digest(path: Path | str) -> str:
     """Return the sha256 of a file's content, as ``sha256sum`` prints it."""
     with open(path, "rb", buffering=0) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def remembered_file_digest(path: Path | str) -> str:
+    """Return `file_digest`, without reading again a file that this process has read and that did not change since.
+
+    Of a file that holds hundreds of recordings each asks for the digest. A file counts as unchanged while the system gives
+    the same inode, size and times of change; one that was written in the last `SETTLED_NS` is always read.
+    """
+    name = os.fspath(path)
+    before = _traits(name)
+    known = _remembered.get(name)
+    if known is not None and known[0] == before:
+        return known[1]
+    found = file_digest(path)
+    if before == _traits(name) and time.time_ns() - max(before[-2:]) > SETTLED_NS:
+        _remembered[name] = before, found
+    return found
+
+
+def _traits(path: str) -> tuple[int, ...]:
+    stat = os.stat(path)  # noqa: PTH116  (once a file on every hit)
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns

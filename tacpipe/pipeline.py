@@ -158,7 +158,8 @@ class _Run:
             old = inputs.named.get("extend")
             return request_of.split_digest(old) if old else None
         if name in ROLES:
-            return keys.of_dataset(inputs.merged, reads, inputs.in_role(inputs.merged, name))
+            chosen = inputs.in_role(inputs.merged, name, may_lack=self.stage.optional(name))
+            return keys.of_dataset(inputs.merged, reads, chosen)
         given = self._replay() if "model" in inputs.named else inputs.merged
         if "split" in inputs.named:
             return keys.of_dataset(given, reads, inputs.in_role(given, self.request.role or "test"))

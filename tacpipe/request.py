@@ -11,7 +11,7 @@ from typing import Any
 from tacpipe import execution, manifest, registry
 from tacpipe import params as params_of
 from tacpipe.errors import UsageError
-from tacpipe.hashing import file_digest
+from tacpipe.hashing import remembered_file_digest
 from tacpipe.manifest import Entry, Found, Manifest
 from tacpipe.stage import Stage
 from tacpipe.store import locate
@@ -123,14 +123,14 @@ class Inputs:
             raise UsageError(f"The split {split.directory} has the folds {folds}; --fold {fold} is none.")
         return {recording: role for (recording, number), role in table.items() if number == fold}
 
-    def in_role(self, given: Manifest, role: str) -> dict[str, Entry]:
-        """Return the recordings of ``given`` that have this role."""
+    def in_role(self, given: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
+        """Return the recordings of ``given`` that have this role. Raises `UsageError` without any, unless ``may_lack``."""
         chosen = {name: entry for name, entry in given.included.items() if self.roles.get(name) == role}
         unknown = sorted(set(given.included) - set(self.roles))
         if unknown:
             note = f"{len(unknown)} recordings have no role in the split and are left out, as {unknown[0]}"
             self.notes.append(f"{note}: give them one with `tacpipe split --extend`.")
-        if not chosen:
+        if not chosen and not may_lack:
             raise UsageError(
                 f"No recording of the dataset has the role {role} in fold {self.request.fold} of the split. "
                 f"Split this dataset, or give the split that was made for it."
@@ -159,4 +159,6 @@ def _discover(stage: Stage, request: Request) -> dict[str, dict[str, Path]]:
 
 def _hash(sources: Mapping[str, Mapping[str, Path]]) -> dict[str, dict[str, str]]:
     """Return the digest of each file; threads were tried and gain nothing on files of some 100 kB."""
-    return {name: {file: file_digest(path) for file, path in files.items()} for name, files in sources.items()}
+    return {
+        name: {file: remembered_file_digest(path) for file, path in files.items()} for name, files in sources.items()
+    }

@@ -4,7 +4,8 @@ The first parameter is ``params``, a frozen dataclass. Each further one says by 
 
 ==============  ==========================================================================================
 ``Shard``       one recording at a time; the stage is run, keyed and stored for each recording alone
-``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone
+``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
+                may be empty where it is annotated ``Dataset | None``
 ``Datasets``    several datasets side by side, as a tuple
 ``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
 ``Fitted``      the files that the stage's ``fit`` made of the training recordings
@@ -94,6 +95,10 @@ class Stage:
     def argument(self, kind: str) -> str | None:
         """The name of the argument of this kind, or None."""
         return next((name for name, found in self.arguments.items() if found == kind), None)
+
+    def optional(self, name: str) -> bool:
+        """Return whether the argument ``name`` may be left out."""
+        return str(inspect.signature(self.function).parameters[name].annotation).strip("'\"").endswith(" | None")
 
     @property
     def params(self) -> type[Any]:

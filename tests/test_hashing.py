@@ -1,4 +1,5 @@
 import hashlib
+import os
 import subprocess
 from pathlib import Path
 
@@ -6,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tacpipe import hashing
 from tacpipe.errors import TacpipeError
-from tacpipe.hashing import bytes_digest, canonical, digest, file_digest
+from tacpipe.hashing import bytes_digest, canonical, digest, file_digest, remembered_file_digest
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -40,3 +42,53 @@ def test_a_file_digest_is_what_sha256sum_prints(tmp_path: Path) -> None:
 
 def test_the_digest_of_a_value_is_that_of_its_canonical_json() -> None:
     assert digest({"b": 1, "a": [True, None]}) == hashlib.sha256(b'{"a":[true,null],"b":1}').hexdigest()
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of files whose content is read."""
+    found: list[str] = []
+
+    def read(path: Path | str) -> str:
+        found.append(Path(path).name)
+        return file_digest(path)
+
+    monkeypatch.setattr(hashing, "file_digest", read)
+    monkeypatch.setattr(hashing, "_remembered", {})
+    return found
+
+
+def test_a_file_that_stays_as_it_is_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
+) -> None:
+    monkeypatch.setattr(hashing, "SETTLED_NS", -1)  # as if it had been written long ago
+    file = tmp_path / "block.npy"
+    file.write_bytes(b"slides")
+    assert {remembered_file_digest(path) for path in (file, str(file), file)} == {bytes_digest(b"slides")}
+    assert reads == ["block.npy"]
+    (tmp_path / "other.npy").write_bytes(b"others")
+    assert remembered_file_digest(tmp_path / "other.npy") == bytes_digest(b"others")
+
+
+def test_a_file_that_was_written_just_now_is_read_each_time(tmp_path: Path, reads: list[str]) -> None:
+    file = tmp_path / "block.npy"
+    for content in (b"one", b"two"):  # of the same length, perhaps within one tick of the file system's clock
+        file.write_bytes(content)
+        assert remembered_file_digest(file) == remembered_file_digest(file) == bytes_digest(content)
+    assert len(reads) == 4
+
+
+def test_a_file_that_changed_is_read_again_though_its_time_was_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
+) -> None:
+    monkeypatch.setattr(hashing, "SETTLED_NS", -1)
+    file = tmp_path / "block.npy"
+    file.write_bytes(b"one")
+    before = file.stat()
+    assert remembered_file_digest(file) == bytes_digest(b"one")
+    while file.stat().st_ctime_ns == before.st_ctime_ns:
+        file.write_bytes(b"two")
+        os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert file.stat().st_mtime_ns == before.st_mtime_ns
+    assert remembered_file_digest(file) == bytes_digest(b"two")
+    assert len(reads) == 2

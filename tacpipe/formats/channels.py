@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TAXELS = 16  # of a XELA uSkin 4x4, numbered row by row
+ELECTRODES = 19  # of a BioTac
+VIBRATIONS = 22  # readings of its pressure's quick part in one frame: 2200 Hz at 100 frames a second
+TRIANGLES, TRIANGLE_TAXELS = 6, 10  # of a RoboSkin patch: triangular modules of ten taxels
 AXES = ("x", "y", "z")
 COMPONENTS = ("x", "y", "z", "w")
 
@@ -43,11 +46,75 @@ def uskin_fields(taxels: int = TAXELS) -> list[pa.Field]:
     ]
 
 
+def biotac_fields() -> list[pa.Field]:
+    """Return the 44 fields of a BioTac, uint16 device counts: ``tdc``, ``tac``, ``pdc``, ``pac01`` …, ``electrode01`` ….
+
+    Temperature and its quick part, pressure of the fluid, 22 readings of the pressure's quick part, 19 impedances.
+    """
+    import pyarrow as pa
+
+    quantities = {"tdc": "temperature", "tac": "temperature_change", "pdc": "static_pressure"}
+    quantities |= {f"pac{reading:02d}": "vibration" for reading in range(1, VIBRATIONS + 1)}
+    fields = [
+        pa.field(name, pa.uint16(), metadata={"unit": "count", "quantity": quantity})
+        for name, quantity in quantities.items()
+    ]
+    return fields + [
+        pa.field(
+            f"electrode{electrode:02d}",
+            pa.uint16(),
+            metadata={"unit": "count", "quantity": "tactile", "electrode": str(electrode)},
+        )
+        for electrode in range(1, ELECTRODES + 1)
+    ]
+
+
+def roboskin_fields() -> list[pa.Field]:
+    """Return the fields ``triangle1_taxel01`` to ``triangle6_taxel10`` of a RoboSkin, float32 counts, by triangle."""
+    import pyarrow as pa
+
+    return [
+        pa.field(
+            f"triangle{triangle}_taxel{taxel:02d}",
+            pa.float32(),
+            metadata={"unit": "count", "quantity": "tactile", "triangle": str(triangle), "taxel": str(taxel)},
+        )
+        for triangle in range(1, TRIANGLES + 1)
+        for taxel in range(1, TRIANGLE_TAXELS + 1)
+    ]
+
+
 def joint_fields(joints: int = 7) -> tuple[list[pa.Field], list[pa.Field]]:
     """Return the fields ``joint1_rad``, … and ``joint1_velocity_rad_s``, …, float64."""
     angles = [float_field(f"joint{n}_rad", "rad", "joint_position") for n in range(1, joints + 1)]
     speeds = [float_field(f"joint{n}_velocity_rad_s", "rad/s", "joint_velocity") for n in range(1, joints + 1)]
     return angles, speeds
+
+
+def joint_torque_fields(joints: int = 7) -> list[pa.Field]:
+    """Return the fields ``joint1_torque_nm``, …, float64."""
+    return [float_field(f"joint{n}_torque_nm", "N m", "joint_torque") for n in range(1, joints + 1)]
+
+
+def twist_fields() -> list[pa.Field]:
+    """Return the six float64 fields of a motion: ``velocity_x_m_s``, … and ``angular_velocity_x_rad_s``, …."""
+    linear = [float_field(f"velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in AXES]
+    return linear + [float_field(f"angular_velocity_{axis}_rad_s", "rad/s", "angular_velocity", axis) for axis in AXES]
+
+
+def wrench_fields() -> list[pa.Field]:
+    """Return the six float64 fields of a load: ``force_x_n``, … and ``torque_x_nm``, …."""
+    force = [float_field(f"force_{axis}_n", "N", "force", axis) for axis in AXES]
+    return force + [float_field(f"torque_{axis}_nm", "N m", "torque", axis) for axis in AXES]
+
+
+def profile_fields() -> list[pa.Field]:
+    """Return the fields that tell how a slide went on: pressure, speed as recorded and smooth, force along z, phase."""
+    import pyarrow as pa
+
+    pressure = pa.field("pressure_count", pa.float32(), metadata={"unit": "count", "quantity": "static_pressure"})
+    speeds = [float_field(name, "m/s", "speed") for name in ("speed_raw_m_s", "speed_m_s")]
+    return [pressure, *speeds, float_field("force_n", "N", "force", "z"), label_field("phase")]
 
 
 def pose_fields() -> list[pa.Field]:
@@ -65,7 +132,7 @@ def float_field(name: str, unit: str, quantity: str, component: str | None = Non
 
 
 def label_field(name: str) -> pa.Field:
-    """Return an int8 field that holds a label, 0 or 1."""
+    """Return an int8 field that holds a label: 0 or 1, or a small number."""
     import pyarrow as pa
 
     return pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})

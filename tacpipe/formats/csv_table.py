@@ -5,6 +5,8 @@ row. What pyarrow would do by itself and may not here: take empty cells, ``NA`` 
 type from its first rows, and count rows without blank lines and header, so that its messages point to the wrong line.
 Rows are counted as lines of the file, from 1, as an editor shows them; the header is row 1.
 
+Unix seconds are read as decimal numbers: as float64, stamps of today with nine decimals would be rounded to 256 ns.
+
 A row that was cut short is seen. A last *number* that was cut short (``0.1234`` of ``0.123456``) cannot be.
 """
 
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
 
+_STAMP = re.compile(r"\s*\d{1,10}(\.\d{1,9})?\s*")
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 
 
@@ -32,39 +35,46 @@ def read_csv(
     integers: pa.DataType | None = None,
     allow_nan: bool = False,
     trailing_comma: bool = False,
+    seconds: str = "",
 ) -> pa.Table:
     """Return ``columns`` of a numeric CSV file, in this order, as float64 or as the type ``integers``.
 
     Other columns of the file must be numbers too, and are left out. ``trailing_comma`` is for files whose data rows end
-    in a comma, whether the header does or not. Blank lines hold no row. Raises `TacpipeError`, naming file and row, for:
-    an empty file, one without rows, a missing or doubled column, a row of another width, a cell that is no number, NaN
-    unless ``allow_nan``, infinity, and, with ``integers``, a fraction or a value out of the type's range.
+    in a comma, whether the header does or not. ``seconds`` names a column of unix seconds with nine decimals at most,
+    which then stands first in the table, as ``t_ns``: exact nanoseconds, int64. Blank lines hold no row. Raises
+    `TacpipeError`, naming file and row, for: an empty file, one without rows, a missing or doubled column, a row of
+    another width, a cell that is no number, NaN unless ``allow_nan``, infinity, seconds that are no such time, and, with
+    ``integers``, a fraction or a value out of the type's range.
     """
     names = read_header(path)
     if trailing_comma and not names[-1]:
         names = names[:-1]
-    _check_header(path, names, columns)
+    _check_header(path, names, [seconds, *columns] if seconds else columns)
     tail = [""] if trailing_comma else []
+    stamps = {seconds: pa.decimal128(19, 9)} if seconds else {}
     try:
         table = pc.read_csv(
             path,
             read_options=pc.ReadOptions(column_names=[*names, *tail], skip_rows=1, use_threads=False),
             convert_options=pc.ConvertOptions(
-                column_types={**dict.fromkeys(names, pa.float64()), **dict.fromkeys(tail, pa.string())},
+                column_types={**dict.fromkeys(names, pa.float64()), **dict.fromkeys(tail, pa.string()), **stamps},
                 null_values=[],
             ),
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        raise TacpipeError(_first_fault(path, names, trailing_comma) or f"{path} is no CSV file: {error}.") from error
+        fault = _first_fault(path, names, trailing_comma, seconds)
+        raise TacpipeError(fault or f"{path} is no CSV file: {error}.") from error
     if not table.num_rows:
         raise TacpipeError(f"{path} has a header and no rows; the recording is empty. Delete it or record it again.")
     if tail and any(cell != "" for cell in table.column(len(names)).unique().to_pylist()):
         raise TacpipeError(_first_fault(path, names, trailing_comma) or f"{path} has a cell too many in some row.")
+    times = {"t_ns": pa.array(_nanoseconds(path, seconds, table.column(seconds)))} if seconds else {}
     arrays = [table.column(names.index(name)).to_numpy() for name in columns]
     for name, array in zip(columns, arrays, strict=True):
         _check_values(path, name, array, integers, allow_nan)
     kind = integers or pa.float64()
-    return pa.table({name: pa.array(array).cast(kind) for name, array in zip(columns, arrays, strict=True)})
+    cast = {name: pa.array(array).cast(kind) for name, array in zip(columns, arrays, strict=True)}
+    return pa.table({**times, **cast})
 
 
 def read_header(path: Path) -> list[str]:
@@ -140,7 +150,7 @@ def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> N
         )
 
 
-def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool) -> str | None:
+def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds: str = "") -> str | None:
     """Return a sentence about the first row that is no row of numbers, or None."""
     rows = _rows(path)
     next(rows)
@@ -155,7 +165,28 @@ def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool) -> str 
         for name, cell in zip(names, cells, strict=True):
             if not _NUMBER.fullmatch(cell):
                 return f"{path}, row {line}, column {name} holds {cell!r}, which is no number. Put the cell right."
+            if name == seconds and not _STAMP.fullmatch(cell):
+                return (
+                    f"{path}, row {line}, column {name} holds {cell}; it must be seconds since 1970 with nine decimals "
+                    f"at most. Put the cell right."
+                )
     return None
+
+
+def _nanoseconds(path: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.int64]:
+    """Return decimal seconds as whole nanoseconds, int64 (time,). Raises `TacpipeError` for those that are none."""
+    chunk = column.combine_chunks()
+    # A decimal128(19, 9) is stored as its number of 1e-9ths in two words of eight bytes, the low one first.
+    words = np.frombuffer(chunk.buffers()[1], dtype="<i8").reshape(-1, 2)[chunk.offset :][: len(chunk)]
+    t_ns: NDArray[np.int64] = words[:, 0].astype(np.int64)
+    bad = (words[:, 1] != 0) | (t_ns < 0)
+    if bad.any():
+        index = int(bad.argmax())
+        raise TacpipeError(
+            f"{path}, row {file_row(path, index)}, column {name} holds {chunk[index].as_py():f}; it must be seconds since "
+            f"1970, which end in 2262 in nanoseconds. Put the cell right."
+        )
+    return t_ns
 
 
 def _check_values(path: Path, name: str, array: NDArray[np.float64], integers: pa.DataType | None, nan: bool) -> None:

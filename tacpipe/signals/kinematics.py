@@ -33,6 +33,11 @@ PANDA = Chain(  # Franka Emika, Panda documentation, "Denavit-Hartenberg paramet
     (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0),
     (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, _QUARTER, _QUARTER),
 )
+IIWA14 = Chain(  # KUKA LBR iiwa 14 R820, data sheet: 0.36, 0.42, 0.40 m between base, shoulder, elbow and wrist
+    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.126),  # the last one to the flange, without the plate for tools
+    (0.0, -_QUARTER, _QUARTER, _QUARTER, -_QUARTER, -_QUARTER, _QUARTER),
+)
 
 
 def joint_frames(chain: Chain, joint_rad: Floats) -> Floats:

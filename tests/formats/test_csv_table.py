@@ -139,3 +139,25 @@ def test_a_record_of_another_shape_is_refused(file: Path, content: str, message:
     file.write_text(content)
     with pytest.raises(TacpipeError, match=message):
         read_record(file)
+
+
+@given(st.lists(st.integers(0, 9_223_372_036 * 10**9), min_size=1, max_size=9))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_unix_seconds_are_read_to_the_last_nanosecond(file: Path, stamps: list[int]) -> None:
+    rows = [f"{stamp // 10**9}.{stamp % 10**9:09d},7" for stamp in stamps]
+    file.write_text("time,a\n" + "\n".join(rows) + "\n")
+    table = read_csv(file, ["a"], seconds="time")
+    assert table.column_names == ["t_ns", "a"]
+    assert table.column("t_ns").to_pylist() == stamps
+
+
+def test_seconds_may_have_fewer_decimals_and_stand_in_any_column(file: Path) -> None:
+    file.write_text("a,time\n7,12\n8,12.5\n")
+    assert read_csv(file, ["a"], seconds="time").to_pydict() == {"t_ns": [12 * 10**9, 12_500_000_000], "a": [7.0, 8.0]}
+
+
+@pytest.mark.parametrize("cell", ["12.0123456789", "-12.5", "nan", "9999999999", "99999999999"])
+def test_what_is_no_unix_time_is_told_with_its_row(file: Path, cell: str) -> None:
+    file.write_text(f"time,a\n11.0,1\n\n{cell},2\n")
+    with pytest.raises(TacpipeError, match=r"row 4, column time holds .*; it must be seconds since"):
+        read_csv(file, ["a"], seconds="time")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tacpipe.signals import kinematics
-from tacpipe.signals.kinematics import PANDA
+from tacpipe.signals.kinematics import IIWA14, PANDA, Chain
 
 Floats = NDArray[np.floating[Any]]
 
@@ -25,11 +25,11 @@ def joints(rows: int = 200) -> tuple[Floats, Floats]:
     return size * np.sin(rate * time_s + phase), size * rate * np.cos(rate * time_s + phase)
 
 
-def elementary(joint_rad: Floats) -> list[Floats]:
+def elementary(joint_rad: Floats, chain: Chain = PANDA) -> list[Floats]:
     """The frames of one row as Craig has them: turn and shift along x, then turn and shift along z."""
     reached: Floats = np.eye(4)
     found: list[Floats] = []
-    for angle, length, offset, twist in zip(joint_rad, PANDA.length_m, PANDA.offset_m, PANDA.twist_rad, strict=True):
+    for angle, length, offset, twist in zip(joint_rad, chain.length_m, chain.offset_m, chain.twist_rad, strict=True):
         for axis, turn, shift in (("x", twist, [length, 0, 0]), ("z", angle, [0, 0, offset])):
             step = np.eye(4)
             step[:3, :3], step[:3, 3] = Rotation.from_euler(axis, turn).as_matrix(), shift
@@ -44,16 +44,27 @@ def hand(joint_rad: Floats) -> Floats:
     return found
 
 
-def test_frames_are_the_product_of_elementary_motions() -> None:
+@pytest.mark.parametrize("chain", [PANDA, IIWA14])
+def test_frames_are_the_product_of_elementary_motions(chain: Chain) -> None:
     angles = np.random.default_rng(0).uniform(-3, 3, (20, 7))
-    found = kinematics.joint_frames(PANDA, angles)
+    found = kinematics.joint_frames(chain, angles)
     assert found.shape == (20, 7, 4, 4)
-    assert np.allclose(found, [elementary(row) for row in angles], atol=1e-12)
+    assert np.allclose(found, [elementary(row, chain) for row in angles], atol=1e-12)
 
 
 def test_a_panda_that_stands_upright_is_as_long_as_its_data_sheet_says() -> None:
     reached = kinematics.joint_frames(PANDA, np.zeros((1, 7)))[0, -1]
     assert np.allclose(reached[:3, 3], [0.088, 0.0, 0.333 + 0.316 + 0.384])
+
+
+def test_an_iiwa_is_as_long_as_its_data_sheet_says_upright_and_stretched_out() -> None:
+    upright = kinematics.joint_frames(IIWA14, np.zeros((1, 7)))[0]
+    assert np.allclose(upright[-1, :3, 3], [0.0, 0.0, 1.306])
+    assert np.allclose(upright[-1, :3, :3], np.eye(3))
+    forwards = kinematics.joint_frames(IIWA14, np.array([[0, np.pi / 2, 0, 0, 0, 0, 0]]))[0, -1, :3, 3]
+    assert np.allclose(forwards, [0.42 + 0.4 + 0.126, 0.0, 0.36])
+    bent = kinematics.joint_frames(IIWA14, np.array([[0, 0, 0, np.pi / 2, 0, 0, 0]]))[0, -1, :3, 3]
+    assert np.allclose(bent, [-0.4 - 0.126, 0.0, 0.36 + 0.42])  # its fourth joint turns the other way
 
 
 def test_velocity_is_what_differences_of_the_hand_s_path_tell() -> None:

@@ -1,0 +1,156 @@
+"""Slides of a BioTac over twenty materials, drawn by a KUKA LBR iiwa 14 (IROS 2020).
+
+Published as dexrob/BioTac_slide_20_50. A slide is a set of CSV files in the folder of its material: the finger
+(``mat3_7_bio.csv``), and, where they were kept, pose, velocity, wrench, joint angles, torques and speeds of the arm, each
+stamped by its own clock reading. All rows of the finger's file end in a comma, those of the arm's do not.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.folders import Params
+from tacpipe.stage import Files, Recording, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+RATE_HZ = 100.0  # of the finger; the mean of each published slide is within 0.03 Hz of it
+NAME = re.compile(r"mat(\d+)_(\d+)_(bio|cp|cv|cw|jp|jt|jv)\.csv")
+ARM = {  # end of the file's name: stream, columns
+    "cp": ("pose", ("posx", "posy", "posz", "ox", "oy", "oz", "ow")),
+    "cv": ("twist", ("x", "y", "z", "a", "b", "c")),
+    "cw": ("wrench", ("fx", "fy", "fz", "tx", "ty", "tz")),
+    "jp": ("joint_position", tuple(f"pa{joint}" for joint in range(1, 8))),
+    "jt": ("joint_torque", tuple(f"ta{joint}" for joint in range(1, 8))),
+    "jv": ("joint_velocity", tuple(f"va{joint}" for joint in range(1, 8))),
+}
+
+
+def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
+    """Return the files of each slide below ``source`` by recording name, ``biotac-m03-t007`` for ``mat3_7_…``.
+
+    The finger's file makes a slide; files of an arm without one are passed over. Raises `TacpipeError` if ``source`` is
+    no folder, holds no slide, or holds one twice.
+    """
+    if not source.is_dir():
+        raise TacpipeError(f"{source} is no folder; give the folder that holds the slides, mat1_1_bio.csv and so on.")
+    found: dict[str, dict[str, Path]] = {}
+    seen: set[str] = set()  # links are followed, circles of them are not
+    for place, below, names in os.walk(source, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            below.clear()
+            continue
+        seen.add(real)
+        for name in names:
+            match = NAME.fullmatch(name)
+            if match is None:
+                continue
+            files = found.setdefault(recording_name(int(match[1]), int(match[2])), {})
+            if name in files:
+                raise TacpipeError(
+                    f"{files[name]} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
+                )
+            files[name] = Path(place) / name
+    slides = {
+        recording: dict(sorted(files.items()))
+        for recording, files in sorted(found.items())
+        if any(name.endswith("_bio.csv") for name in files)
+    }
+    if not slides:
+        raise TacpipeError(
+            f"{source} holds no slide: no file in it is named as mat1_1_bio.csv. Give the folder of the unpacked data set."
+        )
+    return slides
+
+
+def recording_name(material: int, trial: int) -> str:
+    """Return the name of a slide.
+
+    >>> recording_name(3, 7)
+    'biotac-m03-t007'
+    """
+    return f"biotac-m{material:02d}-t{trial:03d}"
+
+
+@stage(version=1, discover=discover)
+def biotac_slide(params: Params, files: Files) -> Recording:
+    """Return the stream biotac of a slide, and those of the arm that are there; angular velocity that is NaN stays so."""
+    from tacpipe.formats import xela
+
+    streams: dict[str, pa.Table] = {}
+    material = trial = 0
+    for name, path in files.items():
+        match = NAME.fullmatch(name)
+        assert match is not None
+        material, trial = int(match[1]), int(match[2])
+        if match[3] == "bio":
+            streams["biotac"] = _finger(path)
+        else:
+            stream, columns = ARM[match[3]]
+            streams[stream] = _arm(path, stream, columns)
+    return Recording(
+        streams,
+        {
+            "sensor": "biotac",
+            "material": material,
+            "trial": trial,
+            "session": f"biotac-m{material:02d}",  # all slides of a material were recorded in a row
+            "rate_hz": RATE_HZ,
+            **xela.authors_role(params.authors_role),
+        },
+    )
+
+
+def _finger(path: Path) -> pa.Table:
+    """Return the stream of the finger: 44 columns of uint16 counts as they were written, spikes included."""
+    import pyarrow as pa
+
+    from tacpipe.formats import channels
+    from tacpipe.formats.csv_table import read_csv
+
+    names = ["tdc", "tac", "pdc"]
+    names += [f"pac{reading}" for reading in range(1, channels.VIBRATIONS + 1)]
+    names += [f"ele{electrode}" for electrode in range(1, channels.ELECTRODES + 1)]
+    table = read_csv(path, names, integers=pa.uint16(), trailing_comma=True, seconds="timestamp")
+    return _stream(path, table, channels.biotac_fields())
+
+
+def _arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
+    from tacpipe.formats import channels
+    from tacpipe.formats.csv_table import read_csv
+
+    angles, speeds = channels.joint_fields()
+    fields = {
+        "pose": channels.pose_fields(),
+        "twist": channels.twist_fields(),
+        "wrench": channels.wrench_fields(),
+        "joint_position": angles,
+        "joint_torque": channels.joint_torque_fields(),
+        "joint_velocity": speeds,
+    }[stream]
+    return _stream(path, read_csv(path, columns, allow_nan=stream == "twist", seconds="timestamp"), fields)
+
+
+def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
+    """Return what was read under the names of its channels. Raises `TacpipeError` where stamps do not increase."""
+    import numpy as np
+    import pyarrow as pa
+
+    from tacpipe.formats import channels
+    from tacpipe.formats.csv_table import file_row
+
+    t_ns = table.column("t_ns").to_numpy()
+    back = np.diff(t_ns) <= 0
+    if back.any():
+        row = int(back.argmax()) + 1
+        raise TacpipeError(
+            f"{path}, row {file_row(path, row)}: the timestamp is {(t_ns[row] - t_ns[row - 1]) / 1e6:g} ms after the one "
+            f"before; it must be later. Put the rows in order or leave the slide out."
+        )
+    return pa.Table.from_arrays(table.columns, schema=pa.schema([channels.time_field(), *fields]))

@@ -1,0 +1,215 @@
+"""Slides of an iCub's forearm, RoboSkin, over the twenty materials that the BioTac slides have (IROS 2020).
+
+Published within dexrob/BioTac_slide_20_50 as arrays (slide, triangle, taxel, time) of 200 slides, a file a fold, with a
+file of labels each. Their axes went through a wrong reshape before (`tacpipe.signals.scrambling`); which arrangement a file
+has is told from its values. The rate is not published.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Attribute, Files, Recording, stage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
+PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
+LARGEST = 255.0  # readings stem from eight bits, compensated for temperature
+LAYOUTS = ("time", "authors")
+MADE = "from nominal rate"
+
+
+@dataclass(frozen=True)
+class Params:
+    """How slides are read."""
+
+    rate_hz: float = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
+    layout: str = "time"  # time: frames as they were felt; authors: mixed as they were published, to compare with
+
+
+def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
+    """Return the block and its labels, each with a slide's place in it, by recording name.
+
+    A block is ``icub_fold_0.npy`` (or ``icub_val_0.npy``, as it is published) or ``icub_test.npy``, its labels
+    ``labels_fold_0.npy`` and so on in the same folder. Folders below one that holds blocks are not searched. Raises
+    `TacpipeError` if ``source`` is no folder, holds no block, or one twice, or where labels are missing or the block is no
+    array of slides.
+    """
+    if not source.is_dir():
+        raise TacpipeError(f"{source} is no folder; give the folder that holds icub_fold_0.npy and so on.")
+    blocks: dict[str, Path] = {}
+    for name, path in _found(source):
+        if name in blocks:
+            raise TacpipeError(f"{blocks[name]} and {path} are the same block. Give the folder that holds one of them.")
+        blocks[name] = path
+    if not blocks:
+        raise TacpipeError(
+            f"{source} holds no block of slides: no file in it is named as icub_fold_0.npy. Give the folder of the "
+            f"unpacked data set."
+        )
+    found: dict[str, dict[str, Path]] = {}
+    for name, path in sorted(blocks.items()):
+        labels = path.with_name(path.name.replace("icub", "labels", 1))
+        if not labels.is_file():
+            raise TacpipeError(f"{path} has no labels: {labels.name} is not beside it. Copy both files.")
+        for slide in range(_slides(path)):
+            found[f"roboskin-{name}-{slide:03d}"] = {f"{file.name}[{slide}]": file for file in (path, labels)}
+    return found
+
+
+@stage(version=1, discover=discover)
+def roboskin(params: Params, files: Files) -> Recording:
+    """Return the stream roboskin of a slide: 60 columns, triangle by triangle, one row a frame; stamps are made."""
+    import numpy as np
+
+    from tacpipe.formats import channels
+    from tacpipe.signals.resampling import uniform_grid
+    from tacpipe.signals.scrambling import scramble
+
+    if params.layout not in LAYOUTS:
+        raise TacpipeError(f"layout is {params.layout!r}; it must be {' or '.join(LAYOUTS)}.")
+    (block, place), (labels, _) = sorted((path, _place(name)) for name, path in files.items())
+    slide = _felt(block, place)  # (triangle, taxel, time)
+    if params.layout == "authors":
+        slide = scramble(slide)
+    frames = slide.shape[-1]
+    t_ns = uniform_grid(0, round((frames - 1) * 1e9 / params.rate_hz) if params.rate_hz > 0 else 0, params.rate_hz)
+    columns = np.reshape(slide, (-1, frames))
+    material = _label(block, labels, place) + 1
+    return Recording(
+        {"roboskin": channels.stream(t_ns, columns, channels.roboskin_fields(), MADE)},
+        {
+            "sensor": "roboskin",
+            "material": material,
+            "trial": place,
+            "session": f"roboskin-m{material:02d}",
+            "rate_hz": params.rate_hz,
+            "layout": params.layout,
+            **_part(block),
+        },
+    )
+
+
+def _found(source: Path) -> list[tuple[str, Path]]:
+    """Return the blocks below a folder: name within the recordings' names, path."""
+    found = []
+    seen: set[str] = set()  # links are followed, circles of them are not
+    for place, below, names in os.walk(source, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            below.clear()
+            continue
+        seen.add(real)
+        for name in sorted(names):
+            match = BLOCK.fullmatch(name)
+            if match is not None:
+                found.append((match[2] or f"fold{int(match[1])}", Path(place) / name))
+                below.clear()  # the published folder holds others with arrays made of these
+    return found
+
+
+def _slides(path: Path) -> int:
+    """Return how many slides a block has, from the head of the file alone: numpy takes longer to load than a hit."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(6) != b"\x93NUMPY":
+                raise ValueError("it does not begin as an array of numpy does")
+            wide = file.read(2)[0] > 1
+            head = ast.literal_eval(file.read(int.from_bytes(file.read(4 if wide else 2), "little")).decode())
+        shape = head["shape"]
+    except (OSError, ValueError, SyntaxError, KeyError, IndexError, TypeError) as error:
+        raise TacpipeError(f"{path} cannot be read as an array: {error}. Copy it again from its source.") from error
+    if not (isinstance(shape, tuple) and len(shape) == 4):
+        raise TacpipeError(
+            f"{path} has the shape {shape}; it must be (slide, triangle, taxel, time). Give the set's own files."
+        )
+    return int(shape[0])
+
+
+def _place(name: str) -> int:
+    match = PLACE.fullmatch(name)
+    assert match is not None
+    return int(match[2])
+
+
+def _part(block: Path) -> dict[str, Attribute]:
+    """Return the attribute of the authors' part that a block is."""
+    match = BLOCK.fullmatch(block.name)
+    assert match is not None
+    return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
+
+
+def _felt(path: Path, place: int) -> NDArray[np.float32]:
+    """Return a slide as it was felt (triangle, taxel, time), float32; its values are checked.
+
+    Where a slide alone does not tell which of its axes is time, because next to nothing was touched, its block does.
+    Raises `TacpipeError` for values that are no readings, and where time cannot be found.
+    """
+    import numpy as np
+
+    from tacpipe.formats.channels import TRIANGLE_TAXELS, TRIANGLES
+    from tacpipe.signals.axes import LEAST, is_time, lag_one
+    from tacpipe.signals.scrambling import unscramble
+
+    block = _array(path)
+    if block.dtype.kind not in "fiu" or block.shape[1:3] != (TRIANGLES, TRIANGLE_TAXELS) or block.shape[3] < 2:
+        raise TacpipeError(
+            f"{path} is an array of {block.dtype} of the shape {block.shape}; it must hold numbers, and be (slide, "
+            f"{TRIANGLES} triangles, {TRIANGLE_TAXELS} taxels, two or more frames)."
+        )
+    slide = np.array(block[place], dtype=np.float32)  # (triangle, taxel, time)
+    if not np.isfinite(slide).all():
+        raise TacpipeError(f"{path}, slide {place} holds values that are not finite. Copy the file again.")
+    if slide.min() < 0 or slide.max() > LARGEST:
+        raise TacpipeError(
+            f"{path}, slide {place} holds values from {slide.min():g} to {slide.max():g}; readings lie from 0 to "
+            f"{LARGEST:g}. It looks like 8-bit numbers that wrapped. Copy the file again, or leave the slide out."
+        )
+    for told_by in (slide, block):
+        if is_time(told_by, -1):
+            return slide
+        if is_time(unscramble(told_by), -1):
+            felt: NDArray[np.float32] = unscramble(slide)
+            return felt
+    raise TacpipeError(
+        f"{path}, slide {place}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
+        f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {LEAST} or more, "
+        f"and more than along other axes. Check how the array was made."
+    )
+
+
+def _label(block: Path, path: Path, place: int) -> int:
+    """Return the label of a slide, from 0. Raises `TacpipeError` if the labels are not one whole number a slide."""
+    import numpy as np
+
+    labels, slides = _array(path).ravel(), len(_array(block))
+    if len(labels) != slides:
+        raise TacpipeError(f"{path} has {len(labels)} labels and {block.name} {slides} slides; copy both files again.")
+    label = labels[place]
+    if labels.dtype.kind not in "fiu" or not (label >= 0 and label == np.rint(label)):
+        raise TacpipeError(
+            f"{path}, label {place} is {label!r}; it must be a whole number from 0. Copy the file again."
+        )
+    return int(label)
+
+
+def _array(path: Path) -> NDArray[Any]:
+    """Return an array without reading it whole. Raises `TacpipeError` if the file is none; a pickle is never opened."""
+    import numpy as np
+
+    try:
+        found: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise TacpipeError(
+            f"{path} cannot be read as an array of numbers: {error}. Copy it again from its source."
+        ) from error
+    return found

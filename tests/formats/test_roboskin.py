@@ -1,0 +1,200 @@
+"""RoboSkin slides: made-up blocks in every arrangement, and the published ones where they are at hand."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.roboskin import Params, discover, roboskin
+from tacpipe.signals.scrambling import scramble
+from tacpipe.stage import Recording
+from tests.formats.slide_files import felt, write_roboskin
+
+SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+
+
+def read(source: Path, params: Params | None = None) -> dict[str, Recording]:
+    params = params or Params()
+    return {name: roboskin(params, files) for name, files in discover(params, source).items()}
+
+
+def values(recording: Recording) -> np.ndarray:
+    """Return (triangle, taxel, time)."""
+    table = recording.streams["roboskin"]
+    return np.stack([column.to_numpy() for column in table.columns[1:]]).reshape(6, 10, table.num_rows)
+
+
+def test_slides_come_out_as_they_were_felt_though_they_are_published_scrambled(tmp_path: Path) -> None:
+    slides = felt()
+    write_roboskin(tmp_path, slides)
+    found = read(tmp_path)
+    assert list(found) == ["roboskin-fold0-000", "roboskin-fold0-001", "roboskin-fold0-002"]
+    for recording, slide in zip(found.values(), slides, strict=True):
+        np.testing.assert_array_equal(values(recording), slide)
+    table = found["roboskin-fold0-001"].streams["roboskin"]
+    assert table.column_names[:2] == ["t_ns", "triangle1_taxel01"]
+    field = table.schema.field("triangle6_taxel10")
+    assert field.type == pa.float32()
+    assert field.metadata == {b"unit": b"count", b"quantity": b"tactile", b"triangle": b"6", b"taxel": b"10"}
+
+
+def test_a_block_that_is_right_already_is_taken_as_it_is(tmp_path: Path) -> None:
+    slides = felt()
+    np.save(write_roboskin(tmp_path, slides), slides)
+    for recording, slide in zip(read(tmp_path).values(), slides, strict=True):
+        np.testing.assert_array_equal(values(recording), slide)
+
+
+def test_the_authors_layout_is_the_published_one_whichever_way_the_block_lies(tmp_path: Path) -> None:
+    slides = felt()
+    path = write_roboskin(tmp_path, slides)
+    for given in (scramble(slides), slides):
+        np.save(path, given)
+        for recording, slide in zip(read(tmp_path, Params(layout="authors")).values(), slides, strict=True):
+            np.testing.assert_array_equal(values(recording), scramble(slide))
+            assert recording.attributes["layout"] == "authors"
+
+
+def test_a_slide_that_touched_nothing_is_arranged_as_its_block(tmp_path: Path) -> None:
+    slides = felt()
+    slides[1] = 0
+    slides[1, 3, 4, 40] = 9.0  # one reading says nothing about axes
+    write_roboskin(tmp_path, slides)
+    np.testing.assert_array_equal(values(read(tmp_path)["roboskin-fold0-001"]), slides[1])
+
+
+def test_an_array_without_a_time_axis_is_refused(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).uniform(0, 200, (2, 6, 10, 75))
+    write_roboskin(tmp_path, noise)
+    with pytest.raises(TacpipeError, match="slide 0: neither as it stands nor unscrambled is its last axis time"):
+        read(tmp_path)
+
+
+def test_stamps_are_made_from_the_nominal_rate_and_say_so(tmp_path: Path) -> None:
+    write_roboskin(tmp_path, felt(1))
+    table = read(tmp_path, Params(rate_hz=25.0))["roboskin-fold0-000"].streams["roboskin"]
+    assert table.column("t_ns").to_pylist() == [40_000_000 * frame for frame in range(75)]
+    assert table.schema.field("t_ns").metadata[b"made"] == b"from nominal rate"
+
+
+@pytest.mark.parametrize(
+    ("name", "recording", "part"),
+    [
+        ("fold_3", "roboskin-fold3-000", {"authors_fold": 3}),
+        ("val_1", "roboskin-fold1-000", {"authors_fold": 1}),
+        ("test", "roboskin-test-000", {"authors_role": "test"}),
+    ],
+)
+def test_the_block_tells_the_authors_part(tmp_path: Path, name: str, recording: str, part: dict[str, object]) -> None:
+    write_roboskin(tmp_path, felt(1), name, np.array([[6]]))
+    assert read(tmp_path)[recording].attributes == {
+        "sensor": "roboskin",
+        "material": 7,
+        "trial": 0,
+        "session": "roboskin-m07",
+        "rate_hz": 50.0,
+        "layout": "time",
+        **part,
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda block: block - 100, "holds values from -.*It looks like 8-bit numbers that wrapped"),
+        (lambda block: block * 2, "readings lie from 0 to 255"),
+        (lambda block: np.where(block == block.max(), np.nan, block), "holds values that are not finite"),
+        (
+            lambda block: block[:, :5],
+            r"of the shape \(1, 5, 10, 75\); it must hold numbers, and be \(slide, 6 triangles",
+        ),
+        (lambda block: block[0], r"has the shape \(6, 10, 75\); it must be \(slide, triangle, taxel, time\)"),
+        (lambda block: block.astype(object), "cannot be read as an array of numbers.*Copy it again"),
+        (lambda block: block > 0, "is an array of bool"),
+    ],
+)
+def test_a_block_that_holds_no_slides_is_refused(tmp_path: Path, change: object, message: str) -> None:
+    assert callable(change)
+    path = write_roboskin(tmp_path, felt(1))
+    np.save(path, change(np.load(path)))
+    with pytest.raises(TacpipeError, match=message):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (np.arange(3), "has 3 labels and icub_fold_0.npy 1 slides"),
+        (np.array([-1]), r"label 0 is .*-1.*; it must be a whole number from 0"),
+        (np.array([1.5]), r"label 0 is .*1\.5.*; it must be a whole number from 0"),
+        (np.array([np.nan]), r"label 0 is .*nan.*; it must be a whole number from 0"),
+        (np.array(["a"]), r"label 0 is .*'a'.*; it must be a whole number from 0"),
+        (np.array([None]), "cannot be read as an array of numbers"),
+    ],
+)
+def test_labels_that_are_none_are_refused(tmp_path: Path, labels: np.ndarray, message: str) -> None:
+    write_roboskin(tmp_path, felt(1), labels=labels)
+    with pytest.raises(TacpipeError, match=message):
+        read(tmp_path)
+
+
+def test_files_that_are_missing_doubled_or_damaged_are_told(tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="holds no block of slides"):
+        discover(Params(), tmp_path)
+    path = write_roboskin(tmp_path, felt(1))
+    with pytest.raises(TacpipeError, match="is no folder"):
+        discover(Params(), path)
+    np.save(tmp_path / "icub_val_0.npy", felt(1))
+    with pytest.raises(TacpipeError, match="are the same block"):
+        discover(Params(), tmp_path)
+    (tmp_path / "icub_val_0.npy").unlink()
+    (tmp_path / "labels_fold_0.npy").unlink()
+    with pytest.raises(TacpipeError, match=r"has no labels: labels_fold_0\.npy is not beside it"):
+        discover(Params(), tmp_path)
+    whole = path.read_bytes()
+    write_roboskin(tmp_path, felt(1))
+    path.write_bytes(whole[:2000])
+    with pytest.raises(TacpipeError, match="cannot be read as an array of numbers"):
+        read(tmp_path)
+    path.write_bytes(b"PK\x03\x04 an archive")
+    with pytest.raises(TacpipeError, match="it does not begin as an array of numpy does"):
+        discover(Params(), tmp_path)
+
+
+def test_blocks_are_found_at_any_depth_and_copies_below_them_are_passed_over(tmp_path: Path) -> None:
+    path = write_roboskin(tmp_path / "set" / "arrays", felt(1))
+    write_roboskin(tmp_path / "set" / "arrays" / "copies", felt(2))
+    np.save(path.with_name("icub_test_4.npy"), felt(1))
+    found = discover(Params(), tmp_path)
+    assert {name: dict(files) for name, files in found.items()} == {
+        "roboskin-fold0-000": {"icub_fold_0.npy[0]": path, "labels_fold_0.npy[0]": path.with_name("labels_fold_0.npy")}
+    }
+
+
+def test_unknown_layouts_and_rates_are_refused(tmp_path: Path) -> None:
+    write_roboskin(tmp_path, felt(1))
+    with pytest.raises(TacpipeError, match="layout is 'mixed'; it must be time or authors"):
+        read(tmp_path, Params(layout="mixed"))
+    with pytest.raises(TacpipeError, match="A rate of 0"):
+        read(tmp_path, Params(rate_hz=0.0))
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (SAMPLE / "roboskin_slide_20_50").is_dir(), reason="the published recordings are not here")
+def test_each_published_slide_is_unscrambled_as_the_formula_says() -> None:
+    found = read(SAMPLE / "roboskin_slide_20_50")
+    assert len(found) == 800
+    row, taxel, place = np.indices((6, 10, 75))
+    for fold in range(4):
+        block = np.load(SAMPLE / "roboskin_slide_20_50" / f"icub_fold_{fold}.npy", allow_pickle=False)
+        for slide, published in enumerate(block):
+            whole = values(found[f"roboskin-fold{fold}-{slide:03d}"])
+            mixed = whole[(75 * row + place) % 6, taxel, (75 * row + place) // 6]
+            np.testing.assert_array_equal(mixed, published)
+    materials = [recording.attributes["material"] for recording in found.values()]
+    assert np.bincount(np.array(materials, dtype=int)).tolist() == [0, *[40] * 20]

@@ -1,0 +1,56 @@
+"""Which axis is time: against numpy's correlation, and on arrays that are made to have one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tacpipe.signals.axes import is_time, lag_one
+
+
+def walk(seed: int, channels: int = 12, frames: int = 80) -> np.ndarray:
+    """Return channels that differ and drift, (channel, time)."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, 5, (channels, 1)) + np.cumsum(rng.normal(size=(channels, frames)), axis=1)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_autocorrelation_is_that_of_neighbours_as_numpy_has_it(axis: int) -> None:
+    values = np.cumsum(np.random.default_rng(0).normal(size=(4, 5, 6)), axis=axis)
+    moved = np.moveaxis(values, axis, 0)
+    wanted = np.corrcoef(moved[:-1].ravel(), moved[1:].ravel())[0, 1]
+    assert lag_one(values, axis) == pytest.approx(wanted)
+    assert lag_one(values, axis - 3) == pytest.approx(wanted)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.01, 100), st.floats(-1000, 1000))
+def test_neither_unit_nor_offset_changes_it(seed: int, scale: float, offset: float) -> None:
+    values = walk(seed)
+    assert lag_one(values * scale + offset, 1) == pytest.approx(lag_one(values, 1), abs=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_time_is_the_axis_along_which_readings_drift(seed: int) -> None:
+    values = walk(seed)
+    assert is_time(values, 1)
+    assert is_time(values.T, 0)
+    assert not is_time(values, 0)
+    assert not is_time(np.random.default_rng(seed).permuted(values, axis=1) - values.mean(axis=1, keepdims=True), 1)
+
+
+def test_of_two_smooth_axes_the_smoother_is_time() -> None:
+    values = np.sin(np.arange(40) / 4)[:, None] + np.sin(np.arange(40) / 9)
+    assert 0.5 < lag_one(values, 0) < lag_one(values, 1)
+    assert is_time(values, 1)
+    assert not is_time(values, 0)
+
+
+def test_what_does_not_vary_or_is_not_finite_tells_nothing() -> None:
+    assert np.isnan(lag_one(np.ones((3, 4)), 1))
+    assert np.isnan(lag_one(np.ones((3, 1)), 1))
+    assert not is_time(np.ones((3, 4)), 1)
+    holed = walk(0)
+    holed[2, 3] = np.nan
+    assert not is_time(holed, 1)

@@ -1,0 +1,81 @@
+"""The streams of a recording: those of a synchronized table are those that were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.streams import of_quantity, signal, streams_of
+
+
+@dataclass
+class Shard:
+    """A recording without a store."""
+
+    tables: Mapping[str, pa.Table]
+    name: str = "trial"
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        return tuple(sorted(self.tables))
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        return self.tables[stream]
+
+
+def table(**columns: tuple[list[Any], dict[str, str]]) -> pa.Table:
+    fields = [pa.field(name, pa.array(values).type, metadata=kind) for name, (values, kind) in columns.items()]
+    return pa.table([pa.array(values) for values, _ in columns.values()], schema=pa.schema(fields))
+
+
+def streams(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
+    return streams_of(Shard(tables))  # type: ignore[arg-type]
+
+
+TIME = ([10, 20], {"quantity": "time"})
+
+
+def test_streams_that_lie_apart_are_given_without_truth_and_events() -> None:
+    one, other = table(t_ns=TIME, a=([1, 2], {})), table(t_ns=TIME, b=([3, 4], {}))
+    assert streams({"one": one, "events": other, "truth": other, "two": other}) == {"one": one, "two": other}
+
+
+def test_a_synchronized_table_falls_apart_under_the_names_that_were_recorded() -> None:
+    found = streams(
+        {
+            "": table(
+                t_ns=TIME,
+                xela_x=([1, 2], {"stream": "xela", "quantity": "tactile"}),
+                xela_held=([True, False], {"stream": "xela", "quantity": "mask"}),
+                robot_xela_x=([3, 4], {"stream": "robot"}),
+                gt_force_n=([5, 6], {"stream": "truth"}),
+            )
+        }
+    )
+    assert {name: part.to_pydict() for name, part in found.items()} == {
+        "xela": {"t_ns": [10, 20], "x": [1, 2]},
+        "robot": {"t_ns": [10, 20], "xela_x": [3, 4]},
+    }
+    assert of_quantity(found["xela"], "tactile") == ["x"]
+    assert of_quantity(found["robot"], "tactile") == []
+
+
+def test_a_table_that_was_one_from_the_start_is_one_stream_without_name() -> None:
+    assert list(streams({"": table(t_ns=TIME, a=([1, 2], {}))})) == [""]
+
+
+def test_a_signal_is_that_of_the_first_stream_with_its_quantity() -> None:
+    force = {"quantity": "force"}
+    given = {
+        "pose": table(t_ns=TIME, a=([1, 2], {})),
+        "wrench": table(t_ns=TIME, x=([1.0, 2.0], force), other=([0.0, 0.0], {}), y=([3.0, 4.0], force)),
+    }
+    found = signal(given, "force")
+    assert found is not None
+    np.testing.assert_array_equal(found[0], [10, 20])
+    np.testing.assert_array_equal(found[1], [[1.0, 3.0], [2.0, 4.0]])
+    assert signal(given, "velocity") is None
