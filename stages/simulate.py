@@ -41,3 +41,34 @@ def forward(params: Params, trial: Trial) -> Recording:
     del values["trials"]
     seed = values.pop("seed")
     return simulate_trial(seed, trial, Rig(**values))
+
+
+@dataclass(frozen=True)
+class MaterialParams:
+    """What the simulated rig of two unlike sensors slides over, and how well the sensors tell."""
+
+    trials: int = 200  # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
+    seed: int = 0  # of all that is random
+    materials: int = 20  # materials
+    sessions: int = 1  # sessions a material, over which its trials are shared out by turns
+    identical_materials: bool = False  # all classes are one and the same material; only their sessions differ
+    spectra: str = "shared"  # shared: both sensors feel the same materials; independent: each has its own twenty
+    session_scale: float = 1.0  # times the offsets, gains and drift that the trials of a session have in common
+    noise_scale: float = 1.0  # times what differs from reading to reading: noise, drift, each trial's own offsets
+    force_n: float = 1.0  # newton, mean force of a slide; it varies by 5 % from trial to trial
+    speed_m_s: float = 0.025  # metres a second, of the arm that draws the BioTac
+    roboskin_speed_m_s: float = 0.05  # metres a second, mean speed of what slides over RoboSkin; it wanders by 30 %
+    pac: bool = True  # whether the BioTac's vibration channels are simulated; they are zero otherwise
+    arm_every: int = 20  # every how many-th slide of a BioTac on a material has the arm's streams; 0: none
+    jitter_ms: float = 0.1  # milliseconds, mean and standard deviation of a reading's way to the host
+
+
+@stage(version=1)
+def material(params: MaterialParams, trial: Trial) -> Recording:
+    """Return one slide of a BioTac or of RoboSkin over a material, and, with ground truth, truth."""
+    from tacpipe.simulation.slide import Rig, simulate_trial
+
+    values = asdict(params)
+    del values["trials"]
+    seed = values.pop("seed")
+    return simulate_trial(seed, trial, Rig(**values))

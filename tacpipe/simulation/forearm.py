@@ -1,0 +1,71 @@
+"""A patch of iCub RoboSkin on a slide: six triangular modules of ten taxels each, of which the object presses some.
+
+The compensated readings of the iCub are floats, 0 where nothing presses, clipped at 255. The object lies on a patch that
+wanders over the triangles as the curved forearm rolls on it; taxels outside are idle: a dead zone hides their noise. In
+the published slides 51 % of the readings are zero.
+
+The layout is an assumption after the iCub's documentation: triangles of 30 mm side, in a strip, of which every other one
+points the other way; in each, taxels in rows of 4, 3, 2 and 1, the fourth being the one in the centre.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.formats import channels
+
+Floats = NDArray[np.float64]
+
+TAXELS = channels.TRIANGLES * channels.TRIANGLE_TAXELS
+PITCH_M = 0.0067  # of the taxels of a triangle
+SIDE_M = 0.030
+APERTURE_M = 0.0018
+SIGMA_M = 0.0085  # of the Gaussian by which the patch presses
+GAIN_COUNT_N = 170.0  # of a taxel at the centre of the patch
+LEAN = 0.3  # as of the fingertip, one sigma before or behind the centre
+NOISE_COUNT = 2.25  # three times the fingertip's
+DEAD_COUNT = 6.0  # readings below are zero, those above less by it
+DRIFT_COUNT = 0.9  # random walk, counts after one second
+LARGEST_COUNT = 255.0
+RATE_HZ, FRAMES = 50.0, 75
+START_M = ((-0.018, -0.010), (-0.003, 0.003))  # of the patch's centre along the strip and across it
+ROLL_M = ((0.012, 0.022), (-0.003, 0.003))  # its way during a slide
+
+
+def _places() -> Floats:
+    """Return where the taxels lie (taxel, axis): along the strip and across it, around its centre."""
+    rows = [(row, place) for row, width in enumerate((4, 3, 2, 1)) for place in range(width)]
+    module = np.array([[place - (3 - row) / 2, (row - 1) * np.sqrt(3) / 2] for row, place in rows]) * PITCH_M
+    module[[3, 5]] = module[[5, 3]]  # the fourth is the one in the centre
+    triangles = []
+    for triangle in range(channels.TRIANGLES):
+        sign = 1 - 2 * (triangle % 2)
+        along = (triangle - (channels.TRIANGLES - 1) / 2) * SIDE_M / 2
+        triangles.append(module * sign + [along, -sign * SIDE_M / 12 * np.sqrt(3)])
+    return np.concatenate(triangles)
+
+
+PLACES_M = _places()  # (taxel, axis)
+ALONG_M = PLACES_M[:, 0]  # (taxel,), xi: by which a taxel feels the surface earlier
+
+
+def shares(patch_m: Floats) -> Floats:
+    """Return how much of the patch's pressure each taxel feels (time, taxel), 1 at its centre ``patch_m`` (time, axis)."""
+    distance2 = ((PLACES_M - patch_m[:, None]) ** 2).sum(axis=2)
+    share: Floats = np.exp(-distance2 / (2 * SIGMA_M**2))
+    return share
+
+
+def leans(patch_m: Floats) -> Floats:
+    """Return the share of the friction that each taxel feels as pressure (time, taxel): d, forward of the patch > 0."""
+    lean: Floats = LEAN * np.tanh((ALONG_M - patch_m[:, :1]) / SIGMA_M)
+    return lean
+
+
+def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return the taxels (time, taxel) as they are logged: with noise and drift, without the dead zone, clipped."""
+    steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
+    noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
+    counts: NDArray[np.float32] = (signal + noise_scale * noise - DEAD_COUNT).clip(0, LARGEST_COUNT).astype(np.float32)
+    return counts

@@ -1,0 +1,336 @@
+"""A slide over a material, on the simulated rig of two unlike sensors: a BioTac on an arm, or RoboSkin on a forearm.
+
+Trial i is one of the BioTac if i is even, of RoboSkin if it is odd; the materials take turns. What happens in one of the
+BioTac, as on the published rig:
+
+1. the finger hangs free, then comes down at 0.5 mm/s until its pressure exceeds 40 counts, 1.4 N;
+2. the arm draws it along at 25 mm/s for 8 s (for 6 s on material 1), while the force settles at about 1 N;
+3. the arm lifts it.
+
+A slide of RoboSkin is 75 frames in contact, at a speed and over triangles that are not well controlled.
+
+Both sensors feel ``gain share [F (1 + mu d) + texture(x + xi) + offset]`` in each channel: xi is where the channel lies,
+``texture`` is what `tacpipe.simulation.texture` tells of the surface, and the offset is nuisance. It is in part one of
+the session, common to all trials of a material in it and drifting from trial to trial, as is a gain: where each
+material has one session, as in the published recordings, such a fingerprint tells the material without any texture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats import channels
+from tacpipe.simulation import faults, fingertip, forearm, texture
+from tacpipe.stage import Attribute, Recording
+
+Floats = NDArray[np.float64]
+
+SENSORS = ("biotac", "roboskin")
+SPECTRA = ("shared", "independent")
+START_NS = 1_581_000_000_000_000_000  # UTC stamp of the first trial's start
+TRIAL_NS = 60_000_000_000
+FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a share of it
+HOVER_S = (0.2, 0.4)  # before the finger touches
+APPROACH_M_S = 0.0005
+SLIDE_S, SHORT_SLIDE_S, SHORT_MATERIAL = 8.0, 6.0, 1  # one published material was recorded for less time
+RAMP_S = 0.3  # over which speed and force settle
+STOP_S, LIFT_S, AFTER_S = 0.1, 0.1, 0.3
+SPEED_SPREAD = 0.01  # of the arm: standard deviation from trial to trial, and half of it within one
+WANDER, MOST_WANDER = 0.07, 0.3  # share by which the forearm's speed varies: standard deviation, and at most
+WANDER_S = (0.8, 2.0)  # periods of that
+SESSION_GAIN, SESSION_N = 0.08, 0.07  # standard deviation between sessions: gain, and offset of each channel in newton
+DRIFT_N, DRIFT_TRIALS = 0.04, 50  # by which an offset moves, over so many trials of a session
+TRIAL_N = 0.10  # standard deviation of each channel's offset from trial to trial
+ARM_HZ = 150.0
+ARM_GAP = 0.12  # share of the arm's readings after which the link is silent
+ARM_GAP_S = 0.04
+SPEED_NOISE_M_S, SPIKE_M_S, SPIKES = 0.0006, 0.02, 0.01
+FORCE_NOISE_N, TORQUE_NOISE_NM = 0.15, 0.02
+MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Which materials are slid over, and how well the sensors tell; the fields are those of the stage's params.
+
+    Controls: with ``identical_materials`` nothing but the session tells one class from another, with ``session_scale=0``
+    nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in common.
+    """
+
+    materials: int = 20
+    sessions: int = 1
+    identical_materials: bool = False
+    spectra: str = "shared"
+    session_scale: float = 1.0
+    noise_scale: float = 1.0
+    force_n: float = 1.0
+    speed_m_s: float = 0.025
+    roboskin_speed_m_s: float = 0.05
+    pac: bool = True
+    arm_every: int = 20
+    jitter_ms: float = 0.1
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a trial stands in the plan of the rig; all but ``number`` count from 1, except that material 0 is any."""
+
+    sensor: str
+    material: int
+    session: int
+    number: int  # of the trial among those of its sensor and material, from 0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What truly happens in a trial when the sensor takes its samples; arrays are (time,) unless told otherwise."""
+
+    place: Place
+    of: texture.Material
+    surface: texture.Waves
+    true_ns: NDArray[np.int64]  # since the start of the trial
+    position_m: Floats  # of the slide
+    speed_m_s: Floats
+    force_n: Floats
+    contact: Floats  # 0: nothing is touched, 1: pressed as in the slide
+    phase: NDArray[np.int8]  # -1 before the slide, 0 in it, 1 after
+    patch_m: Floats  # (time, axis): centre of what is pressed, along the skin and across it
+    pressure_count: fingertip.Counts  # of the finger's fluid, as it is logged; empty for RoboSkin
+
+
+def place(index: int, rig: Rig) -> Place:
+    """Return what trial ``index`` is a trial of."""
+    number, within = divmod(index, len(SENSORS) * rig.materials)
+    session = number % rig.sessions + 1
+    return Place(SENSORS[within % len(SENSORS)], within // len(SENSORS) + 1, session, number)
+
+
+def material(seed: int, sensor: str, number: int, rig: Rig = Rig()) -> texture.Material:
+    """Return material ``number`` as ``sensor`` feels it: the same for both sensors where they share their spectra."""
+    source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
+    known = 0 if rig.identical_materials else number
+    return texture.material(np.random.default_rng([seed, MATERIAL, source, known]))
+
+
+def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
+    """Return trial ``index`` of the rig: the stream biotac or roboskin, truth, and for some of the BioTac the arm's.
+
+    The same seed, index and rig give the same values. Columns of ``truth``, on the true times of the tactile samples,
+    are ground truth. Raises `TacpipeError` for a rig that cannot be.
+    """
+    _check(rig)
+    scene = perform(seed, index, rig)
+    start_ns = START_NS + index * TRIAL_NS
+    rng = np.random.default_rng([seed, NOISE, index])
+    signal = response(seed, index, scene, rig)
+    streams = {}
+    if scene.place.sensor == "biotac":
+        arrived_ns = start_ns + faults.arrivals(scene.true_ns, rig.jitter_ms * 1e6, rng)
+        streams["biotac"] = channels.stream(arrived_ns, _finger(scene, signal, rig, rng), channels.biotac_fields())
+        if rig.arm_every and scene.place.number % rig.arm_every == 0:
+            streams |= _arm(scene, start_ns, rig, rng)
+    else:
+        taxels = forearm.read(signal, rig.noise_scale, rng)
+        made = f"from a nominal rate of {forearm.RATE_HZ:g} Hz"
+        streams["roboskin"] = channels.stream(start_ns + scene.true_ns, taxels.T, channels.roboskin_fields(), made)
+    streams["truth"] = _truth(scene, start_ns)
+    return Recording(streams, _attributes(scene.place))
+
+
+def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
+    """Return what truly happens in trial ``index``."""
+    which = place(index, rig)
+    rng = np.random.default_rng([seed, TRIAL, index])
+    of = material(seed, which.sensor, which.material, rig)
+    surface = texture.track(of, rng)
+    force_n = rig.force_n * (1 + FORCE_SPREAD * float(rng.normal()))
+    if which.sensor == "biotac":
+        return _drawn(which, of, surface, force_n, rig, rng)
+    return _rolled(which, of, surface, force_n, rig, rng)
+
+
+def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
+    """Return what each channel feels in a trial (time, channel), counts without noise."""
+    gain, lean, along_m, aperture_m = sensitivity(scene)
+    felt_n = texture.felt(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
+    factor, offset_n = nuisance(seed, index, gain.shape[1], rig)
+    pressed_n = scene.force_n[:, None] * (1 + scene.of.friction * lean)
+    found: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (felt_n + offset_n))
+    return found
+
+
+def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
+    """Return counts per newton (time, channel), d (time, channel), xi (channel,) in metres, and the aperture's sigma."""
+    if scene.place.sensor == "biotac":
+        shape = (len(scene.true_ns), channels.ELECTRODES)
+        gain, lean = (np.broadcast_to(known, shape) for known in (fingertip.gains(), fingertip.leans()))
+        return gain, lean, fingertip.ALONG_M, fingertip.APERTURE_M
+    gain = forearm.GAIN_COUNT_N * forearm.shares(scene.patch_m)
+    return gain, forearm.leans(scene.patch_m), forearm.ALONG_M, forearm.APERTURE_M
+
+
+def nuisance(seed: int, index: int, number: int, rig: Rig = Rig()) -> tuple[float, Floats]:
+    """Return the gain of a trial's session and the offset of each of ``number`` channels in that trial, N (channel,)."""
+    which = place(index, rig)
+    rng = np.random.default_rng([seed, SESSION, SENSORS.index(which.sensor), which.material, which.session])
+    factor = float(np.exp(rig.session_scale * SESSION_GAIN * rng.normal()))
+    offset, drift = rng.normal(0, 1, (2, number))
+    late = which.number // rig.sessions / DRIFT_TRIALS
+    own = np.random.default_rng([seed, SESSION, index]).normal(0, 1, number)
+    return factor, rig.session_scale * (SESSION_N * offset + DRIFT_N * late * drift) + rig.noise_scale * TRIAL_N * own
+
+
+def _drawn(
+    which: Place, of: texture.Material, surface: texture.Waves, force_n: float, rig: Rig, rng: np.random.Generator
+) -> Scene:
+    """Return a slide of the BioTac, which starts with the first sample whose pressure is above the trigger."""
+    rate_hz = fingertip.RATE_HZ
+    touch_s, phase_s = rng.uniform(*HOVER_S), rng.random() / rate_hz
+    loading_n_s = of.stiffness_n_m * APPROACH_M_S
+    short = which.material == SHORT_MATERIAL and not rig.identical_materials
+    lasts_s = SHORT_SLIDE_S if short else SLIDE_S
+    longest_s = touch_s + 2 * fingertip.TRIGGER_COUNT / fingertip.PRESSURE_COUNT_N / loading_n_s
+    at_s = phase_s + np.arange(round((longest_s + lasts_s + AFTER_S) * rate_hz)) / rate_hz
+    noise = rig.noise_scale * rng.normal(0, fingertip.PRESSURE_NOISE_COUNT, len(at_s))
+    coming_n = loading_n_s * np.maximum(at_s - touch_s, 0)
+    first = int((fingertip.pressure(coming_n, noise) > fingertip.TRIGGER_COUNT).argmax())
+    rows = first + round((lasts_s + AFTER_S) * rate_hz)
+    at_s, since_s = at_s[:rows], at_s[:rows] - at_s[first]
+    position_m, speed_m_s = _way(since_s, lasts_s, rig.speed_m_s, rng)
+    settling = np.clip(since_s / RAMP_S, 0, 1)
+    lifting = 1 - np.clip((since_s - lasts_s) / LIFT_S, 0, 1)
+    sliding_n = (1 - settling) * coming_n[first] + settling * force_n
+    pressed_n = np.where(since_s < 0, coming_n[:rows], sliding_n * lifting)
+    phase = np.where(since_s < 0, -1, np.where(np.arange(rows) < first + round(lasts_s * rate_hz), 0, 1))
+    return Scene(
+        which,
+        of,
+        surface,
+        np.rint(at_s * 1e9).astype(np.int64),
+        position_m,
+        speed_m_s,
+        pressed_n,
+        np.clip(pressed_n / force_n, 0, 1),
+        phase.astype(np.int8),
+        np.tile(fingertip.CENTRE_M[:2], (rows, 1)),
+        fingertip.pressure(pressed_n, noise[:rows]),
+    )
+
+
+def _rolled(
+    which: Place, of: texture.Material, surface: texture.Waves, force_n: float, rig: Rig, rng: np.random.Generator
+) -> Scene:
+    """Return a slide of RoboSkin: in contact from first to last frame, at a speed that wanders."""
+    at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
+    share = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
+    period_s, phase = rng.uniform(*WANDER_S), rng.uniform(0, 2 * np.pi)
+    turn = 2 * np.pi / period_s
+    speed = rig.roboskin_speed_m_s * (1 + share * np.sin(turn * at_s + phase))
+    way = rig.roboskin_speed_m_s * (at_s - share / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
+    start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
+    return Scene(
+        which,
+        of,
+        surface,
+        np.rint(at_s * 1e9).astype(np.int64),
+        way,
+        speed,
+        np.full(len(at_s), force_n),
+        np.ones(len(at_s)),
+        np.zeros(len(at_s), np.int8),
+        start_m + np.outer(at_s / at_s[-1], roll_m),
+        np.empty(0, np.uint16),
+    )
+
+
+def _way(since_s: Floats, lasts_s: float, limit_m_s: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return position and speed of the arm (time,) at ``since_s`` after it is started."""
+    grid = np.arange(0, lasts_s, 0.001)
+    swing, period_s, phase = rng.normal(0, SPEED_SPREAD / 2), rng.uniform(1, 4), rng.uniform(0, 2 * np.pi)
+    speed = limit_m_s * (1 + SPEED_SPREAD * rng.normal() + swing * np.sin(2 * np.pi * grid / period_s + phase))
+    speed *= np.clip(grid / RAMP_S, 0, 1) * np.clip((lasts_s - grid) / STOP_S, 0, 1)
+    position = np.append(0, np.cumsum(speed[:-1] + np.diff(speed) / 2) * 0.001)
+    return np.interp(since_s, grid, position), np.interp(since_s, grid, speed, left=0.0, right=0.0)
+
+
+def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) -> list[Any]:
+    """Return the 44 columns of the stream biotac, each (time,)."""
+    electrodes = fingertip.read(signal, rig.noise_scale, rng)
+    touched = scene.true_ns[int((scene.force_n > 0).argmax())]
+    tdc, tac = fingertip.warmth((scene.true_ns - touched) / 1e9, rig.noise_scale, rng)
+    pac = np.zeros((len(signal), channels.VIBRATIONS), np.uint16)
+    if rig.pac:
+        rows = np.arange(pac.size) / channels.VIBRATIONS
+        at, contact = (np.interp(rows, np.arange(len(signal)), known) for known in (scene.position_m, scene.contact))
+        pac = fingertip.vibration(contact * texture.felt(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng)
+    return [tdc, tac, scene.pressure_count, *pac.T, *electrodes.T]
+
+
+def _arm(scene: Scene, start_ns: int, rig: Rig, rng: np.random.Generator) -> dict[str, pa.Table]:
+    """Return the streams twist and wrench of the arm, on its own clock and with the silences of its link.
+
+    The arm slides along -x, and z is up. Nobody estimates angular velocity: it is NaN, as in the published recordings.
+    """
+    taken = faults.samples(int(scene.true_ns[-1]), ARM_HZ, 0.0, rng).true_ns
+    silent = rng.random(len(taken)) < ARM_GAP
+    until_ns = np.maximum.accumulate(np.where(silent, taken + rng.exponential(ARM_GAP_S * 1e9, len(taken)), 0))
+    taken = taken[np.append(True, taken[1:] > until_ns[:-1])]
+    arrived_ns = start_ns + faults.arrivals(taken, rig.jitter_ms * 1e6, rng)
+    speed, force = (np.interp(taken, scene.true_ns, known) for known in (scene.speed_m_s, scene.force_n))
+    phase = np.interp(taken, scene.true_ns, scene.phase)
+    still = np.zeros(len(taken))
+    down = np.where(phase < 0, APPROACH_M_S, 0.0)
+    twist = np.column_stack([-speed, still, -down]) + rig.noise_scale * rng.normal(0, SPEED_NOISE_M_S, (len(taken), 3))
+    spikes = np.flatnonzero(rng.random(len(taken)) < SPIKES * (rig.noise_scale > 0))
+    twist[spikes, 0] += rng.choice([-SPIKE_M_S, SPIKE_M_S], len(spikes))
+    load = np.column_stack([scene.of.friction * force * (speed > 0), still, force])
+    load += rig.noise_scale * rng.normal(0, FORCE_NOISE_N, load.shape)
+    turned = rig.noise_scale * rng.normal(0, TORQUE_NOISE_NM, load.shape)
+    unknown = np.full((3, len(taken)), np.nan)
+    return {
+        "twist": channels.stream(arrived_ns, [*twist.T, *unknown], channels.twist_fields()),
+        "wrench": channels.stream(arrived_ns, [*load.T, *turned.T], channels.wrench_fields()),
+    }
+
+
+def _truth(scene: Scene, start_ns: int) -> pa.Table:
+    """Return the stream ``truth``, at the true times of the tactile samples."""
+    fields = [
+        channels.float_field("gt_position_m", "m", "position"),
+        channels.float_field("gt_speed_m_s", "m/s", "speed"),
+        channels.float_field("gt_force_n", "N", "force"),
+        channels.float_field("gt_patch_along_m", "m", "position"),
+        channels.float_field("gt_patch_across_m", "m", "position"),
+        pa.field("gt_phase", pa.int8(), metadata={"unit": "1", "quantity": "label"}),
+    ]
+    columns = [scene.position_m, scene.speed_m_s, scene.force_n, *scene.patch_m.T, scene.phase]
+    return channels.stream(start_ns + scene.true_ns, columns, fields)
+
+
+def _attributes(which: Place) -> dict[str, Attribute]:
+    return {
+        "sensor": which.sensor,
+        "simulated": True,
+        "material": which.material,
+        "trial": which.number + 1,
+        "session": f"{which.sensor}-m{which.material:02d}-s{which.session}",
+        "rate_hz": fingertip.RATE_HZ if which.sensor == "biotac" else forearm.RATE_HZ,
+        **({"layout": "time"} if which.sensor == "roboskin" else {}),
+    }
+
+
+def _check(rig: Rig) -> None:
+    if rig.spectra not in SPECTRA:
+        raise TacpipeError(f"There are no spectra {rig.spectra!r}; those of the sensors are shared or independent.")
+    for name in ("materials", "sessions"):
+        if getattr(rig, name) < 1:
+            raise TacpipeError(f"{name} is {getattr(rig, name)}; the rig needs 1 or more.")
+    for name in ("force_n", "speed_m_s", "roboskin_speed_m_s"):
+        if getattr(rig, name) <= 0:
+            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be above 0 for a slide.")
