@@ -1,0 +1,105 @@
+"""What the mean level alone tells: linear discriminant analysis of each channel's mean over the slide.
+
+It sees neither texture nor time, only how hard and where the finger was pressed. Whatever it gets right, contact
+conditions or drift give away, so every classifier is held against it. The covariance within classes is shrunk towards
+a multiple of the identity by as much as Ledoit and Wolf (A well-conditioned estimator for large-dimensional covariance
+matrices, 2004) find best, because a few slides a class do not determine it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.floating[Any]]
+Labels = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class Level:
+    """What was fitted: scores are bias + (levels - centre) @ weight, log-likelihoods up to what classes share."""
+
+    classes: NDArray[np.int32]  # (class,), sorted
+    centre: Floats  # (channel,), in the slides' unit
+    weight: Floats  # (channel, class)
+    bias: Floats  # (class,)
+
+    @classmethod
+    def fit(cls, x: Floats, labels: Labels) -> Level:
+        """Return the analysis of training slides (slide, time, channel) and their classes (slide,).
+
+        A channel that never changes counts for nothing. Raises `TacpipeError` where arrays do not fit one another, a
+        value is not finite, there are fewer than two classes, or no class has two slides.
+        """
+        from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+        classes, counts = np.unique(labels, return_counts=True)
+        if x.ndim != 3 or labels.shape != x.shape[:1]:
+            raise TacpipeError(
+                f"Slides of {x.shape} and labels of {labels.shape} do not fit one another; they must be "
+                "(slide, time, channel) and (slide,)."
+            )
+        if len(classes) < 2 or counts.max() < 2:
+            raise TacpipeError(
+                f"{len(x)} slides of {len(classes)} classes do not show how classes differ; give two classes or more, "
+                "and two slides of one of them."
+            )
+        levels = _levels(x)
+        if not np.isfinite(levels).all():
+            raise TacpipeError("Some slides hold values that are not finite. Segment them again, or leave these out.")
+        centre, spread = levels.mean(axis=0), levels.std(axis=0)
+        gain = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 1e-9 * (1 + np.abs(centre)))
+        moves = gain > 0
+        if not moves.any():
+            raise TacpipeError("All slides have the same mean levels, so nothing tells classes apart by them.")
+        found = LinearDiscriminantAnalysis(
+            solver="lsqr", shrinkage="auto", priors=np.full(len(classes), 1 / len(classes))
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", UserWarning
+            )  # a class of one slide adds nothing to the covariance: so be it
+            found.fit((levels - centre)[:, moves] * gain[moves], labels)
+        signs = np.array([-1.0, 1.0]) / 2 if len(classes) == 2 else None  # of two classes only a difference is fitted
+        weight = np.zeros((x.shape[2], len(classes)))
+        coefficients = found.coef_ if signs is None else signs[:, None] * found.coef_
+        weight[moves] = gain[moves, None] * coefficients.T
+        bias = found.intercept_ if signs is None else signs * found.intercept_
+        parts = (part.astype(np.float32) for part in (centre, weight, bias))
+        return cls(classes.astype(np.int32), *parts)
+
+    def scores(self, x: Floats) -> Floats:
+        """Return the scores of slides (slide, time, channel), (slide, class)."""
+        if x.ndim != 3 or x.shape[2] != len(self.centre):
+            raise TacpipeError(
+                f"Slides of {x.shape} do not fit the mean levels; (slide, time, {len(self.centre)}) was fitted."
+            )
+        scores: Floats = (_levels(x) - self.centre) @ self.weight + self.bias
+        return scores
+
+    def predict(self, x: Floats) -> NDArray[np.int32]:
+        """Return the class of the highest score of each slide, (slide,)."""
+        named: NDArray[np.int32] = self.classes[self.scores(x).argmax(axis=1)]
+        return named
+
+    def to_tensors(self) -> dict[str, NDArray[Any]]:
+        """Return all that `from_tensors` needs."""
+        return {"classes": self.classes, "centre": self.centre, "weight": self.weight, "bias": self.bias}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Level:
+        """Return the analysis that `to_tensors` described."""
+        return cls(*(tensors[name] for name in ("classes", "centre", "weight", "bias")))
+
+
+def _levels(x: Floats) -> Floats:
+    """Return the mean of each channel over the slide, (slide, channel), float64."""
+    levels: Floats = x.mean(axis=1, dtype=np.float64)
+    return levels

@@ -1,0 +1,190 @@
+"""MiniRocket: ten thousand answers to "how often does this pattern occur?", asked of each slide.
+
+Dempster, Schmidt and Webb, MiniRocket: A Very Fast (Almost) Deterministic Transform for Time Series Classification, 2021
+(arXiv 2012.08791), section 3, in its form for several channels. A pattern is one of 84 kernels of nine weights, three of
+them 2 and six -1, stretched by a dilation and laid over the sum of a few channels drawn at random. A feature is the
+share of positions at which the kernel's answer exceeds a bias, and biases are quantiles of the answers to training
+slides. Every other kernel looks only where it fits into the slide; the rest see zeros beyond its ends.
+
+Nothing is learned but the biases, so few slides suffice; what the features mean is left to a linear readout.
+
+Slides are laid out channel, time, slide: a shifted slide is then a slice, and no step of the arithmetic below copies or
+strides. Three things make it fast: the nine weights are summed once for all, by doubling (2, 4 and 8 shifts, then the
+ninth); a block of slides stays in the processor's cache; and positions are counted as bytes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.floating[Any]]
+
+LENGTH = 9  # weights of a kernel
+HEAVY = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): where its weights are 2
+KERNELS = len(HEAVY)  # 84
+DILATIONS = 32  # at most, of each kernel
+MOST_CHANNELS = 9  # that one kernel sums
+GOLDEN = (5**0.5 + 1) / 2  # whose multiples, modulo 1, fill the unit interval evenly
+BLOCK_BYTES = 2**18  # of one channel of a block of slides: several such arrays fit into a cache of 1 MB
+COUNTED = 255  # positions that a byte can count
+
+
+@dataclass(frozen=True)
+class Rocket:
+    """The patterns and their biases. Features come dilation by dilation, then kernel by kernel, then bias by bias."""
+
+    frames: int
+    dilations: NDArray[np.int32]  # (dilation,), frames
+    each: NDArray[np.int32]  # (dilation,): biases of each kernel
+    channels: NDArray[np.bool_]  # (dilation, kernel, channel): which it sums
+    biases: Floats  # (feature,), in the slides' unit
+
+    @classmethod
+    def fit(cls, x: Floats, *, features: int = 10_000, seed: int = 0) -> Rocket:
+        """Return a transform for slides like the training slides ``x``, (slide, time, channel).
+
+        ``features`` is rounded down to a multiple of 84, and channels and slides that biases are taken of follow from
+        ``seed``. Raises `TacpipeError` for fewer than nine frames, fewer than 84 features, or values not finite.
+        """
+        _check(x)
+        if features < KERNELS:
+            raise TacpipeError(f"{features} features do not go round {KERNELS} kernels; ask for {KERNELS} or more.")
+        slides, frames, channels = x.shape
+        rng = np.random.default_rng(seed)
+        dilations, each = _dilations(frames, features // KERNELS)
+        most = min(channels, MOST_CHANNELS)
+        counts = (2 ** rng.uniform(0, np.log2(most + 1), (len(dilations), KERNELS))).astype(int)
+        drawn = rng.random((len(dilations), KERNELS, channels)).argsort(axis=-1).argsort(axis=-1)
+        chosen = drawn < counts[..., None]
+        examples = rng.integers(slides, size=(len(dilations), KERNELS))
+        quantiles = np.arange(1, KERNELS * each.sum() + 1) * GOLDEN % 1
+        padded, answers = _padded(x, dilations[-1]), []
+        for at, dilation in enumerate(dilations):
+            for kernel in range(KERNELS):
+                one = padded[:, :, examples[at, kernel], None]
+                answers.append(_answer(one, frames, at, kernel, dilation, chosen)[:, 0])
+        taken = np.split(quantiles, np.repeat(each, KERNELS).cumsum()[:-1])
+        biases = [np.quantile(answer, some) for answer, some in zip(answers, taken, strict=True)]
+        return cls(frames, dilations, each, chosen, np.concatenate(biases).astype(np.float32))
+
+    def transform(self, x: Floats) -> Floats:
+        """Return the features of slides (slide, time, channel): shares from 0 to 1, (slide, feature), float32.
+
+        Raises `TacpipeError` where slides are not like those that were fitted, or values are not finite.
+        """
+        _check(x)
+        if x.shape[1:] != (self.frames, self.channels.shape[-1]):
+            raise TacpipeError(
+                f"Slides of {x.shape} do not fit the transform; (slide, {self.frames}, {self.channels.shape[-1]}) "
+                "was fitted."
+            )
+        features = np.empty((len(x), len(self.biases)), np.float32)
+        size = max(16, BLOCK_BYTES // (4 * self.frames))
+        for first in range(0, len(x), size):
+            features[first : first + size] = self._block(x[first : first + size]).T
+        return features
+
+    def _block(self, x: Floats) -> Floats:
+        """Return the features of a few slides, (feature, slide)."""
+        features, at = np.empty((len(self.biases), len(x)), np.float32), 0
+        padded = _padded(x, self.dilations[-1])
+        for index, (dilation, each) in enumerate(zip(self.dilations, self.each, strict=True)):
+            for kernel in range(KERNELS):
+                answer = _answer(padded, self.frames, index, kernel, dilation, self.channels)
+                flags = np.empty(answer.shape, np.bool_)
+                for _ in range(each):
+                    np.greater(answer, self.biases[at], out=flags)
+                    features[at] = _counts(flags)
+                    at += 1
+                features[at - each : at] /= len(answer)
+        return features
+
+    def to_tensors(self) -> dict[str, NDArray[Any]]:
+        """Return all that `from_tensors` needs."""
+        return {
+            "frames": np.array([self.frames], np.int32),
+            "dilations": self.dilations,
+            "each": self.each,
+            "channels": self.channels,
+            "biases": self.biases,
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Rocket:
+        """Return the transform that `to_tensors` described."""
+        names = ("dilations", "each", "channels", "biases")
+        return cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
+
+
+def _dilations(frames: int, each: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the dilations and how many of a kernel's ``each`` features every one gets, both (dilation,).
+
+    They are spread evenly over powers of two, up to that at which a kernel spans the slide; those that fall on the same
+    whole number share it, and what rounding leaves over goes round from the first on.
+    """
+    most = min(each, DILATIONS)
+    powers = np.linspace(0, np.log2((frames - 1) / (LENGTH - 1)), most)
+    dilations, shared = np.unique((2**powers).astype(np.int32), return_counts=True)
+    counts = (shared * (each / most)).astype(np.int32)
+    counts[np.arange(each - counts.sum()) % len(counts)] += 1
+    return dilations, counts
+
+
+def _padded(x: Floats, dilation: int) -> Floats:
+    """Return slides with zeros before and after them for kernels up to ``dilation``, (channel, time, slide), float32."""
+    pad = (LENGTH // 2) * int(dilation)
+    padded = np.zeros((x.shape[2], x.shape[1] + 2 * pad, x.shape[0]), np.float32)
+    padded[:, pad : pad + x.shape[1]] = x.transpose(2, 1, 0)
+    return padded
+
+
+def _answer(padded: Floats, frames: int, index: int, kernel: int, dilation: int, channels: NDArray[np.bool_]) -> Floats:
+    """Return what a kernel answers at each position, (time, slide)."""
+    reach = (LENGTH - 1) * int(dilation)
+    spare = padded.shape[1] - frames
+    rows = frames + reach if (index + kernel) % 2 == 0 else frames  # with zeros beyond the ends, or without
+    first = (spare - (rows - frames)) // 2
+    rows -= reach
+    chosen = np.flatnonzero(channels[index, kernel])
+    total = padded[chosen[0], first : first + rows + reach]
+    if len(chosen) > 1:
+        total = total + padded[chosen[1], first : first + rows + reach]
+        for channel in chosen[2:]:
+            total += padded[channel, first : first + rows + reach]
+    nine = total[:-dilation] + total[dilation:]
+    nine = nine[: -2 * dilation] + nine[2 * dilation :]
+    nine = nine[: -4 * dilation] + nine[4 * dilation :]  # eight of them
+    nine = nine[:rows]
+    nine += total[reach:]
+    heavy = [total[weight * dilation : weight * dilation + rows] for weight in HEAVY[kernel]]
+    answer = heavy[0] + heavy[1]
+    answer += heavy[2]
+    answer *= 3
+    answer -= nine
+    return answer
+
+
+def _counts(flags: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return how many of the flags (time, slide) are set, (slide,)."""
+    byte = flags.view(np.uint8)
+    parts = [np.add.reduce(byte[at : at + COUNTED], axis=0, dtype=np.uint8) for at in range(0, len(byte), COUNTED)]
+    total: Floats = np.sum(parts, axis=0, dtype=np.float32)
+    return total
+
+
+def _check(x: Floats) -> None:
+    if x.ndim != 3 or not x.size or x.shape[1] < LENGTH:
+        raise TacpipeError(
+            f"Slides of {x.shape} cannot be transformed; they must be (slide, time, channel), with {LENGTH} frames or "
+            "more."
+        )
+    if not np.isfinite(x).all():
+        raise TacpipeError("Some slides hold values that are not finite. Segment them again, or leave these out.")

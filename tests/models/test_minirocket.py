@@ -1,0 +1,133 @@
+"""MiniRocket, against loops written from the paper: kernels, padding, dilations, biases and shares."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models import minirocket
+from tacpipe.models.minirocket import Rocket
+
+FRAMES, CHANNELS = 41, 3
+
+
+def slides(count: int, frames: int = FRAMES, channels: int = CHANNELS, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    walk = rng.normal(size=(count, frames, channels)).cumsum(axis=1)
+    return (10 * walk).round().astype(np.float32)  # whole numbers: sums are exact in any order
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Rocket:
+    return Rocket.fit(slides(12), features=84 * 12, seed=3)
+
+
+def weights(kernel: int) -> list[int]:
+    """Return the nine weights of a kernel: 2 at three places, in the order of combinations, and -1 elsewhere."""
+    heavy = list(itertools.combinations(range(9), 3))[kernel]
+    return [2 if place in heavy else -1 for place in range(9)]
+
+
+def answer(slide: np.ndarray, rocket: Rocket, index: int, kernel: int) -> list[float]:
+    """Return what a kernel answers at each position of one slide (time, channel), with loops."""
+    dilation = int(rocket.dilations[index])
+    channels = [c for c in range(slide.shape[1]) if rocket.channels[index, kernel, c]]
+    padded = (index + kernel) % 2 == 0
+    answers = []
+    for middle in range(len(slide)):
+        places = [middle + (place - 4) * dilation for place in range(9)]
+        inside = [0 <= place < len(slide) for place in places]
+        if not padded and not all(inside):
+            continue
+        total = 0.0
+        for weight, place, known in zip(weights(kernel), places, inside, strict=True):
+            total += weight * sum(float(slide[place, c]) for c in channels) if known else 0.0
+        answers.append(total)
+    return answers
+
+
+def test_features_are_the_shares_of_answers_above_each_bias(fitted: Rocket) -> None:
+    x = slides(4, seed=9)
+    found = fitted.transform(x)
+    assert found.shape == (4, 84 * 12)
+    assert found.dtype == np.float32
+    expected, at = np.zeros(found.shape), 0
+    for index, each in enumerate(fitted.each):
+        for kernel in range(84):
+            answers = [answer(slide, fitted, index, kernel) for slide in x]
+            for _ in range(each):
+                expected[:, at] = [np.mean([value > fitted.biases[at] for value in one]) for one in answers]
+                at += 1
+    assert at == found.shape[1]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_dilations_are_powers_of_two_evenly_up_to_the_slide_and_share_the_features(fitted: Rocket) -> None:
+    longest = np.log2((FRAMES - 1) / 8)
+    wanted = [int(2 ** (longest * step / 11)) for step in range(12)]
+    assert fitted.dilations.tolist() == sorted(set(wanted))
+    assert fitted.each.tolist() == [wanted.count(dilation) for dilation in sorted(set(wanted))]
+    many = Rocket.fit(slides(3, 400), features=10_000)
+    assert 8 * many.dilations[-1] <= 399
+    assert many.each.sum() == 10_000 // 84
+    assert len(many.biases) == 84 * many.each.sum()
+
+
+def test_biases_are_quantiles_of_one_training_slides_answers_at_multiples_of_the_golden_ratio() -> None:
+    x = slides(1, seed=5)  # a single slide, so that biases can be of it alone
+    rocket = Rocket.fit(x, features=84 * 4, seed=1)
+    at = 0
+    for index, each in enumerate(rocket.each):
+        for kernel in range(84):
+            quantiles = [(n * (1 + 5**0.5) / 2) % 1 for n in range(at + 1, at + 1 + int(each))]
+            expected = np.quantile(answer(x[0], rocket, index, kernel), quantiles)
+            np.testing.assert_allclose(rocket.biases[at : at + each], expected, rtol=1e-5, atol=1e-3)
+            at += int(each)
+
+
+def test_every_kernel_sums_one_to_nine_channels_and_small_sums_are_the_most_frequent() -> None:
+    rocket = Rocket.fit(slides(2, channels=20), features=84 * 32)
+    counts = np.bincount(rocket.channels.sum(axis=-1).ravel(), minlength=10)
+    assert counts[0] == 0
+    assert len(counts) == 10
+    assert counts[1] > counts[4] > 0
+    assert rocket.channels.any(axis=(0, 1)).all()
+
+
+def test_slides_are_transformed_alike_alone_and_among_others(fitted: Rocket, monkeypatch: pytest.MonkeyPatch) -> None:
+    x = slides(40)
+    together = fitted.transform(x)
+    monkeypatch.setattr(minirocket, "BLOCK_BYTES", 1)  # blocks of sixteen
+    assert np.array_equal(fitted.transform(x), together)
+    assert np.array_equal(fitted.transform(x[7:8]), together[7:8])
+
+
+def test_positions_beyond_what_a_byte_counts_are_counted() -> None:
+    x = slides(2, frames=600)
+    rocket = Rocket.fit(x, features=84)
+    always = Rocket(rocket.frames, rocket.dilations, rocket.each, rocket.channels, np.full(84, -1e9, np.float32))
+    assert (always.transform(x) == 1).all()
+
+
+def test_the_seed_decides_and_tensors_hold_everything(fitted: Rocket) -> None:
+    x = slides(12)
+    again, other = Rocket.fit(x, features=84 * 12, seed=3), Rocket.fit(x, features=84 * 12, seed=4)
+    assert np.array_equal(again.transform(x), fitted.transform(x))
+    assert not np.array_equal(other.transform(x), fitted.transform(x))
+    assert np.array_equal(Rocket.from_tensors(fitted.to_tensors()).transform(x), fitted.transform(x))
+
+
+def test_slides_that_cannot_be_transformed_say_why(fitted: Rocket) -> None:
+    with pytest.raises(TacpipeError, match="with 9 frames or more"):
+        Rocket.fit(slides(3, frames=8))
+    with pytest.raises(TacpipeError, match="83 features do not go round 84 kernels"):
+        Rocket.fit(slides(3), features=83)
+    with pytest.raises(TacpipeError, match=r"\(slide, 41, 3\) was fitted"):
+        fitted.transform(slides(2, channels=4))
+    broken = slides(2)
+    broken[1, 3, 0] = np.nan
+    with pytest.raises(TacpipeError, match="not finite"):
+        fitted.transform(broken)
