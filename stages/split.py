@@ -22,8 +22,13 @@ class Params:
     seed: int = 0  # of every draw
     folds: int = 5  # how many parts kfold makes
     by: str = "object"  # attribute whose values leave-one-out leaves out one by one
-    stratify: str = ""  # attribute whose values are spread evenly over the roles; empty for none
+    stratify: str = ""  # attributes, commas between, whose values are spread evenly over the roles; empty for none
     apart: str = ""  # of kfold: attribute whose values are dealt out too, each unknown in one fold; empty for none
+    repeats: int = 1  # of random: folds, each another draw
+    reverse: bool = False  # of blocked: test the first in the order of names and train on the last
+    few: int = 0  # at most so many recordings train, and those left over are unused; 0 for all
+    few_by: str = ""  # attribute of whose every value that many train, as sensor; empty for that many altogether
+    few_of: str = ""  # attribute=value of the recordings that few is about, as sensor=roboskin; empty for all
 
 
 @stage(version=1)
@@ -45,6 +50,11 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
         by=params.by,
         stratify=params.stratify,
         apart=params.apart,
+        repeats=params.repeats,
+        reverse=params.reverse,
+        few=params.few,
+        few_by=params.few_by,
+        few_of=params.few_of,
     )
     roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme, extend or {})
     table = pa.table(

@@ -17,6 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.stage import ROLES, Attribute
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
+UNUSED = "unused"  # role of those that a few-shot split takes out of training
 Attributes = Mapping[str, Attribute]
 Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
 
@@ -31,24 +32,38 @@ class Scheme:
     seed: int = 0
     folds: int = 5  # of kfold
     by: str = "object"  # attribute whose values leave-one-out leaves out one by one
-    stratify: str = ""  # attribute whose values are spread evenly over the roles; empty for none
+    stratify: str = ""  # attributes, with commas between, whose values are spread evenly over the roles; empty for none
     apart: str = ""  # of kfold: attribute whose values are dealt into the folds too, there unknown; empty for none
+    repeats: int = 1  # of random: folds, each another draw
+    reverse: bool = False  # of blocked: test the first and train on the last
+    few: int = 0  # at most so many train, all others that would are unused; 0 for all
+    few_by: str = ""  # attribute of whose every value ``few`` train; empty for ``few`` altogether
+    few_of: str = ""  # attribute=value of those that ``few`` is about, as sensor=roboskin; empty for all
 
 
 def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
     """Return the role of each recording in each fold; ``attributes`` holds those of each recording by name.
 
     ============== =====================================================================================
-    random         shares ``test`` and ``val`` drawn at random
+    random         shares ``test`` and ``val`` drawn at random, anew in each of ``repeats`` folds
     kfold          in fold k the k-th of ``folds`` even parts is tested, ``val`` of the others drawn at random
-    blocked        in the order of names, which is that of time for most sets: train, then val, then test
+    blocked        in the order of names, which is that of time for most sets: train, then val, then test;
+                   with ``reverse`` test, then val, then train
     leave-one-out  in fold k the recordings of the k-th value of ``by`` are tested
-    authors        what the attribute ``authors_role`` says; with no val among them, ``val`` of train is drawn
+    authors        what the attribute ``authors_role`` says; with no val among them, ``val`` of train is drawn.
+                   Where some have ``authors_fold``, a fold a block: see below
     ============== =====================================================================================
+
+    Blocks of ``authors_fold`` take turns: where some recordings have the ``authors_role`` test, these are tested in every
+    fold, and the k-th block is val in fold k. Where none has, the k-th block is tested, and ``val`` of the others is
+    drawn. Recordings with neither attribute are dealt into as many even parts, which take the same turns.
 
     With ``apart``, fold k of kfold tests all recordings of the k-th even part of that attribute's values, so that nothing
     of these values is in train or val, and of the other recordings those of their own k-th part. So unknown and known
     values are tested side by side, and over the folds every value is unknown once.
+
+    With ``few``, so many of those that would train do, spread evenly over the values of ``stratify``, and the others get
+    the role ``unused``. Those of a smaller ``few`` are among those of a larger one.
 
     ``keep`` holds roles of an older split: they stay, and only recordings without any are dealt out. Raises
     `TacpipeError` for a scheme, share or attribute that cannot be, and where no recording is left to train on.
@@ -56,17 +71,20 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     _check(attributes, scheme)
     fresh = sorted(name for name in attributes if not any(kept == name for kept, _ in keep))
     if scheme.name == "random":
-        folds = [_drawn(fresh, attributes, scheme, 0)]
+        folds = [_drawn(fresh, attributes, scheme, draw) for draw in range(scheme.repeats)]
     elif scheme.name == "blocked":
         folds = [_blocked(fresh, attributes, scheme)]
     elif scheme.name == "authors":
-        folds = [_authors(fresh, attributes, scheme)]
+        folds = _authors(fresh, attributes, scheme)
     elif scheme.name == "kfold":
         folds = _kfold(fresh, attributes, scheme, keep)
     else:
         folds = _leave_one_out(attributes, scheme, keep)
     roles = {(name, fold): role for fold, found in enumerate(folds) for name, role in found.items()}
-    roles |= _kept(attributes, keep, len(folds), scheme)
+    kept = _kept(attributes, keep, len(folds), scheme)
+    roles |= kept
+    if scheme.few:
+        roles |= _few(roles, kept, attributes, scheme)
     for fold in range(len(folds)):
         if not any(role == "train" for (_, at), role in roles.items() if at == fold):
             raise TacpipeError(
@@ -90,28 +108,73 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
         raise TacpipeError(
             f"{scheme.folds} folds cannot be made of {len(attributes)} recordings; folds must lie between 2 and that."
         )
+    _check_options(scheme)
+
+
+def _check_options(scheme: Scheme) -> None:
     if scheme.apart and scheme.name != "kfold":
         raise TacpipeError(
             f"apart {scheme.apart} goes with the scheme kfold alone, not with {scheme.name}. "
             f"To keep values apart one by one, choose leave-one-out by {scheme.apart}."
         )
+    if scheme.repeats < 1 or (scheme.repeats > 1 and scheme.name != "random"):
+        raise TacpipeError(
+            f"repeats {scheme.repeats} cannot be with the scheme {scheme.name}; it must be 1 or more, and 1 with all "
+            f"schemes but random."
+        )
+    if scheme.reverse and scheme.name != "blocked":
+        raise TacpipeError(f"reverse goes with the scheme blocked alone, not with {scheme.name}; leave it out.")
+    if scheme.few < 0 or (not scheme.few and (scheme.few_by or scheme.few_of)):
+        raise TacpipeError(
+            f"few is {scheme.few}; it must be the number of recordings to train on, or 0 for all, without few_by and "
+            f"few_of."
+        )
+    if scheme.few_of and not all(scheme.few_of.partition("=")):
+        raise TacpipeError(f"few_of is {scheme.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
 
 
 def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
-    """Return roles with the shares ``test`` and ``val``, each value of ``stratify`` spread evenly over them.
+    """Return roles with the shares ``test`` and ``val``, each value of ``stratify`` spread evenly over them."""
+    order = _order(names, attributes, scheme, np.random.default_rng([scheme.seed, draw]))
+    tests, vals = round(scheme.test * len(names)), round(scheme.val * len(names))
+    return {name: "test" if i < tests else "val" if i < tests + vals else "train" for i, name in enumerate(order)}
 
-    Recordings are shuffled within their stratum and put at (rank + 1/2) / size of it; cutting that order anywhere cuts
-    every stratum at the same share, to within one recording.
+
+def _order(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, rng: np.random.Generator
+) -> list[str]:
+    """Return the names in an order that, cut anywhere, cuts every stratum at the same share, to within one recording.
+
+    Recordings are shuffled within their stratum and put at (rank + 1/2) / size of it.
     """
-    rng = np.random.default_rng([scheme.seed, draw])
     places: dict[str, float] = {}
     for stratum in _strata(names, attributes, scheme).values():
         shuffled = rng.permutation(len(stratum))
         places |= {stratum[i]: (rank + 0.5) / len(stratum) for rank, i in enumerate(shuffled)}
     ties = dict(zip(names, rng.random(len(names)), strict=True))
-    order = sorted(names, key=lambda name: (places[name], ties[name]))
-    tests, vals = round(scheme.test * len(names)), round(scheme.val * len(names))
-    return {name: "test" if i < tests else "val" if i < tests + vals else "train" for i, name in enumerate(order)}
+    return sorted(names, key=lambda name: (places[name], ties[name]))
+
+
+def _few(
+    roles: Roles, kept: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
+) -> Roles:
+    """Return the role ``unused`` for those that would train beyond ``few``; what an older split trains on counts."""
+    attribute, _, value = scheme.few_of.partition("=")
+    meant = [name for name in sorted(attributes) if not attribute or _value(name, attributes, attribute) == value]
+    if not meant:
+        raise TacpipeError(f"No recording has {attribute} {value}, of which few was to leave {scheme.few} to train on.")
+    groups: dict[str, list[str]] = {}
+    for name in meant:
+        groups.setdefault(_value(name, attributes, scheme.few_by) if scheme.few_by else "", []).append(name)
+    unused: Roles = {}
+    for fold in sorted({fold for _, fold in roles}):
+        for group in _ordered(set(groups)):
+            trained = [name for name in groups[group] if roles.get((name, fold)) == "train"]
+            fresh = [name for name in trained if (name, fold) not in kept]
+            room = max(scheme.few - (len(trained) - len(fresh)), 0)
+            order = _order(fresh, attributes, scheme, np.random.default_rng([scheme.seed, fold, 1]))
+            unused |= {(name, fold): UNUSED for name in order[room:]}
+    return unused
 
 
 def _val_of(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
@@ -124,11 +187,15 @@ def _blocked(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
     for stratum in _strata(names, attributes, scheme).values():
         tests, vals = round(scheme.test * len(stratum)), round(scheme.val * len(stratum))
         trains = len(stratum) - tests - vals
-        roles |= {n: "train" if i < trains else "val" if i < trains + vals else "test" for i, n in enumerate(stratum)}
+        order = reversed(stratum) if scheme.reverse else stratum
+        roles |= {n: "train" if i < trains else "val" if i < trains + vals else "test" for i, n in enumerate(order)}
     return roles
 
 
-def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
+def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> list[dict[str, str]]:
+    blocks = sorted({_block(name, attributes) for name in attributes if _has_block(attributes[name])})
+    if blocks:
+        return _authors_folds(names, attributes, scheme, blocks)
     roles = {}
     for name in names:
         role = attributes[name].get("authors_role")
@@ -141,17 +208,45 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
         roles[name] = str(role)
     if "val" not in roles.values():
         roles |= _val_of([name for name in names if roles[name] == "train"], attributes, scheme, 0)
-    return roles
+    return [roles]
+
+
+def _authors_folds(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, blocks: Sequence[int]
+) -> list[dict[str, str]]:
+    """Return a fold a block: the block is val where the authors name whom to test, and tested where they do not."""
+    own = {name: attributes[name].get("authors_role") for name in names}
+    fixed = {name: str(own[name]) for name in names if own[name] == "test"}
+    fixed |= {name: str(own[name]) for name in names if own[name] in ROLES and not _has_block(attributes[name])}
+    published = any(one.get("authors_role") == "test" for one in attributes.values())
+    part = {name: blocks.index(_block(name, attributes)) for name in names if _has_block(attributes[name])}
+    part |= _parts([name for name in names if name not in part and name not in fixed], attributes, scheme, len(blocks))
+    folds = []
+    for fold in range(len(blocks)):
+        turn = [name for name in names if name not in fixed and part[name] == fold]
+        rest = [name for name in names if name not in fixed and part[name] != fold]
+        if published:
+            folds.append(fixed | dict.fromkeys(rest, "train") | dict.fromkeys(turn, "val"))
+        else:
+            folds.append(fixed | _val_of(rest, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test"))
+    return folds
+
+
+def _has_block(attributes: Attributes) -> bool:
+    return attributes.get("authors_fold") is not None
+
+
+def _block(name: str, attributes: Mapping[str, Attributes]) -> int:
+    block = str(attributes[name]["authors_fold"])
+    if not block.isdecimal():
+        raise TacpipeError(f"Recording {name} has authors_fold {block}; it must be a whole number, 0 or more.")
+    return int(block)
 
 
 def _kfold(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> list[dict[str, str]]:
-    """Deal the shuffled recordings out in turn, stratum after stratum, so that parts differ by one at most."""
-    rng = np.random.default_rng(scheme.seed)
-    strata = _strata(names, attributes, scheme).values()
-    order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
-    part = {name: i % scheme.folds for i, name in enumerate(order)}
+    part = _parts(names, attributes, scheme, scheme.folds)
     unknown = _unknown(attributes, scheme, keep) if scheme.apart else {}
     folds = []
     for fold in range(scheme.folds):
@@ -159,6 +254,14 @@ def _kfold(
         rest = _val_of([name for name in names if name not in set(tested)], attributes, scheme, fold + 1)
         folds.append(rest | dict.fromkeys(tested, "test"))
     return folds
+
+
+def _parts(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int) -> dict[str, int]:
+    """Deal the shuffled recordings out in turn, stratum after stratum, so that parts differ by one at most."""
+    rng = np.random.default_rng(scheme.seed)
+    strata = _strata(names, attributes, scheme).values()
+    order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
+    return {name: i % count for i, name in enumerate(order)}
 
 
 def _unknown(
@@ -230,12 +333,15 @@ def _kept(
     return {(name, fold): role for (name, fold), role in keep.items() if name in attributes}
 
 
-def _strata(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, list[str]]:
-    """Return the recordings of each value of the attribute ``stratify``, values and names sorted."""
-    if not scheme.stratify:
-        return {"": sorted(names)}
-    values = {name: _value(name, attributes, scheme.stratify) for name in sorted(names)}
-    return {value: [name for name in values if values[name] == value] for value in _ordered(set(values.values()))}
+def _strata(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme
+) -> dict[tuple[str, ...], list[str]]:
+    """Return the recordings of each value of the attributes ``stratify``, values and names sorted."""
+    wanted = [attribute.strip() for attribute in scheme.stratify.split(",") if attribute.strip()]
+    strata: dict[tuple[str, ...], list[str]] = {}
+    for name in sorted(names):
+        strata.setdefault(tuple(_value(name, attributes, attribute) for attribute in wanted), []).append(name)
+    return {values: strata[values] for values in sorted(strata, key=lambda values: [_place(one) for one in values])}
 
 
 def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:
@@ -251,4 +357,8 @@ def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> s
 
 def _ordered(values: set[str]) -> list[str]:
     """Sort text, whole numbers by value: 4, 10, bottle."""
-    return sorted(values, key=lambda value: (0, int(value), "") if value.isdecimal() else (1, 0, value))
+    return sorted(values, key=_place)
+
+
+def _place(value: str) -> tuple[int, int, str]:
+    return (0, int(value), "") if value.isdecimal() else (1, 0, value)

@@ -183,3 +183,163 @@ def test_a_split_of_nothing_and_one_that_leaves_nothing_to_train_on_are_refused(
         assign({}, Scheme())
     with pytest.raises(TacpipeError, match="none of 1 recordings to train on"):
         assign(recordings(1), Scheme(test=0.6, val=0.0))
+
+
+# ---- several attributes, repeats, the other way round
+
+
+def two_sensors(materials: int = 4, trials: int = 10) -> dict[str, dict[str, str | int]]:
+    """Recordings of two sensors, so many trials of each material."""
+    return {
+        f"{sensor}-m{material:02d}-t{trial:03d}": {"sensor": sensor, "material": material}
+        for sensor in ("biotac", "roboskin")
+        for material in range(1, materials + 1)
+        for trial in range(trials)
+    }
+
+
+@pytest.mark.parametrize("name", ["random", "kfold"])
+def test_several_attributes_are_spread_evenly_in_all_their_combinations(name: str) -> None:
+    found = two_sensors()
+    roles = assign(found, Scheme(name, val=0.2, test=0.2, stratify="sensor, material"))
+    tested = Counter((found[one]["sensor"], found[one]["material"]) for one in with_role(roles, "test"))
+    assert len(tested) == 8
+    assert set(tested.values()) == {2}
+
+
+def test_repeats_are_other_draws_and_the_first_is_that_without_repeats() -> None:
+    found = recordings(40)
+    once, thrice = assign(found, Scheme(seed=4)), assign(found, Scheme(seed=4, repeats=3))
+    assert {key: role for key, role in thrice.items() if key[1] == 0} == once
+    tested = [with_role(thrice, "test", fold) for fold in range(3)]
+    assert {len(one) for one in tested} == {6}
+    assert len({frozenset(one) for one in tested}) == 3
+
+
+def test_blocked_in_reverse_tests_the_first_of_each_stratum_and_trains_on_the_last() -> None:
+    roles = assign(recordings(10), Scheme("blocked", val=0.2, test=0.3, reverse=True))
+    assert [roles[f"trial-{i:03d}", 0] for i in range(10)] == ["test"] * 3 + ["val"] * 2 + ["train"] * 5
+    found = two_sensors(materials=1)
+    roles = assign(found, Scheme("blocked", val=0.0, test=0.1, stratify="sensor", reverse=True))
+    assert with_role(roles, "test") == {"biotac-m01-t000", "roboskin-m01-t000"}
+
+
+# ---- folds of the authors
+
+
+def published(blocks: int = 4, size: int = 6, tests: int = 0) -> dict[str, dict[str, str | int]]:
+    found: dict[str, dict[str, str | int]] = {
+        f"roboskin-fold{block}-{i:03d}": {"sensor": "roboskin", "material": i % 3, "authors_fold": block}
+        for block in range(blocks)
+        for i in range(size)
+    }
+    for i in range(tests):
+        found[f"roboskin-test-{i:03d}"] = {"sensor": "roboskin", "material": 0, "authors_role": "test"}
+    return found
+
+
+def test_blocks_of_the_authors_are_tested_in_turn_where_they_name_no_test() -> None:
+    found = published()
+    roles = assign(found, Scheme("authors", val=0.25, stratify="material"))
+    for fold in range(4):
+        assert with_role(roles, "test", fold) == {name for name in found if found[name]["authors_fold"] == fold}
+        watched = with_role(roles, "val", fold)
+        assert len(watched) == 4  # a quarter of 18, rounded to even
+        assert {found[name]["material"] for name in watched} == {0, 1, 2}
+
+
+def test_blocks_of_the_authors_are_watched_in_turn_where_they_name_the_test() -> None:
+    found = published(tests=5)
+    roles = assign(found, Scheme("authors", val=0.25))
+    for fold in range(4):
+        assert with_role(roles, "test", fold) == {name for name in found if "authors_role" in found[name]}
+        assert with_role(roles, "val", fold) == {name for name in found if found[name].get("authors_fold") == fold}
+        assert len(with_role(roles, "train", fold)) == 18
+
+
+@pytest.mark.parametrize(("tests", "role"), [(0, "test"), (5, "val")])
+def test_recordings_beside_the_blocks_are_dealt_into_as_many_even_parts(tests: int, role: str) -> None:
+    beside: dict[str, dict[str, str | int]] = {
+        f"biotac-{i:03d}": {"sensor": "biotac", "material": i % 3} for i in range(24)
+    }
+    found = published(tests=tests) | beside
+    roles = assign(found, Scheme("authors", val=0.2, stratify="sensor,material"))
+    parts = [with_role(roles, role, fold) & set(beside) for fold in range(4)]
+    assert sorted(name for part in parts for name in part) == sorted(beside)
+    assert all(Counter(beside[name]["material"] for name in part) == {0: 2, 1: 2, 2: 2} for part in parts)
+    again = assign(found, Scheme("authors", val=0.2, stratify="sensor,material", seed=1))
+    assert parts != [with_role(again, role, fold) & set(beside) for fold in range(4)]
+
+
+def test_roles_that_authors_gave_beside_their_blocks_hold_in_every_fold() -> None:
+    found = published()
+    found |= {"x": {"material": 0, "authors_role": "train"}, "y": {"material": 0, "authors_role": "val"}}
+    roles = assign(found, Scheme("authors", val=0.2))
+    assert {roles["x", fold] for fold in range(4)} == {"train"}
+    assert {roles["y", fold] for fold in range(4)} == {"val"}
+
+
+def test_a_block_that_is_no_number_is_named() -> None:
+    with pytest.raises(TacpipeError, match="Recording a has authors_fold first; it must be a whole number"):
+        assign({"a": {"authors_fold": "first"}, "b": {"authors_fold": 0}}, Scheme("authors"))
+
+
+# ---- few to train on
+
+
+def trained(few: int, **options: object) -> set[str]:
+    scheme = Scheme(val=0.2, test=0.2, stratify="sensor,material", few=few, **options)  # type: ignore[arg-type]
+    return with_role(assign(two_sensors(), scheme), "train")
+
+
+def test_few_leaves_so_many_of_each_sensor_spread_over_materials_and_touches_no_other_role() -> None:
+    found = two_sensors()
+    scheme = Scheme(val=0.2, test=0.2, stratify="sensor,material")
+    every = assign(found, scheme)
+    roles = assign(found, Scheme(val=0.2, test=0.2, stratify="sensor,material", few=8, few_by="sensor"))
+    chosen = Counter((found[one]["sensor"], found[one]["material"]) for one in with_role(roles, "train"))
+    assert set(chosen.values()) == {2}
+    assert len(chosen) == 8
+    assert with_role(roles, "unused") == with_role(every, "train") - with_role(roles, "train")
+    assert all(with_role(roles, role) == with_role(every, role) for role in ("val", "test"))
+
+
+@given(st.integers(1, 24), st.integers(1, 24), st.integers(0, 9))
+def test_the_fewer_are_among_the_more(one: int, other: int, seed: int) -> None:
+    fewer, more = sorted((one, other))
+    assert trained(fewer, few_by="sensor", seed=seed) <= trained(more, few_by="sensor", seed=seed)
+    assert len(trained(fewer, few_by="sensor", seed=seed)) == 2 * fewer
+
+
+def test_few_without_an_attribute_is_of_all_and_few_of_leaves_the_others_alone() -> None:
+    assert len(trained(10)) == 10
+    chosen = Counter(name.split("-")[0] for name in trained(10, few_of="sensor=roboskin"))
+    assert chosen == {"biotac": 24, "roboskin": 10}
+    assert len(trained(1000)) == 48
+
+
+def test_few_counts_those_that_an_older_split_trains_on() -> None:
+    scheme = Scheme(val=0.2, test=0.2, few=10)
+    old = assign(recordings(30), scheme)
+    new = assign(recordings(60), scheme, keep=old)
+    assert {key: new[key] for key in old} == old
+    assert with_role(new, "train") == with_role(old, "train")
+
+
+@pytest.mark.parametrize(
+    ("scheme", "message"),
+    [
+        (Scheme(repeats=0), "repeats 0 cannot be"),
+        (Scheme("kfold", folds=2, repeats=2), "repeats 2 cannot be with the scheme kfold"),
+        (Scheme(reverse=True), "reverse goes with the scheme blocked alone"),
+        (Scheme(few=-1), "few is -1"),
+        (Scheme(few_by="object"), "few is 0; it must be the number"),
+        (Scheme(few=2, few_of="object"), "few_of is 'object'; it must be an attribute and a value"),
+        (Scheme(few=2, few_of="object=spoon"), "No recording has object spoon"),
+        (Scheme(few=2, few_by="colour"), "has no attribute colour"),
+        (Scheme(stratify="object,colour"), "has no attribute colour"),
+    ],
+)
+def test_options_that_cannot_be_say_why(scheme: Scheme, message: str) -> None:
+    with pytest.raises(TacpipeError, match=message):
+        assign(recordings(6), scheme)

@@ -51,3 +51,18 @@ def test_every_param_reaches_the_scheme(shard: Shard) -> None:
 def test_a_missing_attribute_is_an_error_sentence(shard: Shard) -> None:
     with pytest.raises(TacpipeError, match="has no attribute authors_role"):
         split(split.params(scheme="authors"), dataset(shard, 3))
+
+
+def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -> None:
+    given = dataset(shard, 16)
+    few = split.params(test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
+    rows = split(few, given).recordings["split"].tables.to_pylist()
+    assert {row["fold"] for row in rows} == {0, 1}
+    for fold in (0, 1):
+        of_two = [row["role"] for row in rows if row["fold"] == fold and int(row["recording"][1:]) % 4 == 2]
+        assert of_two.count("train") == 1
+        assert "unused" in of_two
+        assert not any(row["role"] == "unused" for row in rows if int(row["recording"][1:]) % 4 != 2)
+    blocked = split.params(scheme="blocked", test=0.25, val=0.0, reverse=True)
+    rows = split(blocked, given).recordings["split"].tables.to_pylist()
+    assert [row["recording"] for row in rows if row["role"] == "test"] == ["t00", "t01", "t02", "t03"]
