@@ -1,8 +1,8 @@
 """Put results on one page that needs nothing but a browser.
 
-Several results of the task ``forward`` are compared first, seeds and folds of a method pooled; of more than two, only the
-best method's and that of the paper are told in full. Outputs of ``tacpipe compress`` may be given besides: they tell what
-codecs of other widths lose.
+Results of the same task are compared, seeds and folds of a method pooled. Of more than two of the task ``forward``, only
+the best method's and that of the paper are told in full; outputs of ``tacpipe compress`` may be given besides, which tell
+what codecs of other widths lose. With those of the task ``material``, slides may be given, which tell how they went.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Params:
     """What the page shows."""
 
     title: str = "Touch, predicted"  # heading of the page
-    traces: int = 2  # recordings of each result told in full whose predictions are drawn
+    traces: int = 2  # recordings of each forecast told in full whose predictions are drawn
 
 
-@stage(version=2)
+@stage(version=3)
 def report(params: Params, results: Datasets) -> Result:
     """Put results on one page: headline, figures, tables, and where every number comes from."""
     from tacpipe.report import page

@@ -12,11 +12,12 @@ REPORT = registry.load("report")
 
 
 def test_a_report_is_one_file_with_the_title_asked_for() -> None:
-    nothing: Any = FakeDataset(files={"metrics.json": b'{"counts": {"recordings": 0}}'}, manifest={"stage": "evaluate"})
-    files = REPORT(REPORT.params(title="Monday"), (nothing,)).files
-    assert set(files) == {"report.html"}
-    assert b"<h1>Monday</h1>" in files["report.html"]
-    assert b"No recording was left" in files["report.html"]
+    files = {"metrics.json": b'{"counts": {"recordings": 0}}', "config.json": b'{"task": "forward"}'}
+    nothing: Any = FakeDataset(files=files, manifest={"stage": "evaluate"})
+    made = REPORT(REPORT.params(title="Monday"), (nothing,)).files
+    assert set(made) == {"report.html"}
+    assert b"<h1>Monday</h1>" in made["report.html"]
+    assert b"No recording was left" in made["report.html"]
 
 
 def test_what_is_no_result_is_refused() -> None:

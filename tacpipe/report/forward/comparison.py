@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from tacpipe import metrics
 from tacpipe.metrics import Interval
-from tacpipe.report import methods as by_method
-from tacpipe.report.error_sums import BASELINE, MODEL
-from tacpipe.report.methods import Method, Run
+from tacpipe.report.forward import methods as by_method
+from tacpipe.report.forward.error_sums import BASELINE, MODEL
+from tacpipe.report.forward.methods import Method, Run
 
 Floats = NDArray[np.floating[Any]]
 
@@ -165,8 +165,8 @@ def difference(one: Pool, other: Pool, steps: Sequence[int]) -> Interval | None:
 def rows(methods: Sequence[Method], steps: Sequence[int], known: bool | None) -> list[Row]:
     """Return every method and every baseline, the highest mean skill first.
 
-    Baselines are those of the runs of one method (`tacpipe.report.methods.reference`), because a split has the same for
-    all; those that go through a codec are told for each codec.
+    Baselines are those of the runs of one method (`tacpipe.report.forward.methods.reference`), because a split has the
+    same for all; those that go through a codec are told for each codec.
     """
     found = [_row(one.name, MODEL, one, steps, known) for one in methods]
     source = by_method.reference(methods)

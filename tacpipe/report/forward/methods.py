@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.report import error_sums
-from tacpipe.report.error_sums import ErrorSums
+from tacpipe.report.forward import error_sums
+from tacpipe.report.forward.error_sums import ErrorSums
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.report import figures, markup, traces
+from tacpipe.report import markup, provenance
+from tacpipe.report.forward import figures, traces
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -75,7 +76,7 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
     config = json.loads(result.files["config.json"]) if "config.json" in result.files else {}
     rate_hz = float(config.get("rate_hz", 0.0))
     sentence, word = headline(metrics, rate_hz)
-    badge = ' <span class="badge">simulated</span>' if simulated(result) else ""
+    badge = ' <span class="badge">simulated</span>' if provenance.simulated(result) else ""
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     if isinstance(config.get("codec"), Mapping):
         name += f" · {config['codec'].get('name', config['codec'].get('kind', ''))}"
@@ -84,7 +85,7 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
         f"<h2>{f'{number}. ' if of > 1 else ''}{escape(name.replace('_', ' '))}{badge}</h2>",
         f'<p class="headline {word}">{escape(sentence)}</p>',
         _floor(metrics),
-        _counts(metrics, simulated(result)),
+        _counts(metrics, provenance.simulated(result)),
         _horizon_figures(metrics, rate_hz),
         _error_tables(metrics),
         _objects(metrics),
@@ -92,14 +93,9 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
         _traces(result, trials, drawn),
         _seen(metrics),
         _training(result.files),
-        _provenance(result.manifest),
+        provenance.section(result.manifest),
     ]
     return "\n".join(part for part in parts if part) + "\n"
-
-
-def simulated(result: Dataset) -> bool:
-    """Say whether any recording of a result was simulated."""
-    return any(bool(shard.attributes.get("simulated")) for shard in result.shards.values())
 
 
 def _counts(metrics: Tree, badge: bool) -> str:
@@ -300,20 +296,3 @@ def _training(files: Mapping[str, bytes]) -> str:
     best = min(history, key=lambda line: line["val_loss"])
     caption = f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
     return "<h3>Training</h3>" + markup.figure(figures.losses(history), caption)
-
-
-def _provenance(manifest: Tree) -> str:
-    """Return the chain of stages behind a result, with params and digests."""
-    steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
-    rows = []
-    for step in steps:
-        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in (step.get("params") or {}).items())
-        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
-        rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
-    table = markup.table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows)
-    named = [("this result", str(manifest.get("digest", "")))]
-    for argument, inputs in manifest.get("inputs", {}).items():
-        several = inputs if isinstance(inputs, list) else [inputs]
-        named += [(argument, one["dataset"] if isinstance(one, dict) else str(one)) for one in several]
-    items = "".join(f"<li>{escape(name)}: <code>{escape(digest)}</code></li>" for name, digest in named if digest)
-    return f'<h3>Where it comes from</h3><div class="words">{table}</div><ul>{items}</ul>'

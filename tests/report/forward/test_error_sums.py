@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.report import error_sums
-from tests.report.result_fakes import GROUPS, errors
+from tacpipe.report.forward import error_sums
+from tests.report.forward.result_fakes import GROUPS, errors
 
 RATIOS = {"model": {"r1": 0.5, "r2": 0.25}}
 WINDOWS = {"r1": 10, "r2": 30}

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from tacpipe.report import figures
+from tacpipe.report.forward import figures
 
 ERRORS = {"model": [1.0, 2.0], "persistence": [2.0, 3.0], "codec": [0.5, 0.5], "mine": [1.5, 1.5]}
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.report import comparison, methods
-from tacpipe.report.comparison import Pool
-from tacpipe.report.methods import Method, Run
-from tests.report.result_fakes import WINDOWS, errors, result
+from tacpipe.report.forward import comparison, methods
+from tacpipe.report.forward.comparison import Pool
+from tacpipe.report.forward.methods import Method, Run
+from tests.report.forward.result_fakes import WINDOWS, errors, result
 from tests.stages.learning_fakes import FakeDataset
 
 RATIO = {"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.report import figures
+from tacpipe.report.drawing import Floats
+from tacpipe.report.forward import figures
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Shard
@@ -35,8 +36,8 @@ def draw(shard: Shard, latents: Sequence[int], steps: Sequence[int]) -> str:
     if not chosen:
         return ""
 
-    def values(name: str) -> figures.Floats:
-        column: figures.Floats = table.column(name).to_numpy().astype(np.float64)
+    def values(name: str) -> Floats:
+        column: Floats = table.column(name).to_numpy().astype(np.float64)
         column[broken] = np.nan
         return column[: len(shown_s)]
 

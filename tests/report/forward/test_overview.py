@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from tacpipe.report import overview, tables
-from tacpipe.report.methods import Run
-from tacpipe.report.overview import Overview
-from tests.report.result_fakes import WINDOWS, errors, result
-from tests.report.test_comparison import RATIO
+from tacpipe.report.forward import overview, tables
+from tacpipe.report.forward.methods import Run
+from tacpipe.report.forward.overview import Overview
+from tests.report.forward.result_fakes import WINDOWS, errors, result
+from tests.report.forward.test_comparison import RATIO
 
 
 def over(*results: Any) -> Overview:

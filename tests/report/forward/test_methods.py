@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from tacpipe.report import methods
-from tacpipe.report.methods import Method, Run
-from tests.report.result_fakes import result
+from tacpipe.report.forward import methods
+from tacpipe.report.forward.methods import Method, Run
+from tests.report.forward.result_fakes import result
 
 
 def grouped(*results: Any) -> dict[str, Method]:

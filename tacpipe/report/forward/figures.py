@@ -1,46 +1,17 @@
-"""Figures as inline SVG: the same numbers give the same bytes, and colours follow the page's theme.
-
-matplotlib draws with marker colours, which are then replaced by the page's CSS variables; ids that nothing refers to
-and all metadata are taken out.
-"""
+"""The figures of forecasts: errors, skill, codecs and traces."""
 
 from __future__ import annotations
 
-import io
 import itertools
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.report.drawing import COLOURS, FAINT, INK, Floats, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Floats = NDArray[np.floating[Any]]
-
-INK, FAINT = "#010203", "#010204"
-COLOURS = {"model": "#010301", "persistence": "#010302", "codec": "#010303", "other": "#010304"}
-_THEME = {INK: "currentColor", FAINT: "var(--faint)", **{hexes: f"var(--{name})" for name, hexes in COLOURS.items()}}
-_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",  # text stays text
-    "font.family": "sans-serif",
-    "font.sans-serif": ["system-ui", "DejaVu Sans"],
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-    "grid.color": FAINT,
-    "grid.linewidth": 0.5,
-}
 
 
 def errors_by_horizon(errors: Mapping[str, Sequence[float]], horizon_ms: Sequence[float], unit: str) -> str:
@@ -59,7 +30,7 @@ def errors_by_horizon(errors: Mapping[str, Sequence[float]], horizon_ms: Sequenc
         axes[0].grid(axis="y")
         axes[0].legend()
 
-    return _svg(draw, "Error of each predictor by time ahead", size=(5.4, 3.4))
+    return svg(draw, "Error of each predictor by time ahead", size=(5.4, 3.4))
 
 
 def skill_by_horizon(skill: Mapping[str, Sequence[float]], horizon_ms: Sequence[float]) -> str:
@@ -74,7 +45,7 @@ def skill_by_horizon(skill: Mapping[str, Sequence[float]], horizon_ms: Sequence[
         axes[0].set_ylabel("skill (above 0: better than persistence)")
         axes[0].grid(axis="y")
 
-    return _svg(draw, "Skill over persistence by time ahead, with 95 % interval", size=(5.4, 3.4))
+    return svg(draw, "Skill over persistence by time ahead, with 95 % interval", size=(5.4, 3.4))
 
 
 def skill_by_trial(skill: Sequence[float], windows: Sequence[int]) -> str:
@@ -90,7 +61,7 @@ def skill_by_trial(skill: Sequence[float], windows: Sequence[int]) -> str:
         axes[0].set_ylabel("skill")
         axes[0].grid(axis="y")
 
-    return _svg(draw, "Skill over persistence of each recording", size=(5.4, 3.0))
+    return svg(draw, "Skill over persistence of each recording", size=(5.4, 3.0))
 
 
 def skill_of_methods(
@@ -127,7 +98,7 @@ def skill_of_methods(
         axes[0].grid(axis="y")
         axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.16), borderaxespad=0)
 
-    return _svg(draw, "Skill of methods over persistence by time ahead, with 95 % intervals", size=(5.4, 4.8))
+    return svg(draw, "Skill of methods over persistence by time ahead, with 95 % intervals", size=(5.4, 4.8))
 
 
 def explained_variance(ratio: Sequence[float], kept: int) -> str:
@@ -142,7 +113,7 @@ def explained_variance(ratio: Sequence[float], kept: int) -> str:
         axes[0].grid(axis="y")
         axes[0].set_axisbelow(True)
 
-    return _svg(draw, "Share of variance by principal component", size=(5.4, 3.4))
+    return svg(draw, "Share of variance by principal component", size=(5.4, 3.4))
 
 
 def covariance(matrix: Floats) -> str:
@@ -165,7 +136,7 @@ def covariance(matrix: Floats) -> str:
         axes[0].set_xticks(shown)
         axes[0].set_yticks(shown)
 
-    return _svg(draw, "Covariance between latents", size=(4.2, 3.8))
+    return svg(draw, "Covariance between latents", size=(4.2, 3.8))
 
 
 def loss_by_width(series: Mapping[str, Mapping[int, float]]) -> str:
@@ -184,7 +155,7 @@ def loss_by_width(series: Mapping[str, Mapping[int, float]]) -> str:
         axes[0].grid(axis="y")
         axes[0].legend()
 
-    return _svg(draw, "Reconstruction error by number of latents", size=(5.4, 3.4))
+    return svg(draw, "Reconstruction error by number of latents", size=(5.4, 3.4))
 
 
 def traces(time_s: Floats, truth: Mapping[str, Floats], ahead: Mapping[str, Mapping[str, Floats]]) -> str:
@@ -203,7 +174,7 @@ def traces(time_s: Floats, truth: Mapping[str, Floats], ahead: Mapping[str, Mapp
         axes[0].legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
         axes[-1].set_xlabel("time at which the prediction is known (s)")
 
-    return _svg(draw, "Predictions beside the truth", size=(11, 1.9 * len(truth)), panels=len(truth))
+    return svg(draw, "Predictions beside the truth", size=(11, 1.9 * len(truth)), panels=len(truth))
 
 
 def losses(history: Sequence[Mapping[str, Any]]) -> str:
@@ -221,25 +192,4 @@ def losses(history: Sequence[Mapping[str, Any]]) -> str:
         axes[0].grid(axis="y")
         axes[0].legend()
 
-    return _svg(draw, "Training and validation loss by epoch", size=(5.4, 3.0))
-
-
-def _svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float], panels: int = 1) -> str:
-    """Return what ``draw`` puts on the panels, as an ``<svg>`` element."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    content = io.StringIO()
-    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": title}):
-        figure = Figure(figsize=size, layout="constrained")
-        grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
-        draw(list(grid[:, 0]))
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(content, format="svg", transparent=True, metadata=nothing)
-    drawn = re.sub(r"<metadata>.*?</metadata>", "", content.getvalue(), flags=re.DOTALL)
-    drawn = drawn[drawn.index("<svg") :]
-    wanted = set(re.findall(r"#([\w-]+)[\")]", drawn))
-    drawn = re.sub(r' id="([\w.-]+)"', lambda found: found[0] if found[1] in wanted else "", drawn)
-    for colour, variable in _THEME.items():
-        drawn = drawn.replace(colour, variable)
-    return drawn.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
+    return svg(draw, "Training and validation loss by epoch", size=(5.4, 3.0))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tacpipe.report import sweep
-from tests.report.result_fakes import codec, result
+from tacpipe.report.forward import sweep
+from tests.report.forward.result_fakes import codec, result
 
 
 def test_codecs_are_read_once_each_wherever_they_lie() -> None:

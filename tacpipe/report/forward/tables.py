@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 
 from tacpipe.metrics import Interval
-from tacpipe.report import comparison, markup
-from tacpipe.report import methods as by_method
-from tacpipe.report.comparison import Pool, Row
-from tacpipe.report.error_sums import BASELINE, MODEL
+from tacpipe.report import markup
+from tacpipe.report.forward import comparison
+from tacpipe.report.forward import methods as by_method
+from tacpipe.report.forward.comparison import Pool, Row
+from tacpipe.report.forward.error_sums import BASELINE, MODEL
+from tacpipe.report.forward.methods import Method
+from tacpipe.report.forward.sweep import Loss
 from tacpipe.report.markup import NONE
-from tacpipe.report.methods import Method
-from tacpipe.report.sweep import Loss
 
 PRINTED = {  # validation and test error in Table 1 of the paper
     "raw": (0.0484, 0.0552),

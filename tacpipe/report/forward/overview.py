@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.metrics import Interval
-from tacpipe.report import comparison, figures, markup, sweep, tables, traces
-from tacpipe.report import methods as by_method
-from tacpipe.report.comparison import Row
-from tacpipe.report.error_sums import BASELINE, MODEL
-from tacpipe.report.methods import Method, Run
+from tacpipe.report import markup
+from tacpipe.report.forward import comparison, figures, representations, sweep, tables, traces
+from tacpipe.report.forward import methods as by_method
+from tacpipe.report.forward.comparison import Row
+from tacpipe.report.forward.error_sums import BASELINE, MODEL
+from tacpipe.report.forward.methods import Method, Run
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FIGURE_STEPS = (3, 5, 10)  # those of the paper's figures 5 and 6
 FLOOR = -1.0  # skill at which figures end
-COMPONENTS = 40  # bars of the explained variance
 
 
 class Overview:
@@ -85,7 +85,7 @@ def render(overview: Overview, codecs: Sequence[sweep.Tree], simulated: bool) ->
         _ablations(overview),
         tables.anticipation(overview.main),
         _paper_traces(overview),
-        codec_section(codecs),
+        representations.section(codecs),
     ]
     return "\n".join(part for part in parts if part) + "\n"
 
@@ -112,37 +112,6 @@ def headline(overview: Overview) -> tuple[list[str], str]:
         sentences.append(told + ".")
         word = _word(row)
     return sentences, word
-
-
-def codec_section(codecs: Sequence[sweep.Tree]) -> str:
-    """Return what codecs hold and lose: Figure 4 of the paper, and loss by number of latents; empty without codecs."""
-    found = sweep.losses(codecs)
-    if not codecs:
-        return ""
-    drawn = []
-    pca, autoencoder = sweep.papers(codecs, "PCA", 20), sweep.papers(codecs, "AE-C1", 8)
-    if pca and pca.get("explained_ratio"):
-        kept, ratio = int(pca["latents"]), pca["explained_ratio"]
-        caption = (
-            f"Variance by principal component, as in Figure 4 of the paper. The {kept} that are kept hold "
-            f"{100 * sum(ratio[:kept]):.1f} %; in the paper 20 hold 82 %."
-        )
-        drawn.append(markup.figure(figures.explained_variance(ratio[:COMPONENTS], kept), caption))
-    for name, codec in (("PCA", pca), ("AE-C1", autoencoder)):
-        if codec:
-            caption = (
-                f"Covariance between the {codec['latents']} latents of {name} on training rows; the colour's strength "
-                f"is the square root of its size, blue above 0 and orange below."
-            )
-            drawn.append(markup.figure(figures.covariance(np.array(codec["latent_covariance"])), caption))
-    series: dict[str, dict[int, float]] = {}
-    for one in found:
-        series.setdefault(one.series, {})[one.latents] = one.mse_standardised
-    if any(len(widths) > 1 for widths in series.values()):
-        caption = "Error of encoding and decoding, where 1 is what no latent at all would give. Lower is better."
-        drawn.append(markup.figure(figures.loss_by_width(series), caption))
-    rows = tables.losses(found) if found else ""
-    return f'<h3>Representations</h3><div class="pair">{"".join(drawn)}</div>{rows}'
 
 
 def _basis(overview: Overview, simulated: bool) -> str:

@@ -1,0 +1,63 @@
+"""Figures as inline SVG: the same numbers give the same bytes, and colours follow the page's theme.
+
+matplotlib draws with marker colours, which are then replaced by the page's CSS variables; ids that nothing refers to
+and all metadata are taken out.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = NDArray[np.floating[Any]]
+
+INK, FAINT = "#010203", "#010204"
+COLOURS = {"model": "#010301", "persistence": "#010302", "codec": "#010303", "other": "#010304"}
+_THEME = {INK: "currentColor", FAINT: "var(--faint)", **{hexes: f"var(--{name})" for name, hexes in COLOURS.items()}}
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text
+    "font.family": "sans-serif",
+    "font.sans-serif": ["system-ui", "DejaVu Sans"],
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.5,
+}
+
+
+def svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float], panels: int = 1) -> str:
+    """Return what ``draw`` puts on the panels, as an ``<svg>`` element."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    content = io.StringIO()
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": title}):
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
+        draw(list(grid[:, 0]))
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(content, format="svg", transparent=True, metadata=nothing)
+    drawn = re.sub(r"<metadata>.*?</metadata>", "", content.getvalue(), flags=re.DOTALL)
+    drawn = drawn[drawn.index("<svg") :]
+    wanted = set(re.findall(r"#([\w-]+)[\")]", drawn))
+    drawn = re.sub(r' id="([\w.-]+)"', lambda found: found[0] if found[1] in wanted else "", drawn)
+    for colour, variable in _THEME.items():
+        drawn = drawn.replace(colour, variable)
+    return drawn.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)

@@ -1,0 +1,33 @@
+"""The part of the page that tells of materials: which method names them, and what joint learning is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from tacpipe.report import plain
+from tacpipe.report.material import methods, overview, profiles
+from tacpipe.report.material.methods import Run
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+
+def reads(dataset: Dataset) -> bool:
+    """Say whether a dataset that is no result helps to tell of materials: one of slides does."""
+    return profiles.reads(dataset)
+
+
+def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> str:
+    """Return what ``results`` of this task tell, pooled by method; ``others`` are datasets that `reads` takes.
+
+    A result without predictions of unseen slides has nothing to compare and is told as its metrics name it. Nothing is
+    drawn by recording, so ``traces`` is of no effect.
+    """
+    runs = [Run.read(one) for one in results if "predictions" in one.shards]
+    runs = [run for run in runs if run.sensors]
+    compared = {id(run.dataset) for run in runs}
+    bare = [one for one in results if id(one) not in compared]
+    parts = [overview.render(methods.grouped(runs), others)] if runs else []
+    parts += [plain.render(one, number, len(bare)) for number, one in enumerate(bare, 1)]
+    return "".join(parts)

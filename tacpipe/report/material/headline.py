@@ -1,0 +1,137 @@
+"""What came out, in plain words and no more surely than the slides allow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from tacpipe.report import markup
+from tacpipe.report.material import comparison, curves, tables, wording, zero_shot
+from tacpipe.report.material.accuracy import Accuracy, accuracy, skill
+from tacpipe.report.material.comparison import Difference
+from tacpipe.report.material.methods import Method, shown
+from tacpipe.report.material.predictions import LEVEL, SWAPPED
+
+ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
+APART = 0.2  # of accuracy: where exchanging classifiers costs more, there is no alignment to explain
+LOSS = 0.05  # of accuracy, by which exchanged classifiers may fall behind those of real pairs
+NO_CONTROL = (
+    "No run with permuted materials is among the results, so whether labels alone drive the alignment was not tested."
+)
+
+
+def sentences(methods: Sequence[Method]) -> list[str]:
+    """Return the best method of each sensor, what joint learning does, and what controls say, a sentence or two each."""
+    plain = [one for one in methods if one.plain]
+    told = [_best(plain, sensor) for sensor in tables.sensors_of(plain)]
+    main = comparison.main(plain)
+    if main:
+        told += _joint(main, [one for one in plain if one.kind == "RAEC independent"])
+        told.append(control(main, [one for one in methods if comparison.control(one)]))
+    told += zero_shot.sentences(methods)
+    return [one.replace(" %", "\N{NO-BREAK SPACE}%") for one in told if one]
+
+
+def control(joint: Method, controls: Sequence[Method]) -> str:
+    """Return what training on pairs of permuted materials says of the alignment of real ones, as far as there is one."""
+    permuted = comparison.nearest(joint, controls)
+    if permuted is None:
+        return NO_CONTROL
+    apart = [_last_alignment(one) for one in (joint, permuted)]
+    swaps = [_swapped(one) for one in (joint, permuted)]
+    if any(math.isnan(one) for one in apart) or not swaps[0] or set(swaps[0]) - set(swaps[1]):
+        return (
+            "A run with permuted materials is there, but no latent difference or exchanged classifier to judge it by."
+        )
+    own = {sensor: accuracy(joint.of(sensor), sensor) for sensor in swaps[0]}
+    lag = {sensor: found.share - swaps[0][sensor].share for sensor, found in own.items() if found}
+    if max(lag.values()) > APART:
+        return (
+            f"Even real pairs have not aligned: exchanged classifiers name {100 * max(lag.values()):.1f} points "
+            f"fewer slides right than the sensors' own, so the control has nothing to be compared with."
+        )
+    aligns = apart[1] <= ALIKE * apart[0]
+    lost = {sensor: swaps[0][sensor].share - swaps[1][sensor].share for sensor in swaps[0]}
+    works = all(one <= LOSS for one in lost.values())
+    numbers = (
+        f"latent difference {markup.number(apart[1])} against {markup.number(apart[0])}; classifiers exchanged: "
+        + ", ".join(
+            f"{shown(sensor)} {wording.percent(swaps[1][sensor].share)} % against {wording.percent(one.share)} %"
+            for sensor, one in swaps[0].items()
+        )
+    )
+    if aligns and works:
+        return (
+            f"The alignment is label-driven: pairs of permuted materials align and swap as well as real ones ({numbers}), "
+            f"so neither shows that the sensors share anything but labels."
+        )
+    half = "align as well but do not swap as well" if aligns else "swap as well but do not align as well"
+    verdict = half if aligns or works else "neither align nor swap as well"
+    return f"Pairs of permuted materials {verdict} as real ones ({numbers})."
+
+
+def _best(methods: Sequence[Method], sensor: str) -> str:
+    """Return which method names most slides of a sensor right."""
+    method = tables.leader(methods, sensor)
+    if method is None:
+        return ""
+    runs = method.of(sensor)
+    found = accuracy(runs, sensor)
+    assert found is not None  # the leader was judged
+    told = f"{shown(sensor)}: {method.name} is best and names {_share(found)} of unseen slides right"
+    worth, level = skill(runs, sensor), accuracy(runs, sensor, LEVEL)
+    if level and not np.isnan(worth):
+        told += (
+            f"; the mean level alone names {wording.percent(level.share)} %, which makes its skill over that "
+            f"{markup.decimals(worth)}"
+        )
+    return told + "."
+
+
+def _joint(joint: Method, others: Sequence[Method]) -> list[str]:
+    """Return what learning jointly changes, a sentence a sensor."""
+    alone = comparison.nearest(joint, others)
+    if alone is None:
+        return ["No independently trained RAEC is among the results, so what joint learning does was not tested."]
+    told = []
+    for sensor in joint.sensors:
+        found = comparison.difference(joint.of(sensor), alone.of(sensor), sensor)
+        if found:
+            verb = {
+                "better": f"helps RAEC on {shown(sensor)}",
+                "worse": f"hurts RAEC on {shown(sensor)}",
+                "unclear": f"makes no difference to RAEC on {shown(sensor)} that these slides could show",
+            }[found.word]
+            told.append(f"Joint learning {verb}: {_difference(found)}.")
+    return told
+
+
+def _difference(found: Difference) -> str:
+    tests = [f"McNemar p = {wording.p_value(found.mcnemar)}"]
+    if not math.isnan(found.paired):
+        tests.append(f"paired t over {found.units} {found.unit} p = {wording.p_value(found.paired)}")
+    return (
+        f"{wording.points(found.mean)} points (95 % interval {wording.points(found.low)} to {wording.points(found.high)}) "
+        f"on the same {found.slides} slides, {', '.join(tests)}".replace("= <", "<")
+    )
+
+
+def _share(found: Accuracy) -> str:
+    runs = f" in {found.runs} runs" if found.runs > 1 else ""
+    return (
+        f"{wording.percent(found.share)} % ({found.correct} of {found.judged}{runs}; 95 % interval "
+        f"{wording.percent(found.low)} to {wording.percent(found.high)} %)"
+    )
+
+
+def _last_alignment(method: Method) -> float:
+    """Return the latent difference after the last epoch, the mean over runs."""
+    last = [curve[-1] for run in method.runs if (curve := curves.aligned(run))]
+    return float(np.mean(last)) if last else float("nan")
+
+
+def _swapped(method: Method) -> dict[str, Accuracy]:
+    told = {sensor: accuracy(method.of(sensor), sensor, SWAPPED) for sensor in method.sensors}
+    return {sensor: found for sensor, found in told.items() if found}

@@ -1,0 +1,97 @@
+"""Where two sensors' latents of the same material lie: together where they were aligned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tacpipe.report import markup
+from tacpipe.report.material import comparison, figures
+from tacpipe.report.material.figures import Cloud
+from tacpipe.report.material.methods import Method, Run, ordered, shown
+from tacpipe.report.material.predictions import Floats, Predictions
+
+NOTE = (
+    "Latents of unseen slides on their first two principal components, both sensors together: a colour is a material, whose "
+    "number stands at the mean of the first sensor's slides. A line leads from there to the mean of the other sensor's "
+    "slides of the material that it was paired with, so short lines are what alignment makes. Where permuted pairs have "
+    "lines as short, that sensors lie together is no evidence that they feel the same."
+)
+
+
+def section(methods: Sequence[Method]) -> str:
+    """Return a figure each of a joint run, of the control and of two independent ones; empty without joint latents."""
+    main = comparison.main(methods)
+    if main is None:
+        return ""
+    alone = comparison.nearest(main, [one for one in methods if one.plain and one.kind == "RAEC independent"])
+    permuted = comparison.nearest(main, [one for one in methods if comparison.control(one)])
+    drawn = [_figure(one) for one in (main, permuted, alone) if one]
+    if not any(drawn):
+        return ""
+    return f'<h3>Latents</h3><div class="pair">{"".join(drawn)}</div>{markup.note(NOTE)}'
+
+
+def projected(parts: Sequence[Floats]) -> list[Floats]:
+    """Return points of several sets, each (slide, latent), on the first two principal components of all, (slide, 2).
+
+    Of the two directions of a component the one is taken in which its largest weight is positive.
+    """
+    stacked = np.vstack(parts)
+    centre = stacked.mean(axis=0)
+    axes = np.linalg.svd(stacked - centre, full_matrices=False)[2][:2]  # (component, latent)
+    axes *= np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
+    return [(part - centre) @ axes.T for part in parts]
+
+
+def together(one: Predictions, other: Predictions, partners: Mapping[int, int]) -> tuple[int, int]:
+    """Return of how many materials the nearest mean among the other's is that of its partner, and of how many.
+
+    All latents count. ``partners`` has the other sensor's material of each; one that is not in it is its own.
+    """
+    own, others = np.unique(one.materials), np.unique(other.materials)
+    means = [
+        np.array([_latents(part)[part.materials == name].mean(axis=0) for name in names])
+        for part, names in ((one, own), (other, others))
+    ]
+    apart = np.linalg.norm(means[0][:, None] - means[1][None], axis=2)  # (material, material of the other)
+    wanted = [partners.get(int(name), int(name)) for name in own]
+    found = [near == name for near, name in zip(others[apart.argmin(axis=1)], wanted, strict=True) if name in others]
+    return int(sum(found)), len(found)
+
+
+def _figure(method: Method) -> str:
+    """Return the latents of one run of a method, or of one a sensor where each has its own model."""
+    rows = _rows(method.runs)
+    if rows is None:
+        return ""
+    sensors, parts = rows
+    points = projected([_latents(part) for part in parts])
+    clouds = [Cloud(shown(sensor), at, part.materials) for sensor, at, part in zip(sensors, points, parts, strict=True)]
+    partners = {int(one): int(other) for one, other in method.runs[0].config.get("partners", {}).items()}
+    same, of = together(parts[0], parts[1], partners)
+    svg = figures.latents(clouds, partners, "Latents of both sensors")
+    what = "the material that it was paired with" if partners else "the same material"
+    return markup.figure(
+        svg, f"{method.name}: for {same} of {of} materials, the other sensor's nearest mean is {what}."
+    )
+
+
+def _rows(runs: Sequence[Run]) -> tuple[tuple[str, str], list[Predictions]] | None:
+    """Return two sensors and the rows of each, of the first run that holds both, or else of the first of each."""
+    held = [run for run in runs if run.predictions.latents is not None]
+    sensors = ordered({sensor for run in held for sensor in run.sensors})[:2]
+    if len(sensors) < 2:
+        return None
+    both = next((run for run in held if set(sensors) <= set(run.sensors)), None)
+    chosen = [both or next(run for run in held if sensor in run.sensors) for sensor in sensors]
+    parts = [run.predictions.of(sensor) for run, sensor in zip(chosen, sensors, strict=True)]
+    if len({_latents(part).shape[1] for part in parts}) > 1:
+        return None
+    return (sensors[0], sensors[1]), parts
+
+
+def _latents(part: Predictions) -> Floats:
+    assert part.latents is not None
+    return part.latents

@@ -1,0 +1,285 @@
+"""Which results are runs of the same method, and what that method is called."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.report import provenance
+from tacpipe.report.material import predictions
+from tacpipe.report.material.predictions import Predictions
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Tree = Mapping[str, Any]
+
+SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
+_ARCHITECTURES = {"minirocket": "MiniRocket", "x-lstm": "X-LSTM", "raec": "RAEC"}
+_NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience")  # in these, runs of one method may differ
+_ROCKETS = ("features", "use_validation", "labels", "quantities")  # all that has an effect on MiniRocket
+_RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
+_PAIRS = ("alignment_weight", "align_from", "agreement")  # of no effect where sensors learn alone
+_PLAIN = {"pairing": ("random", "fixed"), "labels": ("true",), "reduce": ("",), "hold_out": ("",), "few": ("",)}
+_SAME = 0.92  # training slides in this ratio are as many: folds are not all of one size
+
+
+@dataclass(frozen=True)
+class Run:
+    """One result: a model trained once and judged once."""
+
+    dataset: Dataset
+    config: Tree
+    metrics: Tree
+    history: Sequence[Tree]
+    predictions: Predictions
+
+    @classmethod
+    def read(cls, dataset: Dataset) -> Run:
+        """Return the run that a result holds."""
+        config, metrics = (json.loads(dataset.files[name]) for name in ("config.json", "metrics.json"))
+        lines = dataset.files["history.jsonl"].splitlines() if "history.jsonl" in dataset.files else []
+        found = predictions.read(dataset.shards["predictions"].table(), config)
+        return cls(dataset, config, metrics, [json.loads(line) for line in lines if line.strip()], found)
+
+    @property
+    def params(self) -> Tree:
+        """What the model was trained with."""
+        found: Tree = self.config.get("params", {})
+        return found
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors whose slides the model was judged on."""
+        return ordered(set(self.predictions.sensors.tolist()))
+
+    @property
+    def trained(self) -> Mapping[str, int]:
+        """The number of slides with the role train, by sensor."""
+        found: Mapping[str, int] = self.config.get("counts", {}).get("train", {})
+        return found
+
+    @property
+    def learned(self) -> Mapping[str, int]:
+        """The number of slides that the model learned from, by sensor: a readout also learns from those of validation."""
+        params = self.params
+        if self.architecture == "minirocket" and params.get("use_validation") and params.get("labels") != "permuted":
+            watched = self.config["counts"].get("val", {})
+            return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
+        ratio = int(params.get("ratio", 100))
+        return {
+            sensor: kept(count, int(params.get("batch", 32)), ratio) if sensor == params.get("reduce") else count
+            for sensor, count in self.trained.items()
+        }
+
+    @property
+    def architecture(self) -> str:
+        """The kind of model."""
+        return str(self.config.get("architecture", self.params.get("architecture", "")))
+
+    @property
+    def simulated(self) -> bool:
+        """Whether its slides were simulated."""
+        return provenance.simulated(self.dataset)
+
+
+@dataclass(frozen=True)
+class Method:
+    """Runs that differ in seed or fold alone."""
+
+    name: str
+    settings: Tree  # what makes it this method, as `grouped` tells
+    marks: tuple[str, ...]  # what tells it from others of its kind
+    runs: tuple[Run, ...]
+
+    @property
+    def line(self) -> str:
+        """Its name but for the number of slides: what a curve over that is called."""
+        parts = [_base({**self.settings, "few": "", "reduce": ""})]
+        parts += [mark for mark in self.marks if not mark.endswith("shuffle")]
+        if self.settings["joint"] and (self.settings["few_of"] or self.settings["reduce"]):
+            parts.append("other sensor whole")
+        if not self.settings.get("shuffle", True):
+            parts.append("fixed batches")
+        return " · ".join(parts)
+
+    @property
+    def kind(self) -> str:
+        """What a table calls it, variants left out: ``RAEC joint``, ``MiniRocket``, ``mapping to known space`` …"""
+        return _base(self.settings, variants=False)
+
+    @property
+    def plain(self) -> bool:
+        """Whether it was trained on all materials and slides, with true labels and pairs: what tables compare."""
+        return self.differs_only()
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors that any of its runs was judged on."""
+        return ordered({sensor for run in self.runs for sensor in run.sensors})
+
+    @property
+    def simulated(self) -> bool:
+        """Whether its slides were simulated."""
+        return bool(self.settings["simulated"])
+
+    def differs_only(self, *names: str) -> bool:
+        """Say whether, but for these settings, it is as `plain` asks."""
+        return all(name in names or self.settings[name] in usual for name, usual in _PLAIN.items())
+
+    def of(self, sensor: str) -> list[Run]:
+        """Return the runs that were judged on slides of ``sensor``."""
+        return [run for run in self.runs if sensor in run.sensors]
+
+    def key_without(self, *names: str) -> str:
+        """Return what methods share that differ in these settings alone."""
+        return json.dumps({name: value for name, value in self.settings.items() if name not in names}, sort_keys=True)
+
+
+def ordered(sensors: set[str]) -> tuple[str, ...]:
+    """Return sensors in the order of tables: those of the paper first."""
+    known = list(SENSORS)
+    return tuple(sorted(sensors, key=lambda one: (known.index(one) if one in known else len(known), one)))
+
+
+def shown(sensor: str) -> str:
+    """Return a sensor's name as texts have it.
+
+    >>> shown("biotac"), shown("xela1")
+    ('BioTac', 'xela1')
+    """
+    return SENSORS.get(sensor, sensor)
+
+
+def kept(slides: int, batch: int, ratio: int) -> int:
+    """Return how many slides a sensor learns from that keeps ``ratio`` % of the full batches.
+
+    90 % leaves out each tenth batch, the others keep each second, fourth, sixth and ninth.
+
+    >>> [kept(600, 32, ratio) for ratio in (100, 90, 50, 25, 17, 11)]
+    [600, 512, 288, 160, 96, 64]
+    """
+    every = {50: 2, 25: 4, 17: 6, 11: 9}
+    batches = range(slides // batch)
+    if ratio == 100:
+        return slides
+    return batch * sum(number % 10 != 0 if ratio == 90 else number % every[ratio] == 0 for number in batches)
+
+
+def grouped(runs: Sequence[Run]) -> list[Method]:
+    """Return the methods of runs, sorted by name.
+
+    A method is architecture, joint or not, number of training slides, layout and split of the slides, and all params but
+    the seed. Its name tells what keeps it from being plain, and the settings in which it differs from others that would
+    have the same name.
+    """
+    whole = _whole(runs)
+    few: list[float] = []
+    found: dict[str, tuple[Tree, list[Run]]] = {}
+    for run in runs:
+        settings: Tree = {**_settings(run), **_few(run, whole, few)}
+        found.setdefault(json.dumps(settings, sort_keys=True), (settings, []))[1].append(run)
+    alike: dict[str, list[Tree]] = {}
+    for settings, _ in found.values():
+        alike.setdefault(_base(settings), []).append(settings)
+    made = []
+    for settings, same in found.values():
+        others = alike[_base(settings)]
+        told = [
+            f"{name} {value}" if not isinstance(value, bool) else name if value else f"no {name}"
+            for name, value in sorted(settings.items())
+            if any(other.get(name) != value for other in others) and value != ""
+        ]
+        made.append(Method(" · ".join([_base(settings), *told]), settings, tuple(told), tuple(same)))
+    return sorted(made, key=lambda method: method.name)
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    """Return all that makes a method but the number of its slides; what is of no effect is left out."""
+    config, params, architecture = run.config, run.params, run.architecture
+    known = str(params.get("known", ""))
+    joint = bool(config.get("joint", architecture == "raec" and params.get("joint", False)))
+    rocket = architecture == "minirocket"
+    ratio = 100 if rocket else int(params.get("ratio", 100))
+    idle = {
+        *_NO_METHOD,
+        "features",
+        "use_validation",
+        *((_RAECS + _PAIRS) if architecture == "x-lstm" else () if joint or known else _PAIRS),
+    }
+    layouts = {one.get("layout", "time") for one in config.get("sensors", {}).values()}
+    split = config.get("split", "")
+    return {
+        **{name: value for name, value in params.items() if (name in _ROCKETS if rocket else name not in idle)},
+        "architecture": architecture,
+        "joint": joint,
+        "known": bool(known),  # each run tells of the sensor that was mapped, so both are one method
+        "pairing": str(params.get("pairing", "random")) if joint or known else "random",
+        "labels": str(params.get("labels", "true")),
+        "reduce": str(params.get("reduce", "")) if ratio < 100 else "",
+        "ratio": ratio if params.get("reduce") else 100,
+        "hold_out": "" if rocket else str(params.get("hold_out", "")),
+        "layout": "authors" if "authors" in layouts else "time",
+        "split": str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split),
+        "simulated": run.simulated,
+    }
+
+
+def _whole(runs: Sequence[Run]) -> dict[str, int]:
+    """Return the largest number of training slides that any run has, by sensor."""
+    whole: dict[str, int] = {}
+    for run in runs:
+        for sensor, count in run.trained.items():
+            whole[sensor] = max(count, whole.get(sensor, 0))
+    return whole
+
+
+def _few(run: Run, whole: Mapping[str, int], told: list[float]) -> dict[str, str]:
+    """Return the number of training slides of a run where it has not all, and the sensor that this is so for if not all.
+
+    Numbers are rounded to those of other runs that have about as many; ``told`` has the shares of before. A sensor that
+    learns from some batches alone has all slides: that is a setting.
+    """
+    fewer = {}
+    for sensor in ordered(set(run.trained)):
+        share = run.trained[sensor] / max(whole[sensor], 1)
+        if share > _SAME:
+            continue
+        same = [one for one in told if _SAME < one / share < 1 / _SAME]
+        if not same:
+            told.append(share)
+        fewer[sensor] = str(round((same or [share])[0] * whole[sensor]))
+    if set(fewer) == set(run.trained) and len(set(fewer.values())) == 1:
+        return {"few": next(iter(fewer.values())), "few_of": ""}
+    few = ", ".join(f"{shown(sensor)} {count}" for sensor, count in fewer.items())
+    return {"few": few, "few_of": ",".join(fewer)}
+
+
+def _base(settings: Tree, variants: bool = True) -> str:
+    """Return the name that a method has before it is told from others like it."""
+    architecture = str(settings["architecture"])
+    name = _ARCHITECTURES.get(architecture, architecture)
+    if settings["known"]:
+        name = "mapping to known space"
+    elif settings["joint"]:
+        name += " joint"
+    elif architecture == "raec":
+        name += " independent"
+    if not variants:
+        return name
+    parts = [name]
+    if settings["pairing"] == "permuted":
+        parts.append("permuted pairs")
+    if settings["labels"] == "permuted":
+        parts.append("permuted labels")
+    if settings["reduce"]:
+        parts.append(f"{shown(settings['reduce'])} {settings['ratio']} %")
+    if settings["hold_out"]:
+        for one in str(settings["hold_out"]).split(";"):
+            sensor, _, materials = one.strip().partition("=")
+            parts.append(f"{shown(sensor)} without {materials.replace(',', ', ')}")
+    if settings["few"]:
+        parts.append(f"{settings['few']} slides")
+    return " · ".join(parts)

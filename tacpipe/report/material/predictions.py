@@ -1,0 +1,77 @@
+"""What a result's model and baselines said of each slide that the model has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Floats = NDArray[np.floating[Any]]
+
+MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
+SHUFFLED = "permuted_labels"
+PREDICTORS = (MODEL, LEVEL, SHUFFLED, SWAPPED, LAST)
+NOTHING = -1  # stands where a predictor said nothing of a slide
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """One row a slide, those of training left out."""
+
+    recordings: NDArray[np.str_]  # (slide,)
+    sensors: NDArray[np.str_]  # (slide,)
+    materials: NDArray[np.int64]  # (slide,), the truth
+    said: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
+    latents: Floats | None  # (slide, latent); None where the model has none
+
+    def of(self, sensor: str) -> Predictions:
+        """Return the rows of one sensor."""
+        rows = self.sensors == sensor
+        said = {name: values[rows] for name, values in self.said.items()}
+        latents = None if self.latents is None else self.latents[rows]
+        return Predictions(self.recordings[rows], self.sensors[rows], self.materials[rows], said, latents)
+
+
+def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
+    """Return what the table ``predictions`` of a result says of slides that its model has not seen.
+
+    As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
+    of the last batch where the model's ``config`` leaves it out, nor those of a sensor whose network was only taken over.
+    """
+    table = table.filter(_counted(table, config))
+    names = [name for name in table.column_names if name.startswith("z") and name[1:].isdigit()]
+    latents = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64) if names else None
+    return Predictions(
+        np.array(table["recording"].to_pylist(), dtype=np.str_),
+        np.array(table["sensor"].to_pylist(), dtype=np.str_),
+        table["material"].to_numpy().astype(np.int64),
+        {
+            name: table[name].fill_null(NOTHING).to_numpy().astype(np.int64)
+            for name in PREDICTORS
+            if name in table.column_names
+        },
+        latents if latents is not None and np.isfinite(latents).all() else None,
+    )
+
+
+def _counted(table: pa.Table, config: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """Return which rows count (slide,)."""
+    sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
+    materials = table["material"].to_numpy()
+    params = config.get("params", {})
+    counted: NDArray[np.bool_] = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
+    counted &= sensors != str(params.get("known", ""))
+    for sensor, held in config.get("held_out", {}).items():
+        counted &= ~((sensors == sensor) & np.isin(materials, held))
+    if params.get("drop_last"):
+        batch = int(params["batch"])
+        for sensor in np.unique(sensors):
+            rows = np.flatnonzero(sensors == sensor)
+            counted[rows[len(rows) // batch * batch :]] = False
+    return counted

@@ -1,0 +1,64 @@
+"""Tables III and IV: what joint learning is worth where one sensor has fewer slides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tacpipe.report import markup
+from tacpipe.report.markup import NONE
+from tacpipe.report.material import printed, wording
+from tacpipe.report.material.accuracy import accuracy
+from tacpipe.report.material.methods import Method, kept, shown
+
+NUMBERS = {"biotac": "III", "roboskin": "IV"}
+SAME = 0.92  # numbers of slides in this ratio are as many
+BATCH = 32  # slides, of the paper's batches
+JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
+
+
+def tables(methods: Sequence[Method]) -> str:
+    """Return a table a reduced sensor, in the paper's form; empty where no sensor was reduced.
+
+    A sensor is reduced where it learns from a share of the batches, as in the paper, or where a split gave it fewer
+    slides than the other. Where both were run, the paper's way counts.
+    """
+    chosen = [one for one in methods if one.differs_only("reduce", "few")]
+    told = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("reduce", "few_of")}
+    return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in told)
+
+
+def _table(methods: Sequence[Method], reduced: str) -> str:
+    columns = [(JOINT, "biotac"), (JOINT, "roboskin"), (ALONE, reduced)]
+    whole = max(run.trained.get(reduced, 0) for one in methods for run in one.runs)
+    rows = []
+    for ratio in printed.RATIOS:
+        slides = kept(whole, BATCH, ratio)
+        same = [one for one in methods if (one.settings["reduce"], one.settings["ratio"]) == (reduced, ratio)]
+        fewer = [one for one in methods if one.settings["few"] and _as_many(one, slides, reduced)]
+        row = [f"{ratio} %", str(slides)]
+        for (kind, sensor), paper in zip(columns, printed.REDUCED[reduced][ratio], strict=True):
+            found = [one for one in same if one.kind == kind] or [
+                one for one in fewer if one.kind == kind and (kind != JOINT or one.settings["few_of"] == reduced)
+            ]
+            row += [_cell(found, sensor), f"{paper:.2f}"]
+        rows.append([*row, _cell([one for one in fewer if one.kind == OURS], reduced)])
+    heads = ["share kept", "slides"]
+    for kind, sensor in columns:
+        heads += [f"{kind.removeprefix('RAEC ')}, {shown(sensor)}", "paper"]
+    title = (
+        f"Table {NUMBERS[reduced]} in the paper's form: accuracy (%) where {shown(reduced)} has fewer training slides"
+    )
+    return markup.table(title, [*heads, f"{OURS}, {shown(reduced)}"], rows)
+
+
+def _cell(methods: Sequence[Method], sensor: str) -> str:
+    """Return the accuracy of that of some methods that has most runs."""
+    held = [one for one in methods if one.of(sensor)]
+    chosen = max(held, key=lambda one: len(one.of(sensor)), default=None)
+    return wording.share(accuracy(chosen.of(sensor), sensor)) if chosen else NONE
+
+
+def _as_many(method: Method, slides: int, sensor: str) -> bool:
+    """Say whether a method learned from about so many slides of a sensor."""
+    told = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
+    return bool(told) and SAME < max(told) / slides < 1 / SAME

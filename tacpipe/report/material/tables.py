@@ -1,0 +1,188 @@
+"""The tables in which methods stand beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tacpipe.report import markup
+from tacpipe.report.markup import NONE
+from tacpipe.report.material import comparison, printed, wording
+from tacpipe.report.material.accuracy import accuracy, skill
+from tacpipe.report.material.methods import Method, Run, ordered, shown
+from tacpipe.report.material.predictions import LAST, LEVEL, MODEL, SHUFFLED, SWAPPED
+
+ORDER = ("X-LSTM", "RAEC independent", "RAEC joint", "mapping to known space")
+BASELINES = {LEVEL: "mean level alone", SHUFFLED: "trained on shuffled labels"}
+
+
+def accuracies(methods: Sequence[Method]) -> str:
+    """Return Table I in the paper's form, then what is not the paper's, and baselines."""
+    plain = [one for one in methods if one.plain]
+    sensors = sensors_of(plain)
+    rows: list[list[str]] = []
+    kinds: dict[int, str] = {}
+    best = {sensor: top for sensor in sensors if (top := leader(plain, sensor))}
+    for kind in [*ORDER, *sorted({one.kind for one in plain} - set(ORDER))]:
+        same = [one for one in plain if one.kind == kind]
+        for method in same:
+            if method in best.values():
+                kinds[len(rows)] = "best"
+            rows.append([method.name, *_row(method, sensors, kind), str(len(method.runs))])
+        if not same:
+            rows.append([kind, *[cell for sensor in sensors for cell in [*[NONE] * 3, _paper(kind, sensor)]], "0"])
+    source = reference(plain)
+    for predictor, name in BASELINES.items():
+        cells = []
+        for sensor in sensors:
+            found = accuracy(source.of(sensor), sensor, predictor)
+            told = markup.decimals(skill(source.of(sensor), sensor, predictor)) if found else NONE
+            cells += [wording.share(found), NONE, told.replace("+nan", NONE), NONE]
+        kinds[len(rows)] = "quiet"
+        rows.append([name, *cells, str(len(source.runs))])
+    kinds[len(rows)] = "quiet"
+    chance = wording.percent(1 / max(len(source.runs[0].config.get("classes", ())), 1))
+    rows.append(["chance", *[cell for _ in sensors for cell in (chance, *[NONE] * 3)], NONE])
+    parts = ("", "last epoch", "skill", "paper")
+    heads = ["", *(f"{shown(sensor)} {part}".strip() for sensor in sensors for part in parts), "runs"]
+    return markup.table("Table I in the paper's form: accuracy (%)", heads, rows, kinds)
+
+
+def swaps(methods: Sequence[Method]) -> str:
+    """Return Table II: accuracy before and after classifiers are exchanged; empty where none were."""
+    held = [one for one in methods if any(SWAPPED in run.predictions.said for run in one.runs)]
+    held = [one for one in held if one.plain or comparison.control(one)]
+    sensors = sensors_of(held)
+    rows = []
+    for method in held:
+        row = [method.name]
+        for sensor in sensors:
+            runs = [run for run in method.of(sensor) if SWAPPED in run.predictions.said]
+            lost = comparison.difference(runs, runs, sensor, (SWAPPED, MODEL))
+            row += [wording.share(accuracy(runs, sensor, name)) for name in (MODEL, SWAPPED)]
+            row.append(wording.points(lost.mean) if lost else NONE)
+        rows.append([*row, str(len(method.runs))])
+    if not rows:
+        return ""
+    cells = []
+    for sensor in sensors:
+        before, after = printed.ACCURACIES["RAEC joint"].get(sensor), printed.SWAPPED.get(sensor)
+        told = [NONE] * 3 if before is None or after is None else [f"{before:.2f}", f"{after:.2f}"]
+        cells += told if len(told) == 3 else [*told, wording.points(((after or 0) - (before or 0)) / 100)]
+    rows.append(["paper: RAEC joint", *cells, NONE])
+    heads = ["", *(f"{shown(sensor)} {part}" for sensor in sensors for part in ("before", "after", "points")), "runs"]
+    title = "Table II in the paper's form: accuracy (%) before and after the sensors' classifiers are exchanged"
+    return markup.table(title, heads, rows, {len(rows) - 1: "quiet"})
+
+
+def differences(methods: Sequence[Method]) -> str:
+    """Return which method is ahead on the same slides, and how sure that is; empty where none can be paired."""
+    rows = []
+    for pair in comparison.pairs(methods):
+        for sensor in sensors_of([pair.first, pair.second]):
+            found = comparison.difference(pair.first.of(sensor), pair.second.of(sensor), sensor)
+            if found:
+                rows.append(
+                    [
+                        f"{shown(sensor)}: {pair.name}",
+                        wording.points_within(found.mean, found.low, found.high),
+                        f"{found.slides}",
+                        f"{found.first_only} : {found.second_only}",
+                        wording.p_value(found.mcnemar),
+                        wording.p_value(found.paired),
+                        f"{found.units} {found.unit}" if found.units else NONE,
+                    ]
+                )
+    if not rows:
+        return ""
+    heads = ["", "points", "slides", "only one right", "McNemar p", "paired t p", "paired over"]
+    return markup.table("Paired comparisons: the first method minus the second, on the same slides", heads, rows)
+
+
+def every_run(methods: Sequence[Method]) -> str:
+    """Return one row a run."""
+    sensors = sensors_of(methods)
+    rows = []
+    for method in methods:
+        for run in sorted(
+            method.runs, key=lambda run: (str(run.config.get("fold", "")), str(run.params.get("seed", "")))
+        ):
+            trained = " + ".join(f"{count}" for _, count in sorted(run.learned.items()))
+            rows.append(
+                [
+                    method.name,
+                    str(run.config.get("fold", NONE)),
+                    str(run.params.get("seed", NONE)),
+                    trained or NONE,
+                    *_accuracies_of(run, sensors),
+                    *_epochs(run),
+                    f"{float(run.config['seconds']):,.0f}" if "seconds" in run.config else NONE,
+                ]
+            )
+    judged = [f"{shown(sensor)} {part}" for sensor in sensors for part in ("(%)", "slides")]
+    heads = ["", "fold", "seed", "slides learned from", *judged, "kept epoch", "epochs", "seconds"]
+    return f"<details><summary>All {len(rows)} runs</summary>{markup.table('Each run', heads, rows)}</details>"
+
+
+def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
+    """Return the sensors that any of some methods was judged on."""
+    return ordered({sensor for method in methods for sensor in method.sensors})
+
+
+def leader(methods: Sequence[Method], sensor: str) -> Method | None:
+    """Return the method that names most slides of a sensor right; of two that name as many, the first."""
+    scores = [(found.share, one) for one in methods if (found := accuracy(one.of(sensor), sensor))]
+    return max(scores, key=lambda score: score[0])[1] if scores else None
+
+
+def reference(methods: Sequence[Method]) -> Method:
+    """Return the method whose runs tell of the baselines, which are nearly the same for all of a split.
+
+    It has most baselines, and if it can be it is the one whose shuffled labels went through the strongest readout.
+    """
+
+    def place(one: Method) -> tuple[int, bool, int]:
+        said = {(name, sensor) for run in one.runs for name in run.predictions.said for sensor in run.sensors}
+        return sum(name in BASELINES for name, _ in said), one.kind == "MiniRocket", len(one.runs)
+
+    return max(methods, key=place)
+
+
+def _row(method: Method, sensors: Sequence[str], kind: str) -> list[str]:
+    """Return what Table I says of a method, four cells a sensor."""
+    cells = []
+    for sensor in sensors:
+        runs = method.of(sensor)
+        found = accuracy(runs, sensor)
+        last = accuracy(runs, sensor, LAST)
+        worth = skill(runs, sensor)
+        cells += [
+            wording.share(found),
+            wording.percent(last.share) if last else NONE,
+            NONE if np.isnan(worth) else markup.decimals(worth),
+            _paper(kind, sensor) if found else NONE,
+        ]
+    return cells
+
+
+def _paper(kind: str, sensor: str) -> str:
+    value = printed.ACCURACIES.get(kind, {}).get(sensor)
+    return NONE if value is None else f"{value:.2f}"
+
+
+def _accuracies_of(run: Run, sensors: Sequence[str]) -> list[str]:
+    cells = []
+    for sensor in sensors:
+        found = accuracy([run], sensor)
+        cells += [wording.percent(found.share), str(found.judged)] if found else [NONE, NONE]
+    return cells
+
+
+def _epochs(run: Run) -> list[str]:
+    """Return the epoch whose weights were kept and the number of epochs."""
+    if not run.history:
+        return [NONE, NONE]
+    kept = run.config.get("validation", {}).get("epoch", {})
+    told = dict.fromkeys(kept[sensor] for sensor in ordered(set(kept)))  # one where sensors were learned jointly
+    return [" / ".join(str(epoch) for epoch in told) or NONE, str(len(run.history))]

@@ -1,0 +1,81 @@
+"""How numbers of this task are written: percentages, points, p values, and what must be said beside an accuracy."""
+
+from __future__ import annotations
+
+import math
+
+from tacpipe.report.markup import NONE, Markup
+from tacpipe.report.material.accuracy import Accuracy
+
+SESSIONS = (
+    "Each material was recorded in one session, so texture cannot be told apart from session in these data: a model that "
+    "knows a session by its drift or its mean level is right as well."
+)
+SIMULATED = "These slides were simulated: nothing here is evidence about a real sensor."
+
+
+def caution(simulated: bool) -> str:
+    """Return what is said beside every table of accuracies."""
+    return SIMULATED if simulated else SESSIONS
+
+
+def percent(share: float) -> str:
+    """Return a share in percent.
+
+    >>> percent(0.995), percent(float("nan"))
+    ('99.5', '–')
+    """
+    return NONE if math.isnan(share) else f"{100 * share:.1f}"
+
+
+def points(share: float) -> str:
+    """Return a difference of shares in percentage points, with its sign.
+
+    >>> points(-0.0245), points(0.0)
+    ('−2.5', '+0.0')
+    """
+    return f"{100 * share + 0.0:+.1f}".replace("-", "−")
+
+
+def p_value(p: float) -> str:
+    """Return a p value with two digits.
+
+    >>> p_value(0.00016), p_value(0.0312), p_value(1e-9), p_value(float("nan"))
+    ('0.00016', '0.031', '< 0.0001', '–')
+    """
+    return NONE if math.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
+
+
+def share(found: Accuracy | None) -> str:
+    """Return an accuracy and its standard deviation over runs, above what it rests on and its interval."""
+    return counted(found.correct, found.judged, found.low, found.high, found.sd) if found else NONE
+
+
+def counted(correct: int, judged: int, low: float, high: float, sd: float) -> Markup:
+    """Return a share in percent, with its standard deviation where there is one, above what it rests on.
+
+    >>> counted(190, 200, 0.91, 0.97, float("nan"))
+    '95.0<br><small>190/200 · 91.0 to 97.0</small>'
+    """
+    spread = "" if math.isnan(sd) else f" ± {percent(sd)}"
+    return Markup(
+        f"{percent(correct / judged)}{spread}<br><small>{correct}/{judged} · {percent(low)} to {percent(high)}</small>"
+    )
+
+
+def points_within(mean: float, low: float, high: float) -> Markup:
+    """Return a difference in points above its interval.
+
+    >>> points_within(0.01, -0.02, 0.04)
+    '+1.0<br><small>−2.0 to +4.0</small>'
+    """
+    return Markup(f"{points(mean)}<br><small>{points(low)} to {points(high)}</small>")
+
+
+def listed(names: list[str]) -> str:
+    """Return names as a sentence has them.
+
+    >>> listed(["a", "b", "c"]), listed(["a"])
+    ('a, b and c', 'a')
+    """
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

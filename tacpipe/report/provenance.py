@@ -1,0 +1,37 @@
+"""Where a result comes from: the stages behind it, and whether its recordings are real."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.report import markup
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Tree = Mapping[str, Any]
+
+
+def simulated(result: Dataset) -> bool:
+    """Say whether any recording of a result was simulated."""
+    return any(bool(shard.attributes.get("simulated")) for shard in result.shards.values())
+
+
+def section(manifest: Tree) -> str:
+    """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
+    steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
+    rows = []
+    for step in steps:
+        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in (step.get("params") or {}).items())
+        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
+        rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
+    table = markup.table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows)
+    named = [("this result", str(manifest.get("digest", "")))]
+    for argument, inputs in manifest.get("inputs", {}).items():
+        several = inputs if isinstance(inputs, list) else [inputs]
+        named += [(argument, one["dataset"] if isinstance(one, dict) else str(one)) for one in several]
+    items = "".join(f"<li>{escape(name)}: <code>{escape(digest)}</code></li>" for name, digest in named if digest)
+    return f'<h3>Where it comes from</h3><div class="words">{table}</div><ul>{items}</ul>'

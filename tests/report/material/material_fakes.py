@@ -1,0 +1,172 @@
+"""Results of the task ``material`` made by hand, with what the report reads of real ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tests.stages.learning_fakes import FakeDataset, FakeShard
+
+MATERIALS, TRIALS = 4, 5  # of the test slides of a sensor
+MANIFEST = {
+    "stage": "evaluate",
+    "version": 2,
+    "params": {},
+    "digest": "ab" * 32,
+    "chain": [{"stage": "segment.slides", "version": 1, "params": {"frames": 400}, "fitted": None}],
+    "inputs": {"model": [{"dataset": "cd" * 32, "manifest": "ef" * 32}]},
+}
+Shares = Mapping[str, float]
+
+
+@dataclass
+class SlideShard:
+    """A recording with several streams."""
+
+    name: str
+    tables: Mapping[str, pa.Table]
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        return tuple(sorted(self.tables))
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
+
+
+def slides(
+    sensor: str, materials: int = MATERIALS, trials: int = TRIALS, first: int = 1
+) -> tuple[list[str], list[int]]:
+    """Return the names of test slides and the material of each."""
+    truth = [material for material in range(1, materials + 1) for _ in range(trials)]
+    return [f"{sensor}-m{material:02d}-t{first + row % trials:03d}" for row, material in enumerate(truth)], truth
+
+
+def said(truth: Sequence[int], wrong: int, materials: int = MATERIALS) -> list[int]:
+    """Return what names all but the first ``wrong`` slides, by turns of the materials, right; wrong ones are the next."""
+    order = np.argsort(np.arange(len(truth)) % (len(truth) // materials), kind="stable")
+    told = np.array(truth)
+    told[order[:wrong]] = told[order[:wrong]] % materials + 1
+    return [int(one) for one in told]
+
+
+def result(
+    architecture: str = "raec",
+    *,
+    wrong: Mapping[str, int],
+    also: Mapping[str, Mapping[str, int]] | None = None,
+    fold: int | None = 0,
+    epochs: int = 0,
+    alignment: float = 0.01,
+    partners: Mapping[int, int] | None = None,
+    train: Mapping[str, int] | None = None,
+    materials: int = MATERIALS,
+    trials: int = TRIALS,
+    first: int = 1,
+    simulated: bool = False,
+    metrics: Mapping[str, Any] | None = None,
+    validation_slides: int = 0,
+    **params: Any,
+) -> Any:
+    """Return one result whose model names all but ``wrong`` slides of each sensor right, and ``also`` by predictor.
+
+    Networks, which have ``epochs``, have latents around their material's corner; the second sensor's lie where the first
+    one's of the material lie whose ``partners`` theirs is.
+    """
+    sensors = list(wrong)
+    rows: dict[str, list[Any]] = {name: [] for name in ("recording", "sensor", "material", "seen")}
+    told: dict[str, list[int | None]] = {}
+    latents = []
+    rng = np.random.default_rng(fold or 0)
+    for place, sensor in enumerate(sensors):
+        names, truth = slides(sensor, materials, trials, first)
+        rows["recording"] += [*names, f"{sensor}-seen"]
+        rows["sensor"] += [sensor] * (len(names) + 1)
+        rows["material"] += [*truth, 1]
+        rows["seen"] += [False] * len(names) + [True]
+        for predictor, mistakes in {"model": wrong, **(also or {})}.items():
+            column: list[int | None] = [*said(truth, mistakes[sensor], materials), 2] if sensor in mistakes else []
+            told.setdefault(predictor, []).extend(column or [None] * (len(names) + 1))
+        back = {other: one for one, other in (partners or {}).items()} if place else {}
+        corners = np.random.default_rng(1).normal(0, 1, (materials + 1, 40)) * 0.7 ** np.arange(40)
+        at = corners[[back.get(material, material) for material in [*truth, 1]]]
+        latents.append(at + rng.normal(0, 0.15, at.shape) * 0.7 ** np.arange(40))
+    columns = {**rows, **{name: pa.array(values, pa.int32()) for name, values in told.items()}}
+    if epochs:
+        columns |= {f"z{index + 1:02d}": np.vstack(latents)[:, index].astype(np.float32) for index in range(40)}
+    shown = {
+        "task": "material",
+        "architecture": architecture,
+        "sensors": {
+            sensor: {"channels": ["a"], "frames": 400, "rate_hz": 100.0, "layout": "time"} for sensor in sensors
+        },
+        "classes": list(range(1, materials + 1)),
+        "trained_on": {f"{sensor}-train{fold}-{index}": "00" for sensor in sensors for index in range(3)},
+        "counts": {
+            "train": dict(train or dict.fromkeys(sensors, 576)),
+            "val": dict.fromkeys(sensors, validation_slides),
+        },
+        "params": {"architecture": architecture, "seed": 0, "joint": False, "known": "", **params},
+        **({} if fold is None else {"fold": fold}),
+        **({} if partners is None else {"partners": {str(one): other for one, other in partners.items()}}),
+    }
+    files = {
+        "config.json": json.dumps(shown).encode(),
+        "metrics.json": json.dumps({"counts": {"slides": dict.fromkeys(sensors, trials)}, **(metrics or {})}).encode(),
+    }
+    if epochs:
+        lines = [json.dumps(line) for line in history(sensors, epochs, alignment, bool(params.get("joint")))]
+        files["history.jsonl"] = "\n".join([*lines, ""]).encode()
+    attributes = {"simulated": True} if simulated else {}
+    return FakeDataset({"predictions": FakeShard("predictions", pa.table(columns), attributes)}, files, MANIFEST)
+
+
+def history(sensors: Sequence[str], epochs: int, alignment: float, joint: bool) -> list[dict[str, Any]]:
+    """Return lines of ``history.jsonl`` whose latent difference ends at ``alignment``."""
+    lines = []
+    for epoch in range(1, epochs + 1):
+        near = 1 - np.exp(-4 * epoch / epochs)
+        lines.append(
+            {
+                "epoch": epoch,
+                "train_loss": 2 - near,
+                "val_loss": 2.1 - near,
+                "best": epoch == max(epochs - 1, 1),
+                "alignment": alignment * 10 ** (3 * (1 - epoch / epochs)) if joint else None,
+                "val": {sensor: {"accuracy": 0.95 * near - 0.02 * place} for place, sensor in enumerate(sensors)},
+            }
+        )
+    return lines
+
+
+def recorded(count: int = 3, outside: int = 1) -> Any:
+    """Return slides of BioTac, the first ``outside`` of which did not keep to the protocol, and one of RoboSkin."""
+    shards: dict[str, Any] = {}
+    time = np.arange(600)
+    for index in range(count):
+        phase = np.where(time < 100, -1, np.where(time < 500, 0, 1)).astype(np.int8)
+        raw = 0.025 * (phase == 0) + 0.002 * np.random.default_rng(index).normal(size=600)
+        profile = pa.table(
+            {
+                "t_ns": time * 10_000_000,
+                "pressure_count": 30.0 + (phase == 0),
+                "speed_raw_m_s": raw,
+                "speed_m_s": np.median([raw, np.roll(raw, 1), np.roll(raw, -1)], axis=0),
+                "force_n": (1.0 + index) * (phase == 0),
+                "phase": phase,
+            }
+        )
+        why = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
+        attributes = {"sensor": "biotac", "force_n": 1.0 + index, "outside_protocol": index < outside, **why}
+        shards[f"biotac-m01-t{index:03d}"] = SlideShard(
+            f"biotac-m01-t{index:03d}", {"slide": profile, "profile": profile}, attributes
+        )
+    attributes = {"sensor": "roboskin", "outside_protocol": False}
+    shards["roboskin-test-000"] = SlideShard("roboskin-test-000", {"slide": pa.table({"t_ns": [0]})}, attributes)
+    return FakeDataset(shards)
