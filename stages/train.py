@@ -64,3 +64,76 @@ def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace, 
     from tacpipe.tasks import forward as task
 
     return Result(files=task.train(asdict(params), train, val, workspace, init.files if init else None))
+
+
+@dataclass(frozen=True)
+class MaterialParams:
+    """Kind of the classifier, what it is told, and how networks are trained; the defaults are the strongest we know."""
+
+    architecture: str = "minirocket"  # minirocket; raec, the paper's recurrent autoencoder; its x-lstm; or spectra
+    sensors: str = ""  # sensors to learn for, with commas; empty for all
+    quantities: str = ""  # of the columns to read; empty: tactile, and vibration (22 readings a frame) for minirocket
+    setting: str = ""  # words that set this run apart from others of its kind in a report, as blocked
+    seed: int = 0  # of kernels, first weights, shuffles and pairs
+    baselines: bool = True  # fit the mean-level and shuffled-label baselines too, so that evaluate shows them
+    labels: str = "true"  # true, or permuted: dealt out anew among the training slides, a negative control
+    features: int = 10_000  # of minirocket, for each sensor
+    use_validation: bool = True  # let minirocket and spectra learn from validation slides too: they choose nothing
+    joint: bool = True  # raec: draw the latents of unlike sensors together where they felt the same material
+    known: str = ""  # raec with --init: sensor of that model whose latents stay; the others learn to meet them
+    pairing: str = "random"  # pairs of joint learning: random; fixed, drawn once; permuted, of other materials
+    agreement: str = "pairs"  # what draws latents together: pairs of one material; contrast, to all other slides too
+    hold_out: str = ""  # materials whose labels a sensor is not told, as roboskin=17,18,19,20; not minirocket
+    reduce: str = ""  # sensor that learns from a share of the batches alone; needs --no-shuffle
+    ratio: int = 100  # that share in percent: 100, 90, 50, 25, 17 or 11
+    headers: str = ""  # in front of the networks, as biotac=mlp: none, mlp or cnn; cnn for a 6 x 10 grid, else none
+    decoder: str = "D1"  # of raec: D1, latents are its first state; D2, its input at every step
+    hidden: int = 90  # units of each LSTM
+    latents: int = 40  # numbers that a slide becomes
+    speeds: str = "biotac=0.025,roboskin=0.05"  # metres a second of slides whose recordings do not tell; of spectra
+    scaling: str = "none"  # of a network's input: none; standard; spread, zero staying zero; log, spread of log(1 + x)
+    epochs: int = 300  # most passes over the training slides
+    batch: int = 32  # slides of each sensor in a step of the optimiser
+    learning_rate: float = 5e-4  # of Adam, without unit
+    cycle: bool = False  # let the learning rate rise and fall over all epochs
+    patience: int = 0  # epochs without a better validation accuracy after which training ends; 0: never before time
+    reconstruction_weight: float = 0.01  # of the squared error of slides made again
+    classification_weight: float = 1.0  # of the negative log-likelihood of classes
+    alignment_weight: float = 1.0  # of the squared difference of latents between sensors
+    align_from: int = 20  # first epoch, from 0, in which latents are drawn together
+    dropout: float = 0.2  # share of latents left out, where dropout_mode says so
+    dropout_mode: str = "noop"  # noop: none, as in the published code, whose dropout has no effect; latent
+    shuffle: bool = True  # other batches every epoch
+    drop_last: bool = False  # leave out the batch that is not full, also when judging, as the published code does
+    unpool: str = "nearest"  # how a cnn is undone: nearest; last, with the last frame's indices, as published
+    select: str = "best"  # weights to keep: best, of the highest validation accuracy; last, of the last epoch
+    PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {
+        "paper": {"architecture": "raec", "epochs": 2000},
+        "authors": {  # the published code with its quirks; to be given slides of the layout authors
+            "architecture": "raec",
+            "epochs": 2000,
+            "pairing": "fixed",
+            "shuffle": False,
+            "drop_last": True,
+            "unpool": "last",
+            "select": "last",
+            "seed": 1,
+        },
+        "quick": {"features": 1_000, "epochs": 30},
+    }
+
+
+@stage(version=1)
+def material(
+    params: MaterialParams, train: Dataset, val: Dataset | None, workspace: Workspace, init: Model | None = None
+) -> Result:
+    """Train a classifier of materials on slides, for each sensor alone or for unlike sensors jointly.
+
+    ``init`` is a model whose latents of the sensor ``known`` stay while the others learn to meet them.
+    """
+    from dataclasses import asdict
+
+    from tacpipe.stage import Result
+    from tacpipe.tasks import material as task
+
+    return Result(files=task.train(asdict(params), train, val, workspace, init.files if init else None))

@@ -9,10 +9,16 @@ from pathlib import Path
 from tacpipe.errors import TacpipeError
 
 TRIALS = 30
+MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
 
 
 def commands(output: Path) -> list[list[str]]:
-    """Return the commands of the demo, each without the leading ``tacpipe``: the default model beside the paper's."""
+    """Return the commands of the demo without the leading ``tacpipe``: in each task the default model and the paper's."""
+    return [*forward(output), *material(output), ["report", *_results(output), "-o", str(output / "report.html")]]
+
+
+def forward(output: Path) -> list[list[str]]:
+    """Return the commands of the task ``forward`` up to its results."""
     names = ("recordings", "synced", "segments", "split", "latents", "model", "results", "paper-model", "paper-results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["split"]]
@@ -27,8 +33,29 @@ def commands(output: Path) -> list[list[str]]:
         ["compress", "pca", place["segments"], *split, "-o", place["latents"]],
         ["train", "forward", place["latents"], *split, "-o", place["paper-model"], *paper],
         ["evaluate", place["paper-model"], place["latents"], *split, "-o", place["paper-results"]],
-        ["report", place["results"], place["paper-results"], "-o", str(output / "report.html")],
     ]
+
+
+def material(output: Path) -> list[list[str]]:
+    """Return the commands of the task ``material`` up to its results."""
+    names = ("touched", "slides", "slides-split", "materials", "materials-results", "joint", "joint-results")
+    place = {name: str(output / name) for name in names}
+    split = ["--split", place["slides-split"]]
+    many = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
+    paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # of the paper's 2,000 epochs
+    return [
+        ["simulate", "material", *many, "-o", place["touched"]],
+        ["segment", "slides", place["touched"], "-o", place["slides"]],
+        ["split", place["slides"], "-o", place["slides-split"], "--scheme", "random", "--stratify", "sensor,material"],
+        ["train", "material", place["slides"], *split, "-o", place["materials"], "--features", "2000"],
+        ["evaluate", place["materials"], place["slides"], *split, "-o", place["materials-results"]],
+        ["train", "material", place["slides"], *split, "-o", place["joint"], *paper],
+        ["evaluate", place["joint"], place["slides"], *split, "-o", place["joint-results"]],
+    ]
+
+
+def _results(output: Path) -> list[str]:
+    return [str(output / name) for name in ("results", "paper-results", "materials-results", "joint-results")]
 
 
 def run(output: Path) -> Path:

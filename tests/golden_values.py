@@ -16,6 +16,8 @@ COMMANDS = {
     "synchronize": "synchronize simulate.forward -o {0}",
     "segment.contacts": "segment contacts synchronize -o {0}",
     "segment.slips": "segment slips segment.contacts -o {0}",
+    "simulate.material": "simulate material --trials 12 --materials 3 --seed 7 -o {0}",
+    "segment.slides": "segment slides simulate.material -o {0}",
     "split": "split segment.contacts --scheme random --val 0.34 --test 0.34 -o {0}",
     "compress.pca": "compress pca segment.contacts --split split --components 4 -o {0}",
 }

@@ -182,6 +182,32 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
 
 @pytest.mark.dvc
 @NEEDS_DVC
+def test_a_method_of_the_material_chain_runs_once_and_is_reported(
+    tmp_path: Path, environment: Mapping[str, str]
+) -> None:
+    project = Project(tmp_path / "material", environment)
+    project.folder.mkdir()
+    for name in ("dvc.yaml", "params.yaml"):
+        shutil.copy(HERE / name, project.folder / name)
+    (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
+    params = yaml.safe_load((project.folder / "params.yaml").read_text())
+    params["material"]["sources"] = {"simulated": "simulate material --trials 96 --materials 3 --no-pac"}
+    params["material"]["readouts"]["patterns"]["features"] = 200
+    (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
+    project.start()
+    project.run("dvc repro material-readout@patterns-0")
+    again = project.run("dvc repro material-readout@patterns-0")
+
+    assert "Running stage" not in again
+    metrics = json.loads((project.folder / "results/material/patterns/0/metrics.json").read_text())
+    assert metrics["model"]["n"] == {"biotac": 12, "roboskin": 12}
+    assert metrics["model"]["accuracy"]["biotac"] > metrics["chance"]["accuracy"]["biotac"]
+    project.run("tacpipe report results/material/patterns/0 data/material/slides -o results/material.html")
+    assert "simulated" in (project.folder / "results/material.html").read_text()
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
 def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
     assert toy.values("data/scaled") == expected(3)
     toy.run("git checkout --quiet HEAD~1")
@@ -254,15 +280,40 @@ def filled(value: Any, names: Mapping[str, str]) -> Any:
     return value
 
 
+def looked_up(value: Any, params: Mapping[str, Any]) -> Any:
+    """Return a list of the chain, which may be told by the name of a param like ``${forward.folds}``."""
+    if isinstance(value, str) and value.startswith("${"):
+        for part in value[2:-1].split("."):
+            params = params[part]
+        return params
+    return value
+
+
+def items_of(value: Mapping[str, Any], params: Mapping[str, Any]) -> Iterator[dict[str, str]]:
+    """Yield what stands for ``${item...}`` and ``${key}`` in each stage that a ``matrix`` or ``foreach`` makes."""
+    if "foreach" in value:
+        for key, one in looked_up(value["foreach"], params).items():
+            yield {"key": key, "item": one}
+        return
+    matrix = {key: looked_up(one, params) for key, one in value.get("matrix", {}).items()}
+    matrix = {key: one[:1] if key == "fold" else one for key, one in matrix.items()}
+    for chosen in itertools.product(*matrix.values()):
+        found: dict[str, str] = {}
+        for key, one in zip(matrix, chosen, strict=True):
+            parts = {f"item.{key}.{part}": str(text) for part, text in one.items()} if isinstance(one, dict) else {}
+            found |= parts or {f"item.{key}": str(one)}
+        yield found
+
+
 def stages(preset: str) -> Iterator[tuple[str, dict[str, Any], list[list[str]]]]:
-    """Yield each stage of the project's own chain in its first fold, and the words of each of its commands."""
-    params = yaml.safe_load((HERE / "params.yaml").read_text())["forward"]
-    known = {"forward.recordings": params["recordings"], "forward.preset": preset}
+    """Yield each stage of the project's own chains in its first fold, and the words of each of its commands."""
+    params = yaml.safe_load((HERE / "params.yaml").read_text())
+    known = {"forward.recordings": params["forward"]["recordings"]}
+    known |= {f"{task}.preset": preset for task in params}
     for name, value in yaml.safe_load((HERE / "dvc.yaml").read_text())["stages"].items():
-        matrix = {key: ["0"] if one == "${forward.folds}" else one for key, one in value.get("matrix", {}).items()}
-        for chosen in itertools.product(*matrix.values()):
-            items = {f"item.{key}": str(one) for key, one in zip(matrix, chosen, strict=True)}
-            found = filled({key: one for key, one in value.items() if key != "matrix"}, {**known, **items})
+        for items in items_of(value, params):
+            body = value.get("do", value)
+            found = filled({key: one for key, one in body.items() if key != "matrix"}, {**known, **items})
             commands = found["cmd"] if isinstance(found["cmd"], list) else [found["cmd"]]
             yield "-".join([name, *items.values()]), found, [shlex.split(command) for command in commands]
 

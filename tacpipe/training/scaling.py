@@ -61,3 +61,53 @@ def fit(values: Floats) -> MinMax:
         at = int(np.argwhere(~np.isfinite(values))[0, 1])
         raise TacpipeError(f"Dimension {at} of the training rows holds a value that is not finite. Mask it as a gap.")
     return MinMax(values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64))
+
+
+KINDS = ("none", "standard", "spread", "log")
+
+
+@dataclass(frozen=True)
+class Affine:
+    """What is taken off each channel and what it is divided by, float64 (channel,); a logarithm may come first."""
+
+    offset: Floats
+    scale: Floats
+    logarithm: bool = False  # log(1 + x), for counts of a heavy tail
+
+    def apply(self, values: Floats) -> Floats:
+        """Return ``values`` (…, channel) scaled, as float32. Raises `TacpipeError` where a logarithm meets -1 or less."""
+        if self.logarithm:
+            if (values <= -1).any():
+                raise TacpipeError(f"The logarithm of 1 + {values.min():g} is not defined. Choose another scaling.")
+            values = np.log1p(values)
+        return ((values - self.offset) / self.scale).astype(np.float32)
+
+    def to_tensors(self) -> dict[str, Floats]:
+        """Return what `from_tensors` reads."""
+        return {"offset": self.offset, "scale": self.scale, "logarithm": np.array([float(self.logarithm)])}
+
+    @classmethod
+    def from_tensors(cls, stored: Mapping[str, Floats]) -> Affine:
+        """Return the scaling that `to_tensors` wrote."""
+        return cls(stored["offset"], stored["scale"], bool(stored["logarithm"][0]))
+
+    @classmethod
+    def fit(cls, values: Floats, kind: str) -> Affine:
+        """Return the scaling ``kind`` fitted on training ``values`` (…, channel).
+
+        none leaves all as it is; standard takes each channel to mean 0 and standard deviation 1; spread divides all
+        channels by one standard deviation, so that zero and the proportions of channels stay; log is spread after
+        log(1 + x). Raises `TacpipeError` for another kind.
+        """
+        channels = values.shape[-1]
+        zeros, ones = np.zeros(channels), np.ones(channels)
+        if kind == "none":
+            return cls(zeros, ones)
+        if kind == "standard":
+            flat = values.reshape(-1, channels)
+            spread = flat.std(axis=0, dtype=np.float64)
+            return cls(flat.mean(axis=0, dtype=np.float64), np.where(spread > 0, spread, 1.0))
+        if kind in ("spread", "log"):
+            spread = float(np.std(np.log1p(values) if kind == "log" else values, dtype=np.float64))
+            return cls(zeros, ones * (spread or 1.0), kind == "log")
+        raise TacpipeError(f"There is no scaling {kind!r}; there are {', '.join(KINDS)}.")

@@ -1,0 +1,191 @@
+"""What sensors can tell one another of classes: features of the same kind, each sensor's changed in a way of its own.
+
+In sensor s, slides of class c have features N(m_sc, W_s). What another sensor t knows of the class says where m_sc is to
+be expected: in each feature alone at ``a + g m_tc``, give or take a variance b. The offset a and the gain g are fitted
+on the classes that both were told, the gain drawn towards that of all features, for these classes are few; b is the mean
+squared error on each of these classes when it is left out of the fit. Several sensors' expectations count by 1 / b; where
+none knows the class, it is expected like the sensor's own classes, with the variance between them.
+
+What the sensor itself was told then corrects the expectation, by the rule of Bayes: n slides of mean x give
+``V = (B^-1 + n W^-1)^-1`` and ``m = V (B^-1 p + n W^-1 x)``, and a new slide of the class is N(m, W + V). So one rule names
+classes of many slides, of few, and of none: the wider a class is expected to lie, the less is made of a slide near its
+middle. W is shrunk as by Ledoit and Wolf (A well-conditioned estimator for large-dimensional covariance matrices, 2004).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.floating[Any]]
+Labels = NDArray[np.integer[Any]]
+
+SHARED = 3  # fewest classes that tell how two sensors differ
+PULL = 0.5  # of the gain of all features on that of each, as a share of a feature's mean sum of squares
+STEADY = 1e-4  # share of a covariance's mean variance that is added to each variance: features may depend on each other
+
+
+@dataclass(frozen=True)
+class Told:
+    """Labelled slides of a sensor: features (slide, feature) and classes (slide,)."""
+
+    features: Floats
+    labels: Labels
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Classes as normal distributions of features; a covariance of zeros marks one of which nothing is known."""
+
+    mean: Floats  # (class, feature)
+    covariance: Floats  # (class, feature, feature)
+
+    def scores(self, features: Floats) -> Floats:
+        """Return log-likelihoods of slides (slide, feature) up to what all classes share: (slide, class), float32."""
+        scores = np.full((len(features), len(self.mean)), -np.inf, np.float32)
+        for index, (mean, covariance) in enumerate(zip(self.mean, self.covariance, strict=True)):
+            if covariance.any():
+                steady = STEADY * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
+                root = np.linalg.cholesky(covariance + steady)
+                away = np.linalg.solve(root, (features - mean).T)
+                scores[:, index] = -np.square(away).sum(axis=0) / 2 - np.log(np.diag(root)).sum()
+        return scores
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What was fitted for one sensor: classes as it knows them, and as other sensors alone make it expect them."""
+
+    classes: NDArray[np.int32]  # (class,), sorted
+    known: Gaussians
+    expected: Gaussians  # nothing of a class that no other sensor knows
+
+    @classmethod
+    def fit(cls, own: Told, others: Sequence[Told] = ()) -> Transfer:
+        """Return what a sensor of which the labelled slides ``own`` are known can tell, with the help of ``others``.
+
+        Raises `TacpipeError` where arrays do not fit one another, values are not finite, no class has two slides, the
+        sensor was told fewer than two classes, or fewer than `SHARED` of those of another sensor.
+        """
+        for one in (own, *others):
+            _check(one, own.features.shape[-1])
+        classes = np.unique(np.concatenate([one.labels for one in (own, *others)]))
+        means = _means(own, classes)
+        within = _within(own)
+        told = np.isfinite(means[:, 0])
+        expected, variance = _expected(means, [_means(other, classes) for other in others])
+        foreign = np.isfinite(expected[:, 0])
+        prior = np.where(foreign[:, None], expected, means[told].mean(axis=0))
+        spread = np.where(foreign[:, None], variance, means[told].var(axis=0, ddof=1) + _least(within))
+        mean, covariance = prior.copy(), within + np.stack([np.diag(one) for one in spread])
+        borrowed = Gaussians(np.where(foreign[:, None], prior, 0), np.where(foreign[:, None, None], covariance, 0))
+        for index in np.flatnonzero(told):
+            wide = np.diag(spread[index])
+            trust = wide @ np.linalg.inv(wide + within / (own.labels == classes[index]).sum())
+            mean[index] += trust @ (means[index] - prior[index])
+            covariance[index] = within + wide - trust @ wide
+        return cls(classes.astype(np.int32), Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2), borrowed)
+
+    def to_tensors(self) -> dict[str, NDArray[Any]]:
+        """Return all that `from_tensors` needs."""
+        return {
+            "classes": self.classes,
+            "known.mean": self.known.mean,
+            "known.covariance": self.known.covariance,
+            "expected.mean": self.expected.mean,
+            "expected.covariance": self.expected.covariance,
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Transfer:
+        """Return the knowledge that `to_tensors` described."""
+        known, expected = (
+            Gaussians(tensors[f"{kind}.mean"], tensors[f"{kind}.covariance"]) for kind in ("known", "expected")
+        )
+        return cls(tensors["classes"], known, expected)
+
+
+def _expected(means: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Return where other sensors' class means make one expect those of a sensor, and the variance of that.
+
+    All are (class, feature), NaN in the rows of classes that a sensor was not told, or that no other one knows.
+    """
+    weight, total = np.zeros(means.shape), np.zeros(means.shape)
+    for other in others:
+        both = np.isfinite(means[:, 0]) & np.isfinite(other[:, 0])
+        if both.sum() < SHARED:
+            raise TacpipeError(
+                f"Two sensors were told {both.sum()} classes in common; {SHARED} at least show how they differ. Record "
+                "more with both, or learn for each sensor alone."
+            )
+        there, here = other[both], means[both]
+        wrong = [
+            here[i] - _mapped(np.delete(there, i, 0), np.delete(here, i, 0), there[i]) for i in range(int(both.sum()))
+        ]
+        precise = 1 / (np.square(wrong).mean(axis=0) + 1e-9)
+        knows = np.isfinite(other[:, 0])
+        weight[knows] += precise
+        total[knows] += precise * _mapped(there, here, other[knows])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return total / weight, np.where(weight > 0, 1 / weight, np.nan)
+
+
+def _mapped(there: Floats, here: Floats, features: Floats) -> Floats:
+    """Return features of one sensor as another's, by the means (class, feature) of classes that both were told."""
+    centre, target = there.mean(axis=0), here.mean(axis=0)
+    squares = np.square(there - centre).sum(axis=0)
+    products = ((there - centre) * (here - target)).sum(axis=0)
+    pull = PULL * squares.mean() + 1e-12
+    gain = (products + pull * products.sum() / (squares.sum() + 1e-12)) / (squares + pull)
+    found: Floats = target + (features - centre) * gain
+    return found
+
+
+def _means(told: Told, classes: Labels) -> Floats:
+    """Return the mean features of each class (class, feature), NaN where a class has no slide."""
+    found = np.full((len(classes), told.features.shape[1]), np.nan)
+    for index, one in enumerate(classes):
+        if (told.labels == one).any():
+            found[index] = told.features[told.labels == one].mean(axis=0)
+    return found
+
+
+def _within(told: Told) -> Floats:
+    """Return the covariance (feature, feature) of features within classes."""
+    from sklearn.covariance import ledoit_wolf
+
+    classes, index = np.unique(told.labels, return_inverse=True)
+    left = told.features - _means(told, classes)[index]
+    spread = left.std(axis=0)
+    spread = np.where(spread > 0, spread, 1.0)
+    shrunk, _ = ledoit_wolf(left / spread, assume_centered=True)
+    found: Floats = shrunk * np.outer(spread, spread) * len(left) / (len(left) - len(classes))
+    return found
+
+
+def _least(within: Floats) -> float:
+    """Return a variance between classes that is as good as none."""
+    return float(STEADY * np.trace(within) / len(within))
+
+
+def _check(told: Told, number: int) -> None:
+    """Refuse slides that tell nothing of classes."""
+    shape, classes = told.features.shape, len(np.unique(told.labels))
+    if len(shape) != 2 or told.labels.shape != shape[:1] or shape[1] != number:
+        raise TacpipeError(
+            f"Features of {shape} and labels of {told.labels.shape} do not fit one another; they must be "
+            f"(slide, {number}) and (slide,)."
+        )
+    if classes < 2 or len(told.labels) == classes:
+        raise TacpipeError(
+            f"{len(told.labels)} slides of {classes} classes do not show how classes differ; give two classes or more, and "
+            "two slides of one of them."
+        )
+    if not np.isfinite(told.features).all():
+        raise TacpipeError("Some features are not finite. Look for slides with gaps, and leave these out.")

@@ -1,0 +1,245 @@
+"""A trained classifier of materials, as it lies in a model's files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import load as load_arrays
+from safetensors.torch import load as load_tensors
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.models import recurrent_autoencoder
+from tacpipe.models.level import Level
+from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.models.spatial_spectrum import Bands
+from tacpipe.models.strong import Strong
+from tacpipe.models.transfer import Transfer
+from tacpipe.tasks.material.learning import JUDGED, Network
+from tacpipe.tasks.material.slides import Layout, Slides, difference
+from tacpipe.training.scaling import Affine
+
+TASK = "material"
+CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
+ROCKET, SPECTRA = "minirocket", "spectra"
+MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
+
+Config = dict[str, Any]
+Floats = NDArray[np.float32]
+Materials = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a reader says of slides."""
+
+    scores: Floats  # (slide, class), in the order of the model's classes
+    latents: Floats | None  # (slide, latent)
+
+
+@dataclass(frozen=True)
+class NetworkReader:
+    """A network of one sensor and the scaling in front of it."""
+
+    network: Network
+    scaling: Affine
+
+    def tell(self, frames: Floats) -> Told:
+        """Return what the network says of slides (slide, time, channel) in device counts."""
+        scores, latents = [], []
+        device = next(self.network.parameters()).device
+        self.network.eval()
+        with torch.no_grad():
+            for first in range(0, len(frames), JUDGED):
+                scaled = torch.from_numpy(self.scaling.apply(frames[first : first + JUDGED])).to(device)
+                told = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
+                scores.append(told.scores.cpu().numpy())
+                latents.append(told.latents.cpu().numpy())
+        return Told(np.concatenate(scores), np.concatenate(latents))
+
+    def scores_of(self, latents: Floats) -> Floats:
+        """Return the scores (slide, class) that this sensor's classifier gives to latents, of another sensor maybe."""
+        device = next(self.network.parameters()).device
+        self.network.eval()
+        with torch.no_grad():
+            scores: Floats = self.network.classify(torch.from_numpy(latents).to(device)).cpu().numpy()
+        return scores
+
+
+@dataclass(frozen=True)
+class RocketReader:
+    """Convolutional features and a linear readout of one sensor."""
+
+    strong: Strong
+    classes: tuple[int, ...]
+
+    def tell(self, frames: Floats) -> Told:
+        """Return the readout's scores of slides (slide, time, channel) in device counts."""
+        return Told(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
+
+
+@dataclass(frozen=True)
+class SpectraReader:
+    """Spectra over spatial frequency of one sensor, and what it and other sensors were told of them."""
+
+    bands: Bands
+    rate_hz: float
+    speed_m_s: float
+    transfer: Transfer
+    classes: tuple[int, ...]
+
+    def tell(self, frames: Floats) -> Told:
+        """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
+        found = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
+        return Told(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
+
+    def expected(self, latents: Floats) -> Floats:
+        """Return the scores (slide, class) of spectra by what other sensors alone were told of the classes."""
+        return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
+
+
+Reader = NetworkReader | RocketReader | SpectraReader
+
+
+class Classifier:
+    """Readers of one or more sensors that name the material of a slide."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        config: Config = json.loads(files[CONFIG])
+        self.config = config
+        self.architecture: str = config["architecture"]
+        self.classes: tuple[int, ...] = tuple(config["classes"])
+        self.quantities = tuple(config["quantities"])
+        self.layouts = {name: Layout.from_told(name, told) for name, told in config["sensors"].items()}
+        self.readers: dict[str, Reader] = self._readers(files[WEIGHTS])
+        self.last = self._readers(files[LAST]) if LAST in files else {}
+        self.baselines = self._baselines(files[BASELINES]) if BASELINES in files else {}
+
+    @classmethod
+    def load(cls, files: Mapping[str, bytes]) -> Classifier:
+        """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task."""
+        if CONFIG not in files:
+            raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train material`.")
+        task = json.loads(files[CONFIG]).get("task")
+        if task != TASK:
+            raise TacpipeError(f"This model is of the task {task}, not {TASK}. Give one of `tacpipe train material`.")
+        return cls(files)
+
+    def predict(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Materials:
+        """Return the material of each slide: ``slides`` are device counts (slide, time, channel), or one (time, channel).
+
+        ``sensor`` may be left out where the model knows but one. Raises `TacpipeError` for another shape than the
+        model was trained on, and for values that are not finite.
+        """
+        return self.named(self.scores(slides, sensor))
+
+    def scores(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
+        """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
+        if not sensor and len(self.layouts) > 1:
+            raise UsageError(
+                f"The model knows the sensors {', '.join(self.layouts)}; name the one that felt the slides."
+            )
+        layout = self.layout(sensor or next(iter(self.layouts)))
+        frames = np.asarray(slides, np.float32)
+        frames = frames[None] if frames.ndim == 2 else frames
+        wanted = (layout.frames, len(layout.channels))
+        if frames.ndim != 3 or frames.shape[1:] != wanted:
+            raise TacpipeError(f"Slides of {layout.sensor} are (slide, {wanted[0]}, {wanted[1]}), not {frames.shape}.")
+        if not np.isfinite(frames).all():
+            raise TacpipeError("A slide holds a value that is not finite; it must have a number in every frame.")
+        return self.readers[layout.sensor].tell(frames).scores
+
+    def layout(self, sensor: str) -> Layout:
+        """Return the layout of a sensor's slides. Raises `TacpipeError` where the model does not know the sensor."""
+        if sensor not in self.layouts:
+            raise TacpipeError(
+                f"The model does not know the sensor {sensor}; it was trained on {', '.join(self.layouts)}. "
+                f"Train one on recordings of it."
+            )
+        return self.layouts[sensor]
+
+    def check(self, slides: Slides) -> None:
+        """Raise `TacpipeError` where slides are of another layout than those that the model was trained on."""
+        layout = self.layout(slides.layout.sensor)
+        if slides.layout != layout:
+            raise TacpipeError(
+                f"{slides.names[0]} {difference(layout, slides.layout)} as the model was trained on. "
+                f"Segment it with the same params, or train on slides like it."
+            )
+
+    def named(self, scores: Floats) -> Materials:
+        """Return the material of the highest score of each slide (slide,)."""
+        named: Materials = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
+        return named
+
+    def partner(self, sensor: str) -> str:
+        """Return the sensor whose classifier is exchanged with that of ``sensor``: the next one."""
+        names = list(self.layouts)
+        partner: str = names[(names.index(sensor) + 1) % len(names)]
+        return partner
+
+    def _readers(self, content: bytes) -> dict[str, Reader]:
+        if self.architecture == ROCKET:
+            arrays = load_arrays(content)
+            return {
+                name: RocketReader(Strong.from_tensors(under(f"{name}.", arrays)), self.classes)
+                for name in self.layouts
+            }
+        if self.architecture == SPECTRA:
+            arrays, told = load_arrays(content), self.config["spectra"]
+            bands = Bands(told["way_m"], np.array(told["edges_per_m"]))
+            return {
+                name: SpectraReader(
+                    bands,
+                    layout.rate_hz,
+                    told["speed_m_s"][name],
+                    Transfer.from_tensors(under(f"{name}.", arrays)),
+                    self.classes,
+                )
+                for name, layout in self.layouts.items()
+            }
+        tensors = load_tensors(content)
+        readers: dict[str, Reader] = {}
+        for name in self.layouts:
+            network = recurrent_autoencoder.build(self.architecture, Shape(**self.config["shapes"][name]))
+            network.load_state_dict(under(f"{name}.", tensors))
+            scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
+            readers[name] = NetworkReader(network, Affine.from_tensors(scaling))
+        return readers
+
+    def _baselines(self, content: bytes) -> dict[str, dict[str, Level | Strong]]:
+        """Return the baselines by name and sensor."""
+        arrays = load_arrays(content)
+        permuted = Strong if self.architecture == ROCKET else Level
+        kinds: dict[str, type[Level] | type[Strong]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: permuted}
+        return {
+            kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
+            for kind, cls in kinds.items()
+        }
+
+
+def spread(scores: Floats, known: Any, classes: tuple[int, ...]) -> Floats:
+    """Return scores of the classes ``known`` as columns of all ``classes``, the lowest possible where one is unknown.
+
+    >>> spread(np.array([[1.0, 2.0]], np.float32), [3, 5], (3, 4, 5)).tolist()
+    [[1.0, -inf, 2.0]]
+    """
+    found = np.full((len(scores), len(classes)), -np.inf, np.float32)
+    found[:, [classes.index(int(one)) for one in known]] = scores
+    return found
+
+
+def under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries whose name begins with ``prefix``, without it."""
+    return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
+
+
+def shape_told(shape: Shape) -> dict[str, Any]:
+    """Return a network's shape as JSON holds it."""
+    return dataclasses.asdict(shape)

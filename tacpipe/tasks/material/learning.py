@@ -1,0 +1,226 @@
+"""What networks learn of slides: to make them again, to name their material, and to agree with other sensors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import combinations, permutations
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, RecurrentClassifier, Told
+from tacpipe.tasks.material.pairs import NONE, Pairs
+from tacpipe.training.loop import Line
+
+Network = RecurrentAutoencoder | RecurrentClassifier
+TEMPERATURE = 0.1  # of contrast: the published one
+JUDGED = 128  # slides that go through a network at once where nothing is learned
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What each loss counts (the paper's section IV: 0.01, 1, 1), and from which epoch on latents are aligned."""
+
+    reconstruction: float = 0.01
+    classification: float = 1.0
+    alignment: float = 1.0  # 0: sensors are learned independently
+    align_from: int = 20  # first epoch, from 0, in which the alignment counts
+    agreement: str = (
+        "pairs"  # what is aligned: pairs of one row, or each slide with all of its class, in contrast to others
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse an agreement that there is none of."""
+        if self.agreement not in ("pairs", "contrast"):
+            raise TacpipeError(f"agreement is {self.agreement!r}; it must be pairs or contrast.")
+
+
+@dataclass(frozen=True)
+class Felt:
+    """Slides of one sensor as a network reads them."""
+
+    frames: Tensor  # (slide, time, channel), scaled
+    classes: Tensor  # (slide,), from 0; NONE where there is no label
+
+    def batch(self, chosen: Tensor) -> Tensor:
+        """Return the frames of some slides (time, slide, channel)."""
+        return self.frames[chosen].transpose(0, 1).contiguous()
+
+
+@dataclass
+class _Sums:
+    """Sums over the batches of one epoch."""
+
+    values: dict[str, Tensor | float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, name: str, mean: Tensor, count: int) -> None:
+        self.values[name] = self.values.get(name, 0.0) + mean.detach().double() * count
+        self.counts[name] = self.counts.get(name, 0) + count
+
+    def mean(self, name: str) -> float | None:
+        return float(self.values[name]) / self.counts[name] if self.counts.get(name) else None
+
+
+class JointWork:
+    """Networks of one or more sensors, learned side by side and, where ``weights.alignment`` is above 0, jointly.
+
+    Each sensor's network lowers the mean squared error of its slides made again and the negative log-likelihood of their
+    classes; from epoch ``align_from`` on also the mean squared difference of its latents to those of the other sensors'
+    slides in the same row of the batch (Gao et al. 2020, section IV). A sensor in ``known`` learns nothing: others
+    learn to meet its latents, without seeing a class. Joint networks are chosen together, by the mean validation
+    accuracy over sensors, others each by its own; of equals the later epoch.
+    """
+
+    def __init__(
+        self,
+        training: Mapping[str, Felt],
+        validation: Mapping[str, Felt],
+        pairs: Pairs,
+        weights: Weights,
+        known: str = "",
+        drop_last: bool = False,
+    ) -> None:
+        self.training, self.validation, self.pairs, self.weights = training, validation, pairs, weights
+        self.known, self.drop_last = known, drop_last
+        self._sums = _Sums()
+
+    @property
+    def joint(self) -> bool:
+        """Whether latents of unlike sensors are aligned."""
+        return self.weights.alignment > 0 and len(self.training) > 1
+
+    def batches(self, epoch: int) -> list[dict[str, Tensor]]:
+        """Return the batches of an epoch: for each sensor the slide of every row."""
+        self._sums = _Sums()
+        return self.pairs.epoch()
+
+    def loss(self, model: nn.Module, batch: Mapping[str, Tensor], epoch: int) -> tuple[Tensor, int]:
+        """Return the sum of all losses of a batch, and its rows."""
+        told, total = {}, torch.zeros(())
+        for sensor, rows in batch.items():
+            chosen = rows[rows != NONE]
+            if len(chosen):
+                told[sensor], loss = self._own(sensor, model.get_submodule(sensor), chosen)
+                total = total.to(loss.device) + loss
+        if self.joint:
+            aligned = self._alignment(batch, told)
+            if self.weights.agreement == "contrast":
+                aligned = self._contrast(batch, told)
+            if aligned is not None and epoch >= self.weights.align_from:
+                total = total + self.weights.alignment * aligned
+        return total, max(int((rows != NONE).sum()) for rows in batch.values())
+
+    def _own(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[Told, Tensor]:
+        """Return what a network says of some slides, and the losses that are its own."""
+        felt, weights = self.training[sensor], self.weights
+        frames, classes = felt.batch(chosen), felt.classes[chosen]
+        if sensor == self.known:
+            with torch.no_grad():
+                told: Told = network(frames, decode=False)
+            return told, told.latents.new_zeros(())
+        told = network(frames)
+        total = told.latents.new_zeros(())
+        labelled = classes != NONE
+        if labelled.any():
+            loss = nn.functional.cross_entropy(told.scores[labelled], classes[labelled])
+            self._sums.add(f"{sensor}.classification", loss, int(labelled.sum()))
+            if not self.known:  # a sensor that is mapped to a known space learns without classes
+                total = total + weights.classification * loss
+        if told.frames is not None:
+            loss = nn.functional.mse_loss(told.frames, frames)
+            self._sums.add(f"{sensor}.reconstruction", loss, len(chosen))
+            total = total + weights.reconstruction * loss
+        return told, total
+
+    def _alignment(self, batch: Mapping[str, Tensor], told: Mapping[str, Told]) -> Tensor | None:
+        """Return the mean squared difference of latents in rows that two sensors share, averaged over their pairs."""
+        found = []
+        for one, other in combinations(told, 2):
+            latents, valid = zip(*(self._by_row(batch[name], told[name], name) for name in (one, other)), strict=True)
+            both = valid[0] & valid[1]
+            if both.any():
+                found.append(nn.functional.mse_loss(latents[0][both], latents[1][both]))
+        if not found:
+            return None
+        mean = torch.stack(found).mean()
+        self._sums.add("alignment", mean, 1)
+        return mean
+
+    def _contrast(self, batch: Mapping[str, Tensor], told: Mapping[str, Told]) -> Tensor | None:
+        """Return how badly slides tell those of the same row's class, felt by another sensor, from all others of it.
+
+        The supervised contrastive loss (Khosla et al., Supervised Contrastive Learning, 2020, equation 2) between
+        sensors: cosines of latents over a temperature, one term for each slide and direction. A row's class is that of
+        its first sensor, so that permuted pairs are drawn together as they are paired.
+        """
+        first = next(iter(batch))
+        classes = torch.where(batch[first] != NONE, self.training[first].classes.cpu()[batch[first]], NONE)
+        found = []
+        for one, other in permutations(told, 2):
+            (from_, valid), (to, known) = (self._by_row(batch[name], told[name], name) for name in (one, other))
+            here, there = (classes != NONE).to(valid.device) & valid, (classes != NONE).to(known.device) & known
+            same = classes.to(valid.device)[here][:, None] == classes.to(valid.device)[there]  # (slide, other slide)
+            told_apart = same.any(dim=1)
+            if told_apart.any():
+                cosines = nn.functional.normalize(from_[here], dim=1) @ nn.functional.normalize(to[there], dim=1).t()
+                shares = nn.functional.log_softmax(cosines / TEMPERATURE, dim=1)[told_apart]
+                counted = same[told_apart]
+                found.append(-((shares * counted).sum(dim=1) / counted.sum(dim=1)).mean())
+        return torch.stack(found).mean() if found else None
+
+    def _by_row(self, rows: Tensor, told: Told, sensor: str) -> tuple[Tensor, Tensor]:
+        """Return latents (row, latent), and which rows hold a slide with a label."""
+        filled = rows != NONE
+        latents = told.latents.new_zeros(len(rows), told.latents.shape[1])
+        latents[filled.to(latents.device)] = told.latents
+        valid = filled.clone()
+        valid[filled] = (self.training[sensor].classes[rows[filled]] != NONE).cpu()
+        return latents, valid.to(latents.device)
+
+    def watch(self, model: nn.Module) -> Line:
+        """Return the epoch's losses, and losses and accuracy of each sensor on its validation slides."""
+        judged = {sensor: self._judged(model.get_submodule(sensor), felt) for sensor, felt in self.validation.items()}
+        weights = self.weights
+        return {
+            "val_loss": sum(
+                weights.classification * one["classification"] + weights.reconstruction * one.get("reconstruction", 0.0)
+                for one in judged.values()
+            ),
+            "alignment": self._sums.mean("alignment"),
+            "train": {
+                sensor: {name: self._sums.mean(f"{sensor}.{name}") for name in ("reconstruction", "classification")}
+                for sensor in self.training
+            },
+            "val": judged,
+        }
+
+    @torch.no_grad()
+    def _judged(self, network: nn.Module, felt: Felt) -> dict[str, float]:
+        labelled = (felt.classes != NONE).nonzero()[:, 0]
+        if self.drop_last:
+            labelled = labelled[: len(labelled) // self.pairs.batch * self.pairs.batch]
+        right = loss = again = 0.0
+        for first in range(0, len(labelled), JUDGED):
+            some = labelled[first : first + JUDGED]
+            frames, classes = felt.batch(some), felt.classes[some]
+            told: Told = network(frames)
+            right += float((told.scores.argmax(dim=1) == classes).sum())
+            loss += float(nn.functional.cross_entropy(told.scores, classes, reduction="sum"))
+            if told.frames is not None:
+                again += float(nn.functional.mse_loss(told.frames, frames)) * len(some)
+        count = len(labelled) or math.nan
+        found = {"accuracy": right / count, "classification": loss / count}
+        return found if isinstance(network, RecurrentClassifier) else {**found, "reconstruction": again / count}
+
+    def ranks(self, line: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+        """Return the wrong share of validation slides, of equals the later epoch being better."""
+        wrong = {sensor: 1 - one["accuracy"] for sensor, one in line["val"].items()}
+        later = -line["epoch"]
+        if self.joint:
+            return {"": (sum(wrong.values()) / len(wrong), later)}
+        return {f"{sensor}.": (one, later) for sensor, one in wrong.items()}

@@ -1,0 +1,47 @@
+"""What a classifier says of slides, without a word on whether it is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.stage import Recording, Result
+from tacpipe.tasks.material import slides as slides_of
+from tacpipe.tasks.material.classifier import Classifier
+from tacpipe.tasks.material.judging import PREDICTIONS, latent_columns, score_columns
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+
+def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
+    """Return one table, ``predictions``: a row a slide with the material named, all scores, and latents where there are.
+
+    Slides need no label; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where the
+    recordings are not what the model reads.
+    """
+    classifier = Classifier.load(model)
+    names: list[str] = []
+    sensors: list[str] = []
+    told = []
+    for sensor, slides in slides_of.read(recordings, quantities=classifier.quantities).items():
+        classifier.check(slides)
+        names += slides.names
+        sensors += [sensor] * len(slides)
+        told.append(classifier.readers[sensor].tell(slides.frames))
+    scores = np.concatenate([one.scores for one in told])
+    columns: list[tuple[pa.Field, Any]] = [
+        (pa.field("recording", pa.string()), names),
+        (pa.field("sensor", pa.string()), sensors),
+        (pa.field("material", pa.int32(), metadata={"quantity": "prediction"}), classifier.named(scores)),
+        *score_columns(classifier, scores),
+    ]
+    latents = [one.latents for one in told if one.latents is not None]
+    if latents:
+        columns += latent_columns(np.concatenate(latents))
+    arrays = [pa.array(values, field.type) for field, values in columns]
+    table = pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))
+    return Result({PREDICTIONS: Recording(table)})

@@ -1,0 +1,343 @@
+"""How a classifier of materials comes about: from slides and params to the files of a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from safetensors.torch import save as save_tensors
+from torch import nn
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.models import headers, recurrent_autoencoder
+from tacpipe.models.level import Level
+from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.tasks.material import readouts
+from tacpipe.tasks.material import slides as slides_of
+from tacpipe.tasks.material.classifier import (
+    BASELINES,
+    CONFIG,
+    LAST,
+    MEAN_LEVEL,
+    PERMUTED_LABELS,
+    ROCKET,
+    SPECTRA,
+    TASK,
+    WEIGHTS,
+    Classifier,
+    Config,
+    NetworkReader,
+    shape_told,
+)
+from tacpipe.tasks.material.learning import Felt, JointWork, Weights
+from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
+from tacpipe.tasks.material.slides import Slides
+from tacpipe.training import loop
+from tacpipe.training.scaling import Affine
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+HISTORY = "history.jsonl"
+ARCHITECTURES = (ROCKET, "raec", "x-lstm", SPECTRA)
+QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params do not say
+MAPPED_RECONSTRUCTION = 0.05  # of a network that learns to meet known latents: that of the published script
+
+Params = Mapping[str, Any]
+BySensor = Mapping[str, Slides]
+
+
+def train(
+    params: Params,
+    training: Dataset,
+    validation: Dataset | None,
+    workspace: Path,
+    init: Mapping[str, bytes] | None = None,
+) -> dict[str, bytes]:
+    """Return the files of a model trained on the slides of ``training`` and, for networks, chosen on ``validation``.
+
+    ``params`` are those of the stage `train.material`. Whatever is fitted is fitted on training slides alone; a readout
+    in closed form needs none to choose by, and learns from validation slides too where ``use_validation`` says so.
+    Raises `TacpipeError` where slides lack labels, differ in layout or, learned jointly, in materials.
+    """
+    _check(params, init)
+    only = [name.strip() for name in params["sensors"].split(",") if name.strip()]
+    kinds = slides_of.quantities(params["quantities"]) or QUANTITIES.get(params["architecture"], (slides_of.TACTILE,))
+    known = slides_of.read(training, only=only, quantities=kinds, labelled=True)
+    watched: dict[str, Slides] = {}
+    if validation is not None and validation.shards:
+        watched = slides_of.read(validation, only=only, quantities=kinds, labelled=True)
+    if not known:
+        raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
+    classes = sorted({int(one) for some in known.values() for one in some.materials})
+    if len(classes) < 2:
+        raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to tell apart.")
+    config: Config = {
+        "task": TASK,
+        "architecture": params["architecture"],
+        "params": dict(params),
+        "split": params["setting"],
+        "quantities": kinds,
+        "sensors": {name: some.layout.told() for name, some in known.items()},
+        "classes": classes,
+        "counts": {
+            role: {name: len(some) for name, some in part.items()}
+            for role, part in (("train", known), ("val", watched))
+        },
+        "trained_on": {
+            name: digest
+            for part in (known, watched)
+            for some in part.values()
+            for name, digest in zip(some.names, some.digests, strict=True)
+        },
+    }
+    if params["architecture"] == ROCKET:
+        return readouts.rockets(config, known, watched)
+    if params["architecture"] == SPECTRA:
+        return readouts.spectra(config, known, watched, held_out(params["hold_out"], classes, known))
+    return _networks(config, known, watched, workspace, init)
+
+
+def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
+    """Refuse params that do not go together."""
+    if params["architecture"] not in ARCHITECTURES:
+        raise UsageError(f"There is no architecture {params['architecture']}; there are {', '.join(ARCHITECTURES)}.")
+    if params["labels"] not in ("true", "permuted"):
+        raise UsageError(f"labels is {params['labels']!r}; it must be true or permuted.")
+    if params["select"] not in ("best", "last"):
+        raise UsageError(f"select is {params['select']!r}; it must be best or last.")
+    if bool(params["known"]) != (init is not None):
+        raise UsageError(
+            "Mapping to a known space needs both --known, the sensor whose latents are known, and --init, the model that "
+            "knows them."
+        )
+    if params["known"] and params["architecture"] != "raec":
+        raise UsageError(f"Only networks of the architecture raec map to a known space, not {params['architecture']}.")
+
+
+# ---- networks
+
+
+def _networks(
+    config: Config, known: BySensor, watched: BySensor, workspace: Path, init: Mapping[str, bytes] | None
+) -> dict[str, bytes]:
+    params = config["params"]
+    missing = sorted(set(known) - set(watched))
+    if missing:
+        raise TacpipeError(
+            f"No recording of {missing[0]} has the role val, and a network is chosen by its validation slides. "
+            f"Make a split that has some of every sensor."
+        )
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    start = Classifier.load(init) if init else None
+    joint = params["joint"] and len(known) > 1 and params["architecture"] == "raec"
+    if joint:
+        _same_materials(known)
+    kinds = headers.chosen(params["headers"], {name: len(some.layout.channels) for name, some in known.items()})
+    shapes = {name: _shape(params, some, kinds[name], len(config["classes"])) for name, some in known.items()}
+    scalings = {name: Affine.fit(some.frames, params["scaling"]) for name, some in known.items()}
+    held = held_out(params["hold_out"], config["classes"], known)
+    if start:
+        _same_space(start, params["known"], config, known)
+        shapes[params["known"]] = Shape(**start.config["shapes"][params["known"]])
+        scalings[params["known"]] = _reader(start, params["known"]).scaling
+    felt = [
+        {
+            name: _felt(config, some, scalings[name], held, device, place)
+            for place, (name, some) in enumerate(part.items())
+        }
+        for part in (known, watched)
+    ]
+    config |= {
+        "shapes": {name: shape_told(shape) for name, shape in shapes.items()},
+        "scaling": {
+            name: {key: value.tolist() for key, value in one.to_tensors().items()} for name, one in scalings.items()
+        },
+        "joint": joint,
+        "held_out": {name: sorted(materials) for name, materials in held.items()},
+    }
+    partners = None
+    if params["pairing"] == "permuted":
+        partners = permuted_classes(range(len(config["classes"])), params["seed"])
+        config["partners"] = {
+            str(config["classes"][one]): config["classes"][other] for one, other in sorted(partners.items())
+        }
+    work = JointWork(
+        felt[0],
+        felt[1],
+        Pairs(
+            {name: some.classes.cpu() for name, some in felt[0].items()},
+            params["batch"],
+            params["pairing"],
+            params["shuffle"],
+            params["drop_last"],
+            params["reduce"],
+            params["ratio"],
+            partners,
+            params["seed"],
+        ),
+        _weights(params, joint),
+        params["known"],
+        params["drop_last"],
+    )
+    schedule = loop.Schedule(
+        epochs=params["epochs"],
+        batch=params["batch"],
+        learning_rate=params["learning_rate"],
+        patience=params["patience"] or params["epochs"],
+        gradient_clip=math.inf,
+        seed=params["seed"],
+        cycle=params["cycle"],
+    )
+    trained = loop.train(lambda: _built(params, shapes, start).to(device), work, schedule, workspace)
+    best, last = (trained.weights, trained.last) if params["select"] == "best" else (trained.last, trained.weights)
+    config["validation"] = _validation(trained.history, work.joint)
+    files = {
+        CONFIG: readouts.config_file(config),
+        WEIGHTS: save_tensors(best),
+        HISTORY: trained.history_lines,
+    }
+    if params["select"] == "best":
+        files[LAST] = save_tensors(last)
+    if params["baselines"]:
+        files[BASELINES] = _network_baselines(Classifier.load(files), known, params)
+    return files
+
+
+def _shape(params: Params, some: Slides, header: str, classes: int) -> Shape:
+    return Shape(
+        channels=len(some.layout.channels),
+        classes=classes,
+        header=header,
+        decoder=params["decoder"],
+        hidden=params["hidden"],
+        latents=params["latents"],
+        unpool=params["unpool"],
+        dropout=params["dropout"] if params["dropout_mode"] == "latent" else 0.0,
+    )
+
+
+def _felt(config: Config, some: Slides, scaled: Affine, held: Mapping[str, set[int]], device: str, place: int) -> Felt:
+    """Return slides as networks read them; what is held out or not among the training slides' classes has no label."""
+    params, name = config["params"], some.layout.sensor
+    numbers = {material: number for number, material in enumerate(config["classes"]) if material not in held[name]}
+    materials = readouts.permuted(params, some.materials, place)
+    classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
+    if not (classes != NONE).any():
+        raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
+    return Felt(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
+
+
+def held_out(given: str, classes: Sequence[int], sensors: Sequence[str] | BySensor) -> dict[str, set[int]]:
+    """Return the materials whose labels each sensor is not told; ``given`` is like ``roboskin=17,18,19,20``.
+
+    >>> held_out("b=3,4", [1, 2, 3, 4], ["a", "b"])
+    {'a': set(), 'b': {3, 4}}
+    """
+    found: dict[str, set[int]] = {name: set() for name in sensors}
+    for part in filter(None, (part.strip() for part in given.split(";"))):
+        name, _, numbers = part.partition("=")
+        try:
+            materials = {int(number) for number in numbers.split(",")}
+        except ValueError:
+            raise UsageError(f"hold_out is {part!r}; it must be like roboskin=17,18,19,20.") from None
+        if name not in found or not materials <= set(classes):
+            raise UsageError(
+                f"hold_out names {part}; the sensors are {', '.join(found)} and the materials {classes[0]} to {classes[-1]}."
+            )
+        found[name] |= materials
+    return found
+
+
+def _same_materials(known: BySensor) -> None:
+    """Refuse joint learning where a sensor lacks a material that another has."""
+    materials = {name: {int(one) for one in some.materials} for name, some in known.items()}
+    every = set().union(*materials.values())
+    for name, own in materials.items():
+        if own != every:
+            lacking = ", ".join(map(str, sorted(every - own)))
+            raise TacpipeError(
+                f"{name} has no training slide of material {lacking}, which other sensors have, so they cannot be learned "
+                f"jointly. Exclude those slides, record the material, or train with --no-joint."
+            )
+
+
+def _same_space(start: Classifier, known: str, config: Config, slides: BySensor) -> None:
+    """Refuse a model of --init that does not know the sensor or the same materials."""
+    if known not in slides:
+        raise UsageError(f"known names the sensor {known}; the recordings are of {', '.join(slides)}.")
+    if start.architecture != "raec":
+        raise TacpipeError(
+            f"The model of --init is of the architecture {start.architecture}; its space must be of raec."
+        )
+    start.check(slides[known])
+    if list(start.classes) != config["classes"]:
+        raise TacpipeError(
+            f"The model of --init names {len(start.classes)} materials and the recordings have {len(config['classes'])}; "
+            f"a known space is that of the same ones."
+        )
+
+
+def _reader(start: Classifier, sensor: str) -> NetworkReader:
+    reader = start.readers[sensor]
+    assert isinstance(reader, NetworkReader)
+    return reader
+
+
+def _weights(params: Params, joint: bool) -> Weights:
+    reconstruction = params["reconstruction_weight"]
+    return Weights(
+        MAPPED_RECONSTRUCTION if params["known"] else reconstruction,
+        params["classification_weight"],
+        params["alignment_weight"] if joint else 0.0,
+        params["align_from"],
+        params["agreement"],
+    )
+
+
+def _built(params: Params, shapes: Mapping[str, Shape], start: Classifier | None) -> nn.ModuleDict:
+    """Return the networks by sensor; a known one is taken over and frozen, with its classifier in all others."""
+    built = nn.ModuleDict(
+        {name: recurrent_autoencoder.build(params["architecture"], one) for name, one in shapes.items()}
+    )
+    if start:
+        known = _reader(start, params["known"]).network
+        for name, network in built.items():
+            if name == params["known"]:
+                network.load_state_dict(known.state_dict())
+                network.requires_grad_(False)
+            else:
+                network.get_submodule("classifier").load_state_dict(known.classifier.state_dict())
+                network.get_submodule("classifier").requires_grad_(False)
+    return built
+
+
+def _validation(history: Sequence[loop.Line], joint: bool) -> dict[str, Any]:
+    """Return the epoch that each sensor's weights are of, and its accuracy there."""
+
+    def chosen(sensor: str) -> loop.Line:
+        lines = history
+        of = list(history[0]["val"]) if joint else [sensor]
+        return max(lines, key=lambda line: (sum(line["val"][one]["accuracy"] for one in of), line["epoch"]))
+
+    found = {sensor: chosen(sensor) for sensor in history[0]["val"]}
+    return {
+        "epoch": {sensor: line["epoch"] for sensor, line in found.items()},
+        "accuracy": {sensor: line["val"][sensor]["accuracy"] for sensor, line in found.items()},
+    }
+
+
+def _network_baselines(trained: Classifier, known: BySensor, params: Params) -> bytes:
+    """Return the mean-level baseline, and a readout of the networks' own latents fitted to shuffled labels."""
+    found: dict[str, np.ndarray] = {}
+    for place, (name, some) in enumerate(known.items()):
+        latents = trained.readers[name].tell(some.frames).latents
+        assert latents is not None
+        shuffled = np.random.default_rng([params["seed"], 3, place]).permutation(some.materials)
+        found |= readouts.stored(MEAN_LEVEL, name, Level.fit(some.frames, some.materials))
+        found |= readouts.stored(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
+    return readouts.packed(found)

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models import headers
+from tacpipe.models.recurrent_autoencoder import (
+    RecurrentAutoencoder,
+    RecurrentClassifier,
+    Shape,
+    build,
+    parameters,
+)
+
+BIOTAC, ROBOSKIN = Shape(19, 20), Shape(60, 20, header="cnn")
+
+
+def test_the_networks_have_as_many_weights_as_the_published_ones() -> None:
+    biotac, roboskin = RecurrentAutoencoder(BIOTAC), RecurrentAutoencoder(ROBOSKIN)
+    assert parameters(biotac) == 83_319
+    assert parameters(roboskin) == 82_962
+    assert parameters(biotac.encoder) == 39_960
+    assert parameters(roboskin.encoder) == 39_600
+    assert parameters(biotac.to_latents) == 3_640
+    assert parameters(biotac.classifier) == 820
+    assert parameters(biotac.from_latents) == 3_690
+    assert parameters(biotac.decoder) == 33_480
+    assert parameters(biotac.to_features) == 1_729
+    assert parameters(roboskin.to_features) == 1_638
+    assert parameters(roboskin.header) == 48 + 46
+
+
+class Plainly(nn.Module):
+    """The same network written with torch's layers only."""
+
+    def __init__(self, ours: RecurrentAutoencoder) -> None:
+        super().__init__()
+        self.ours = ours
+
+    def forward(self, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        ours, shape = self.ours, self.ours.shape
+        header: Any = ours.header
+        steps, slides, _ = frames.shape
+        if shape.header == "cnn":
+            maps = [nn.functional.max_pool2d(header.encoder(one.view(slides, 1, 6, 10)), 2) for one in frames]
+            features = torch.stack([one.flatten(1) for one in maps])
+        elif shape.header == "mlp":
+            features = torch.stack([torch.tanh(header.encoder(one)) for one in frames])
+        else:
+            features = frames
+        _, (last, _) = ours.encoder(features)
+        z = ours.to_latents(last[0])
+        begun = ours.from_latents(z)
+        if shape.decoder == "D1":
+            state = begun[None], torch.zeros_like(begun)[None]
+            states, _ = ours.decoder(torch.zeros(steps, slides, 1), state)
+        else:
+            states, _ = ours.decoder(torch.stack([begun] * steps))
+        out = ours.to_features(states)
+        if shape.header == "cnn":
+            ups = [one.view(slides, 3, 2, 3).repeat_interleave(2, 2).repeat_interleave(2, 3) for one in out]
+            out = torch.stack([torch.relu(header.decoder(one)).flatten(1) for one in ups])
+        elif shape.header == "mlp":
+            out = header.decoder(out)
+        return z, ours.classifier(z), out
+
+
+@pytest.mark.parametrize("header, channels", [("none", 19), ("mlp", 19), ("cnn", 60)])
+@pytest.mark.parametrize("decoder", ["D1", "D2"])
+def test_a_network_says_what_the_same_one_of_plain_layers_says(header: str, channels: int, decoder: str) -> None:
+    torch.manual_seed(3)
+    ours = RecurrentAutoencoder(Shape(channels, 5, header=header, decoder=decoder))
+    frames = torch.rand(7, 4, channels)
+    wanted = Plainly(ours)(frames)
+    for found, one in zip(ours(frames), wanted, strict=True):
+        torch.testing.assert_close(found, one, atol=1e-5, rtol=1e-4)
+    grown = torch.autograd.grad(sum(one.square().mean() for one in wanted), list(ours.parameters()), allow_unused=True)
+    told = ours(frames)
+    ours.zero_grad()
+    sum(one.square().mean() for one in told).backward()
+    for weight, gradient in zip(ours.parameters(), grown, strict=True):
+        wanted_gradient = torch.zeros_like(weight) if gradient is None else gradient
+        found_gradient = torch.zeros_like(weight) if weight.grad is None else weight.grad
+        torch.testing.assert_close(found_gradient, wanted_gradient, atol=1e-5, rtol=1e-3)
+
+
+def test_unpooling_as_published_uses_the_places_of_the_last_frame() -> None:
+    header = headers.Convolution(60, "last")
+    frames = torch.rand(5, 2, 60)
+    features = header.encode(frames)
+    _, indices = nn.functional.max_pool2d(header.encoder(frames[-1].view(2, 1, 6, 10)), 2, return_indices=True)
+    maps = nn.functional.max_unpool2d(features[0].view(2, 3, 2, 3), indices, [2, 2])
+    wanted = torch.relu(header.decoder(maps)).flatten(1)
+    torch.testing.assert_close(header.decode(features)[0], wanted)
+
+
+def test_reconstructed_counts_of_the_convolution_are_never_negative() -> None:
+    told = RecurrentAutoencoder(ROBOSKIN)(torch.randn(6, 3, 60))
+    assert (told.frames >= 0).all()
+
+
+def test_the_classifier_alone_has_its_last_state_for_latents_and_makes_no_frames() -> None:
+    network = RecurrentClassifier(BIOTAC)
+    told = network(torch.rand(6, 3, 19))
+    assert told.frames is None
+    torch.testing.assert_close(network.classifier(told.latents), told.scores)
+    assert parameters(network) == 39_960 + 90 * 20 + 20
+
+
+def test_dropout_leaves_out_latents_in_training_only() -> None:
+    network = RecurrentAutoencoder(Shape(19, 20, dropout=0.5))
+    frames = torch.rand(4, 64, 19)
+    network.eval()
+    assert torch.equal(network(frames).scores, network(frames).scores)
+    network.train()
+    assert not torch.equal(network(frames).scores, network(frames).scores)
+
+
+def test_what_cannot_be_built_is_refused_with_what_can() -> None:
+    with pytest.raises(TacpipeError, match="no decoder 'D3'; there are D1 and D2"):
+        build("raec", Shape(19, 20, decoder="D3"))
+    with pytest.raises(TacpipeError, match="no network 'rnn'"):
+        build("rnn", BIOTAC)
+    with pytest.raises(TacpipeError, match="a grid of 6 x 10 channels and this sensor has 19"):
+        build("raec", Shape(19, 20, header="cnn"))
+    with pytest.raises(TacpipeError, match="no header 'fft'"):
+        build("raec", Shape(19, 20, header="fft"))
+    with pytest.raises(TacpipeError, match="the sensor digit; the recordings have biotac"):
+        headers.chosen("digit=mlp", {"biotac": 19})

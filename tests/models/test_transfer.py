@@ -1,0 +1,146 @@
+"""What sensors tell one another of classes, against normal distributions and the rule of Bayes by another road."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+from sklearn.covariance import LedoitWolf
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models.transfer import STEADY, Gaussians, Told, Transfer
+
+WIDE, CLASSES = 5, 10
+MEANS = 2 * np.random.default_rng(0).normal(size=(CLASSES, WIDE))
+
+
+def told(classes: object, each: int, gain: float = 1.0, offset: float = 0.0, noise: float = 0.3, seed: int = 1) -> Told:
+    """Slides of some classes, as a sensor with this gain and offset in every feature feels them."""
+    labels = np.repeat(np.array(classes), each)
+    rng = np.random.default_rng(seed)
+    return Told(offset + gain * MEANS[labels] + noise * rng.normal(size=(len(labels), WIDE)), labels)
+
+
+def named(of: Transfer, gaussians: Gaussians, slides: Told) -> float:
+    """The share of slides named rightly."""
+    return float((of.classes[gaussians.scores(slides.features).argmax(axis=1)] == slides.labels).mean())
+
+
+def test_classes_that_only_another_sensor_was_told_are_named() -> None:
+    found = Transfer.fit(told(range(6), 8, 0.5, 3.0), [told(range(CLASSES), 8, seed=2)])
+    new = told(range(6, CLASSES), 30, 0.5, 3.0, seed=3)
+    assert named(found, found.known, new) > 0.9
+    assert named(found, found.expected, new) > 0.9
+    assert named(found, found.known, told(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
+
+
+def test_what_is_expected_is_the_other_sensors_mean_by_gain_and_offset() -> None:
+    own, other = told(range(6), 400, -0.5, 3.0, 0.05), told(range(CLASSES), 400, noise=0.05, seed=2)
+    found = Transfer.fit(own, [other])
+    np.testing.assert_allclose(found.known.mean[6:], 3 - 0.5 * MEANS[6:], atol=0.05)
+    np.testing.assert_allclose(found.expected.mean, 3 - 0.5 * MEANS, atol=0.05)
+
+
+def test_sensors_that_have_nothing_in_common_expect_nothing_of_one_another() -> None:
+    strange = np.random.default_rng(7).normal(size=(CLASSES, WIDE))
+    other = told(range(CLASSES), 8, seed=2)
+    right = []
+    for seed in range(20):
+        shuffled = np.random.default_rng(seed).permutation(strange)
+        own = Told(shuffled[np.repeat(np.arange(6), 8)], np.repeat(np.arange(6), 8))
+        rng = np.random.default_rng([seed, 1])
+        found = Transfer.fit(Told(own.features + 0.1 * rng.normal(size=own.features.shape), own.labels), [other])
+        right.append(named(found, found.expected, Told(shuffled[6:], np.arange(6, CLASSES))))
+    assert np.mean(right) < 0.2  # chance is 0.1
+
+
+def test_a_few_slides_correct_what_is_expected_by_the_rule_of_bayes() -> None:
+    own, other = told(np.r_[np.repeat(range(5), 6), 5, 5], 1, 0.5, 1.0), told(range(CLASSES), 8, seed=2)
+    found = Transfer.fit(own, [other])
+    number = 4  # a class of six slides
+    left = own.features - np.stack([own.features[own.labels == one].mean(axis=0) for one in own.labels])
+    scale = left.std(axis=0)
+    within = LedoitWolf(assume_centered=True).fit(left / scale).covariance_ * np.outer(scale, scale) * 32 / 26
+    prior = found.expected.covariance[number] - within
+    precise = np.linalg.inv(np.linalg.inv(prior) + 6 * np.linalg.inv(within))
+    mean = precise @ (
+        np.linalg.inv(prior) @ found.expected.mean[number]
+        + 6 * np.linalg.inv(within) @ own.features[own.labels == number].mean(axis=0)
+    )
+    np.testing.assert_allclose(np.diag(np.diag(prior)), prior, atol=1e-12)
+    np.testing.assert_allclose(found.known.mean[number], mean, rtol=1e-6)
+    np.testing.assert_allclose(found.known.covariance[number], within + precise, rtol=1e-6)
+
+
+def test_many_slides_of_its_own_outweigh_what_others_expect() -> None:
+    wrong = told(range(CLASSES), 8, seed=2)
+    wrong = Told(np.random.default_rng(3).permutation(wrong.features), wrong.labels)
+    own = told(range(CLASSES), 500)
+    found = Transfer.fit(own, [wrong])
+    means = np.stack([own.features[own.labels == one].mean(axis=0) for one in range(CLASSES)])
+    np.testing.assert_allclose(found.known.mean, means, atol=0.01)
+
+
+def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
+    new = told(range(CLASSES), 40, 0.5, 3.0, 1.0, seed=3)
+    with_other, alone = [], []
+    for seed in range(5):
+        own = told(range(CLASSES), 2, 0.5, 3.0, 1.0, seed=10 + seed)
+        found = Transfer.fit(own, [told(range(CLASSES), 50, noise=0.3, seed=2)])
+        with_other.append(named(found, found.known, new))
+        found = Transfer.fit(own)
+        alone.append(named(found, found.known, new))
+    assert np.mean(with_other) > np.mean(alone) + 0.05
+
+
+def test_the_more_exact_of_two_sensors_counts_more() -> None:
+    exact, vague = told(range(CLASSES), 20, noise=0.01, seed=2), told(range(CLASSES), 20, seed=3)
+    rng = np.random.default_rng(4)
+    vague = Told(vague.features + rng.normal(size=(CLASSES, WIDE))[vague.labels], vague.labels)
+    own = told(range(6), 20, noise=0.01)
+    errors = {
+        name: np.abs(Transfer.fit(own, others).known.mean[6:] - MEANS[6:]).mean()
+        for name, others in {"exact": [exact], "vague": [vague], "both": [vague, exact]}.items()
+    }
+    assert errors["both"] < 0.1 * errors["vague"]
+    assert errors["both"] < 2 * errors["exact"]
+
+
+def test_scores_are_logarithms_of_normal_densities() -> None:
+    found, new = Transfer.fit(told(range(6), 8), [told(range(CLASSES), 8, seed=2)]), told(range(CLASSES), 3, seed=5)
+    expected = np.array(
+        [
+            multivariate_normal(mean, cov + STEADY * np.trace(cov) / WIDE * np.eye(WIDE)).logpdf(new.features)
+            for mean, cov in zip(found.known.mean, found.known.covariance, strict=True)
+        ]
+    ).T
+    np.testing.assert_allclose(found.known.scores(new.features), expected + WIDE / 2 * np.log(2 * np.pi), rtol=1e-5)
+
+
+def test_nothing_is_expected_of_classes_that_no_other_sensor_knows() -> None:
+    found = Transfer.fit(told(range(CLASSES), 8), [told(range(7), 8, seed=2)])
+    scores = found.expected.scores(MEANS)
+    assert np.isfinite(scores[:, :7]).all()
+    assert np.isneginf(scores[:, 7:]).all()
+    assert named(found, found.known, told(range(CLASSES), 20, seed=3)) > 0.95
+
+
+def test_tensors_hold_everything() -> None:
+    found = Transfer.fit(told(range(6), 8), [told(range(CLASSES), 8, seed=2)])
+    again = Transfer.from_tensors(found.to_tensors())
+    for one, other in ((found.known, again.known), (found.expected, again.expected)):
+        assert np.array_equal(one.scores(MEANS), other.scores(MEANS))
+    assert again.classes.tolist() == list(range(CLASSES))
+
+
+def test_slides_that_teach_nothing_are_refused() -> None:
+    with pytest.raises(TacpipeError, match="told 2 classes in common; 3 at least"):
+        Transfer.fit(told(range(4), 4), [told(range(2, 8), 4)])
+    with pytest.raises(TacpipeError, match="8 slides of 1 classes do not show"):
+        Transfer.fit(told([3], 8))
+    with pytest.raises(TacpipeError, match="4 slides of 4 classes do not show"):
+        Transfer.fit(told(range(4), 1))
+    with pytest.raises(TacpipeError, match=r"must be \(slide, 5\) and \(slide,\)"):
+        Transfer.fit(told(range(4), 4), [Told(np.zeros((4, 3)), np.arange(4))])
+    with pytest.raises(TacpipeError, match="not finite"):
+        Transfer.fit(Told(np.full((8, WIDE), np.nan), np.arange(8) % 4))

@@ -1,0 +1,93 @@
+"""Whether a sensor names materials that only another one was told of: where both feel the same, and only there.
+
+Slides of one material are alike in what is wrong with them, so certainty is counted by materials, not by slides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tacpipe.registry import load
+from tacpipe.simulation.slide import SENSORS, SPECTRA
+from tacpipe.tasks import material
+from tests.stages.conftest import FakeShard
+from tests.tasks.material.textures import Slide, dataset
+
+SEEDS, MATERIALS = (0, 1, 2), 12
+KNOWN, NEW = range(7), range(7, 10)  # which slides of each material and sensor are learned from, and which are named
+HELD = (range(1, 5), range(5, 9), range(9, 13))  # every material is held out once
+CHANCE, CHANCE_AMONG_HELD = 1 / MATERIALS, 1 / 4
+simulate, segment = load("simulate.material"), load("segment.slides")
+
+
+@cache
+def slide(seed: int, index: int, spectra: str) -> Slide:
+    """Slide ``index`` of the rig, cut as any other."""
+    asked = simulate.params(seed=seed, materials=MATERIALS, spectra=spectra, pac=False, arm_every=0)
+    recording = simulate(asked, index)
+    cut = segment(segment.params(), FakeShard(recording.streams, f"slide-{index}", recording.attributes))
+    return Slide(cut.streams, f"slide-{index}", {**recording.attributes, **cut.attributes})
+
+
+def slides(seed: int, numbers: range, spectra: str) -> list[Slide]:
+    """The slides with these numbers, of all materials and both sensors."""
+    each = len(SENSORS) * MATERIALS
+    return [slide(seed, index, spectra) for index in range(each * numbers.start, each * numbers.stop)]
+
+
+@cache
+def named(spectra: str) -> dict[str, NDArray[np.float64]]:
+    """How RoboSkin's slides of each material of each seed are named while it is not told of it: shares named rightly.
+
+    ``every``: of all materials, ``among``: of those held out; by what the BioTac was told. Both are (material,).
+    """
+    found: dict[str, list[float]] = {"every": [], "among": []}
+    for seed, held in product(SEEDS, HELD):
+        hold_out = "roboskin=" + ",".join(map(str, held))
+        asked = load("train.material").params(architecture="spectra", hold_out=hold_out, baselines=False)
+        files = material.train(dataclasses.asdict(asked), dataset(*slides(seed, KNOWN, spectra)), None, Path())
+        for number in held:
+            new = [one for one in slides(seed, NEW, spectra) if one.attributes["material"] == number]
+            zero: dict[str, Any] = json.loads(material.evaluate(files, dataset(*new)).files["metrics.json"])[
+                "zero_shot"
+            ]
+            assert zero["n"] == {"roboskin": len(NEW)}
+            found["every"].append(zero["accuracy"]["roboskin"])
+            found["among"].append(zero["among_held_out"]["accuracy"]["roboskin"])
+    return {name: np.array(shares) for name, shares in found.items()}
+
+
+def margin(shares: NDArray[np.float64], chance: float) -> float:
+    """Three standard errors of the mean over materials, of which a guesser names all slides rightly or none."""
+    return float(3 * max(shares.std(ddof=1), np.sqrt(chance * (1 - chance))) / np.sqrt(len(shares)))
+
+
+def test_materials_told_to_one_sensor_are_named_by_the_other_three_times_as_often_as_by_chance() -> None:
+    shares = named("shared")
+    assert shares["every"].mean() >= 3 * CHANCE
+    assert shares["every"].mean() - margin(shares["every"], CHANCE) > CHANCE
+    assert shares["among"].mean() - margin(shares["among"], CHANCE_AMONG_HELD) > CHANCE_AMONG_HELD
+
+
+def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> None:
+    shares = named("independent")
+    assert abs(shares["every"].mean() - CHANCE) <= margin(shares["every"], CHANCE)
+    assert abs(shares["among"].mean() - CHANCE_AMONG_HELD) <= margin(shares["among"], CHANCE_AMONG_HELD)
+
+
+@pytest.mark.parametrize("spectra", SPECTRA)
+def test_each_sensor_names_what_it_was_told_whatever_the_other_feels(spectra: str) -> None:
+    asked = load("train.material").params(architecture="spectra", baselines=False)
+    files = material.train(dataclasses.asdict(asked), dataset(*slides(0, KNOWN, spectra)), None, Path())
+    metrics = json.loads(material.evaluate(files, dataset(*slides(0, NEW, spectra))).files["metrics.json"])
+    assert metrics["model"]["accuracy"]["biotac"] >= 0.95
+    assert metrics["model"]["accuracy"]["roboskin"] >= 0.8

@@ -1,0 +1,274 @@
+"""Models of the task from params to metrics, on small slides."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load as load_tensors
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.proportions import wilson
+from tacpipe.tasks import material
+from tacpipe.tasks.material import learning
+from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
+from tacpipe.training import loop
+from tests.tasks.material.textures import MATERIALS, dataset, judged, slide, slides, trained
+
+RAEC = {"architecture": "raec", "epochs": 3}
+
+
+def predictions(result: Any) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = result.recordings["predictions"].tables.to_pydict()
+    return found
+
+
+@pytest.mark.parametrize("changed", [{}, RAEC, {"architecture": "x-lstm"}, {**RAEC, "joint": False}])
+def test_every_unseen_slide_of_every_sensor_is_counted(tmp_path: Path, changed: dict[str, Any]) -> None:
+    metrics, result = judged(trained(tmp_path, **changed), slides(8, 3))
+    rows = predictions(result)
+    assert metrics["model"]["n"] == {"biotac": 12, "roboskin": 12}
+    assert metrics["counts"]["slides"] == {"biotac": 12, "roboskin": 12}
+    for predictor in ("model", "mean_level", "permuted_labels"):
+        for sensor in ("biotac", "roboskin"):
+            right = sum(
+                told == known
+                for told, known, felt in zip(rows[predictor], rows["material"], rows["sensor"], strict=True)
+                if felt == sensor
+            )
+            assert metrics[predictor]["correct"][sensor] == right
+            assert metrics[predictor]["accuracy"][sensor] == right / 12
+            low, high = metrics[predictor]["low"][sensor], metrics[predictor]["high"][sensor]
+            assert (low, high) == wilson(right, 12)
+    assert metrics["chance"]["accuracy"] == {"biotac": 0.25, "roboskin": 0.25}
+    assert "seen" not in metrics
+
+
+def test_the_strong_classifier_names_textures_that_it_can_tell_apart(tmp_path: Path) -> None:
+    metrics, _ = judged(trained(tmp_path), slides(8, 3))
+    assert metrics["model"]["accuracy"] == {"biotac": 1.0, "roboskin": 1.0}
+    assert metrics["permuted_labels"]["accuracy"]["biotac"] < 0.7
+
+
+def test_a_network_learns_textures_given_time(tmp_path: Path) -> None:
+    time = {"epochs": 40, "hidden": 16, "latents": 8, "align_from": 5, "learning_rate": 0.01, "scaling": "standard"}
+    metrics, _ = judged(trained(tmp_path, architecture="raec", **time), slides(8, 3))
+    assert metrics["model"]["low"]["biotac"] > 0.25
+
+
+def test_labels_dealt_out_anew_leave_nothing_to_learn(tmp_path: Path) -> None:
+    metrics, _ = judged(trained(tmp_path, labels="permuted"), slides(8, 6))
+    low, _ = wilson(metrics["model"]["correct"]["biotac"], metrics["model"]["n"]["biotac"])
+    assert low < 0.25
+
+
+def test_slides_that_the_model_has_seen_are_reported_apart(tmp_path: Path) -> None:
+    metrics, result = judged(trained(tmp_path), slides(5, 4))
+    assert metrics["model"]["n"]["biotac"] == 4
+    assert metrics["seen"]["model"]["n"]["biotac"] == 12
+    assert sum(predictions(result)["seen"]) == 24
+
+
+def test_the_confusions_add_up_to_the_unseen_slides(tmp_path: Path) -> None:
+    _, result = judged(trained(tmp_path), slides(5, 4))
+    lines = result.files["confusion.csv"].decode().splitlines()[1:]
+    assert sum(int(line.split(",")[-1]) for line in lines) == 8
+
+
+def test_dropping_the_last_batch_counts_whole_batches_only(tmp_path: Path) -> None:
+    metrics, _ = judged(trained(tmp_path, **RAEC, drop_last=True), slides(8, 3))
+    assert metrics["model"]["n"] == {"biotac": 8, "roboskin": 8}
+    assert metrics["model"]["correct"]["biotac"] == round(8 * metrics["model"]["accuracy"]["biotac"])
+
+
+def test_scores_and_latents_of_a_network_lie_beside_what_it_names(tmp_path: Path) -> None:
+    _, result = judged(trained(tmp_path, **RAEC), slides(8, 1))
+    rows = predictions(result)
+    scores = np.array([rows[f"score_{kind:02d}"] for kind in MATERIALS])
+    assert rows["model"] == [MATERIALS[i] for i in scores.argmax(axis=0)]
+    assert np.isfinite([rows[f"z{number:02d}"] for number in range(1, 7)]).all()
+
+
+def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
+    files = trained(tmp_path, **RAEC)
+    _, result = judged(files, slides(8, 1))
+    rows, found = predictions(result), material.load(files)
+    frames = np.column_stack(
+        [slide("biotac", 2, 8).table("slide").column(f"channel{number:02d}").to_numpy() for number in range(1, 6)]
+    )
+    assert found.predict(frames, "biotac").tolist() == [rows["model"][rows["recording"].index("biotac-m02-t008")]]
+    told = predictions(material.predict(files, slides(8, 1, material=None)))
+    assert told["material"] == rows["model"]
+
+
+@pytest.mark.parametrize("select", ["best", "last"])
+def test_both_the_best_and_the_last_weights_are_kept(tmp_path: Path, select: str) -> None:
+    files = trained(tmp_path, **{**RAEC, "epochs": 6}, select=select)
+    history = [json.loads(line) for line in files["history.jsonl"].splitlines()]
+    assert len(history) == 6
+    assert (LAST in files) == (select == "best")
+    config = json.loads(files[CONFIG])
+    best = max(history, key=lambda line: (sum(one["accuracy"] for one in line["val"].values()), line["epoch"]))
+    assert config["validation"]["epoch"] == dict.fromkeys(("biotac", "roboskin"), best["epoch"])
+    assert ("last_epoch" in judged(files, slides(8, 1))[0]) == (select == "best")
+
+
+@pytest.mark.parametrize("calls", [1, 40, 88])
+def test_a_joint_run_killed_at_any_epoch_ends_with_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    whole = trained(tmp_path / "whole", **{**RAEC, "epochs": 30})
+    real, left = learning.JointWork.loss, iter(range(calls))
+
+    def dies(*args: Any) -> Any:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(learning.JointWork, "loss", dies)
+        trained(tmp_path / "killed", **{**RAEC, "epochs": 30})
+    again = trained(tmp_path / "killed", **{**RAEC, "epochs": 30})
+    assert again[WEIGHTS] == whole[WEIGHTS]
+    assert again[LAST] == whole[LAST]
+    assert again["history.jsonl"] == whole["history.jsonl"]
+
+
+def test_mapping_to_a_known_space_leaves_the_known_sensor_as_it_was(tmp_path: Path) -> None:
+    known = trained(tmp_path / "known", **RAEC, joint=False)
+    mapped = trained(tmp_path / "mapped", **RAEC, known="roboskin", init=known, reconstruction_weight=0.01)
+    before, after = load_tensors(known[WEIGHTS]), load_tensors(mapped[WEIGHTS])
+    for name, value in before.items():
+        if name.startswith("roboskin."):
+            assert torch.equal(after[name], value)
+    assert torch.equal(after["biotac.classifier.weight"], before["roboskin.classifier.weight"])
+    assert not torch.equal(after["biotac.to_latents.weight"], before["biotac.to_latents.weight"])
+
+
+def test_materials_held_out_are_named_by_the_other_sensors_classifier_alone(tmp_path: Path) -> None:
+    metrics, _ = judged(trained(tmp_path, **RAEC, hold_out="roboskin=3,4"), slides(8, 3))
+    assert metrics["model"]["n"] == {"biotac": 12, "roboskin": 6}
+    zero = metrics["zero_shot"]
+    assert zero["n"] == {"roboskin": 6}
+    assert zero["chance"] == {"roboskin": 0.25}
+    assert zero["among_held_out"]["chance"] == {"roboskin": 0.5}
+    assert zero["among_held_out"]["n"] == {"roboskin": 6}
+
+
+def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(tmp_path: Path) -> None:
+    files = trained(tmp_path, **RAEC, pairing="permuted")
+    partners = {int(one): other for one, other in json.loads(files[CONFIG])["partners"].items()}
+    assert sorted(partners.values()) == list(MATERIALS)
+    _, result = judged(files, slides(8, 2))
+    rows, found = predictions(result), material.load(files)
+    latents = np.array([rows[f"z{number:02d}"] for number in range(1, 7)], np.float32).T
+    for sensor, partner in (("biotac", "roboskin"), ("roboskin", "biotac")):
+        at = [i for i, one in enumerate(rows["sensor"]) if one == sensor]
+        named = found.named(found.readers[partner].scores_of(latents[at]))  # type: ignore[union-attr]
+        back = {other: one for one, other in partners.items()} if sensor == "biotac" else partners
+        assert [rows["swapped"][i] for i in at] == [back[int(one)] for one in named]
+
+
+def test_one_sensor_alone_is_trained_where_only_it_is_asked_for(tmp_path: Path) -> None:
+    files = trained(tmp_path, **RAEC, sensors="roboskin")
+    assert list(json.loads(files[CONFIG])["sensors"]) == ["roboskin"]
+    assert judged(files, slides(8, 1, ("roboskin",)))[0]["model"]["n"] == {"roboskin": 4}
+
+
+def test_the_strong_classifier_needs_no_validation_slides_and_learns_from_those_there_are(tmp_path: Path) -> None:
+    alone = trained(tmp_path, validation=dataset())
+    beside = trained(tmp_path)
+    assert alone[WEIGHTS] != beside[WEIGHTS]
+    assert alone[WEIGHTS] == trained(tmp_path, use_validation=False)[WEIGHTS]
+
+
+def test_baselines_can_be_left_out(tmp_path: Path) -> None:
+    files = trained(tmp_path, **RAEC, baselines=False)
+    assert BASELINES not in files
+    assert "mean_level" not in judged(files, slides(8, 1))[0]
+
+
+def test_networks_are_trained_by_the_loop_that_all_tasks_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[Any] = []
+    real = loop.train
+
+    def noted(*args: Any, **kwargs: Any) -> Any:
+        called.append(args[2].epochs)
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(loop, "train", noted)
+    trained(tmp_path, **RAEC, baselines=False)
+    assert called == [3]
+
+
+def same_but(**attributes: Any) -> Any:
+    return dataset(*slides(0, 2).shards.values(), slide("roboskin", 1, 9, **attributes))
+
+
+@pytest.mark.parametrize(
+    "training, changed, sentence",
+    [
+        (slides(0, 2, ("biotac",), material=1), {}, "All training slides are of material 1"),
+        (same_but(material=None), {}, "roboskin-m01-t009 of the sensor roboskin has no material"),
+        (same_but(material="cork"), {}, "has material 'cork'; materials are whole numbers"),
+        (same_but(sensor=None), {}, "does not say which sensor felt it"),
+        (same_but(rate_hz=50.0), {}, "has 50 frames a second, not 100 as roboskin-m01-t000"),
+        (same_but(material=9), RAEC, "biotac has no training slide of material 9"),
+        (same_but(sensor="biotac"), {}, "has 60 channels, among them channel06, not the same 5"),
+    ],
+)
+def test_slides_that_cannot_be_learned_from_are_refused(
+    tmp_path: Path, training: Any, changed: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(TacpipeError, match=sentence):
+        trained(tmp_path, training, **changed)
+
+
+@pytest.mark.parametrize(
+    "changed, sentence",
+    [
+        ({"architecture": "cnn"}, "no architecture cnn; there are minirocket, raec, x-lstm"),
+        ({"labels": "none"}, "labels is 'none'"),
+        ({**RAEC, "select": "first"}, "select is 'first'"),
+        ({**RAEC, "known": "biotac"}, "needs both --known"),
+        ({**RAEC, "hold_out": "roboskin=9"}, "hold_out names roboskin=9"),
+        ({**RAEC, "hold_out": "roboskin=x"}, "must be like roboskin=17,18"),
+        ({"hold_out": "roboskin=3"}, "hold_out is for networks"),
+        ({"sensors": "digit"}, "No recording is of the sensor digit"),
+        ({**RAEC, "scaling": "cube"}, "no scaling 'cube'"),
+    ],
+)
+def test_params_that_make_no_sense_are_refused(tmp_path: Path, changed: dict[str, Any], sentence: str) -> None:
+    with pytest.raises((TacpipeError, UsageError), match=sentence):
+        trained(tmp_path, **changed)
+
+
+def test_networks_need_validation_slides(tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="No recording of biotac has the role val"):
+        trained(tmp_path, validation=dataset(), **RAEC)
+
+
+def test_recordings_of_an_unknown_layout_are_refused_when_judged(tmp_path: Path) -> None:
+    files = trained(tmp_path)
+    with pytest.raises(TacpipeError, match="does not know the sensor digit; it was trained on biotac, roboskin"):
+        material.evaluate(files, dataset(slide("biotac", 1, 8, sensor="digit")))
+    with pytest.raises(TacpipeError, match="has 60 channels, among them channel06"):
+        material.evaluate(files, dataset(slide("roboskin", 1, 8, sensor="biotac")))
+    with pytest.raises(TacpipeError, match="of material 7, which the model was never taught"):
+        material.evaluate(files, dataset(slide("biotac", 7, 8)))
+    with pytest.raises(TacpipeError, match="of the task forward"):
+        material.load({CONFIG: b'{"task": "forward"}'})
+
+
+def test_slides_of_another_shape_are_refused_by_a_loaded_model(tmp_path: Path) -> None:
+    found = material.load(trained(tmp_path))
+    with pytest.raises(TacpipeError, match=r"Slides of biotac are \(slide, 40, 5\), not \(1, 40, 4\)"):
+        found.predict(np.zeros((40, 4)), "biotac")
+    with pytest.raises(UsageError, match="name the one that felt the slides"):
+        found.predict(np.zeros((40, 5)))
+    with pytest.raises(TacpipeError, match="not finite"):
+        found.predict(np.full((40, 5), np.nan), "biotac")
