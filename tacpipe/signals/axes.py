@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST = 0.5  # lag-1 autocorrelation that time must have; of 800 published RoboSkin slides the least has 0.92
+LEAST = 0.5  # lag-1 autocorrelation that time must have
 
 
 def lag_one(values: NDArray[Any], axis: int) -> float:
@@ -31,12 +31,12 @@ def lag_one(values: NDArray[Any], axis: int) -> float:
     return float(before @ after) / spread if spread > 0 else float("nan")
 
 
-def is_time(values: NDArray[Any], axis: int) -> bool:
-    """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is `LEAST` or more, and the largest.
+def is_time(values: NDArray[Any], axis: int, least: float = LEAST) -> bool:
+    """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``least`` or more, and the largest.
 
     False where nothing varies along it: such an array tells nothing about its axes.
     """
     wanted = axis % values.ndim
     along = [lag_one(values, place) for place in range(values.ndim)]
     others = [found for place, found in enumerate(along) if place != wanted and np.isfinite(found)]
-    return along[wanted] >= LEAST and all(along[wanted] > other for other in others)
+    return along[wanted] >= least and all(along[wanted] > other for other in others)

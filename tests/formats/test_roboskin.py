@@ -11,7 +11,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.roboskin import Params, discover, roboskin
-from tacpipe.signals.scrambling import scramble
+from tacpipe.signals.scrambling import scramble, unscramble
 from tacpipe.stage import Recording
 from tests.formats.slide_files import felt, write_roboskin
 
@@ -198,3 +198,18 @@ def test_each_published_slide_is_unscrambled_as_the_formula_says() -> None:
             np.testing.assert_array_equal(mixed, published)
     materials = [recording.attributes["material"] for recording in found.values()]
     assert np.bincount(np.array(materials, dtype=int)).tolist() == [0, *[40] * 20]
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (SAMPLE / "roboskin_slide_20_50").is_dir(), reason="the published recordings are not here")
+@pytest.mark.parametrize(
+    "order", [(0, 3, 1, 2), (0, 3, 2, 1), (0, 1, 3, 2)], ids=["frames first", "mixed", "taxels last"]
+)
+def test_published_slides_that_went_through_another_wrong_reshape_are_refused(
+    tmp_path: Path, order: tuple[int, ...]
+) -> None:
+    right = unscramble(np.load(SAMPLE / "roboskin_slide_20_50" / "icub_fold_0.npy")[:20])
+    write_roboskin(tmp_path, right.transpose(order).reshape(right.shape))
+    for files in discover(Params(), tmp_path).values():
+        with pytest.raises(TacpipeError, match="neither as it stands nor unscrambled is its last axis time"):
+            roboskin(Params(), files)

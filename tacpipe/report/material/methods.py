@@ -17,13 +17,34 @@ if TYPE_CHECKING:
 Tree = Mapping[str, Any]
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
-_ARCHITECTURES = {"minirocket": "MiniRocket", "x-lstm": "X-LSTM", "raec": "RAEC"}
-_NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience")  # in these, runs of one method may differ
-_ROCKETS = ("features", "use_validation", "labels", "quantities")  # all that has an effect on MiniRocket
+_ARCHITECTURES = {"minirocket": "MiniRocket", "x-lstm": "X-LSTM", "raec": "RAEC", "spectra": "spatial spectra"}
+_NO_METHOD = (
+    "seed",
+    "fold",
+    "sensors",
+    "baselines",
+    "patience",
+    "setting",
+    "quantities",
+)  # in these, runs of one method may differ
+_CLOSED = {  # all that has an effect on what is fitted in closed form
+    "minirocket": ("features", "use_validation", "labels"),
+    "spectra": ("speeds", "use_validation", "labels", "hold_out"),
+}
 _RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
 _PAIRS = ("alignment_weight", "align_from", "agreement")  # of no effect where sensors learn alone
-_PLAIN = {"pairing": ("random", "fixed"), "labels": ("true",), "reduce": ("",), "hold_out": ("",), "few": ("",)}
-_SAME = 0.92  # training slides in this ratio are as many: folds are not all of one size
+_PLAIN = {
+    "pairing": ("random", "fixed"),
+    "labels": ("true",),
+    "reduce": ("",),
+    "hold_out": ("",),
+    "few": ("",),
+    "elsewhere": (False,),
+}
+_USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be said
+_SAME = (
+    0.75  # training slides in this ratio are as many: folds differ in size, and some learn from validation slides too
+)
 
 
 @dataclass(frozen=True)
@@ -175,11 +196,13 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     the seed. Its name tells what keeps it from being plain, and the settings in which it differs from others that would
     have the same name.
     """
-    whole = _whole(runs)
+    places = [_place(run) for run in runs]
+    main = max(dict.fromkeys(places), key=places.count, default=("", "time"))
     few: list[float] = []
     found: dict[str, tuple[Tree, list[Run]]] = {}
-    for run in runs:
-        settings: Tree = {**_settings(run), **_few(run, whole, few)}
+    for run, place in zip(runs, places, strict=True):
+        whole = _whole([one for one, other in zip(runs, places, strict=True) if other == place])
+        settings: Tree = {**_settings(run), "elsewhere": place != main, **_few(run, whole, few)}
         found.setdefault(json.dumps(settings, sort_keys=True), (settings, []))[1].append(run)
     alike: dict[str, list[Tree]] = {}
     for settings, _ in found.values():
@@ -190,7 +213,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
         told = [
             f"{name} {value}" if not isinstance(value, bool) else name if value else f"no {name}"
             for name, value in sorted(settings.items())
-            if any(other.get(name) != value for other in others) and value != ""
+            if (name, value) not in _USUAL and any(other.get(name) != value for other in others) and value != ""
         ]
         made.append(Method(" · ".join([_base(settings), *told]), settings, tuple(told), tuple(same)))
     return sorted(made, key=lambda method: method.name)
@@ -201,18 +224,18 @@ def _settings(run: Run) -> dict[str, Any]:
     config, params, architecture = run.config, run.params, run.architecture
     known = str(params.get("known", ""))
     joint = bool(config.get("joint", architecture == "raec" and params.get("joint", False)))
-    rocket = architecture == "minirocket"
-    ratio = 100 if rocket else int(params.get("ratio", 100))
+    closed = _CLOSED.get(architecture)
+    ratio = 100 if closed else int(params.get("ratio", 100))
     idle = {
         *_NO_METHOD,
         "features",
         "use_validation",
+        "speeds",
         *((_RAECS + _PAIRS) if architecture == "x-lstm" else () if joint or known else _PAIRS),
     }
-    layouts = {one.get("layout", "time") for one in config.get("sensors", {}).values()}
-    split = config.get("split", "")
+    split, layout = _place(run)
     return {
-        **{name: value for name, value in params.items() if (name in _ROCKETS if rocket else name not in idle)},
+        **{name: value for name, value in params.items() if (name in closed if closed else name not in idle)},
         "architecture": architecture,
         "joint": joint,
         "known": bool(known),  # each run tells of the sensor that was mapped, so both are one method
@@ -220,11 +243,20 @@ def _settings(run: Run) -> dict[str, Any]:
         "labels": str(params.get("labels", "true")),
         "reduce": str(params.get("reduce", "")) if ratio < 100 else "",
         "ratio": ratio if params.get("reduce") else 100,
-        "hold_out": "" if rocket else str(params.get("hold_out", "")),
-        "layout": "authors" if "authors" in layouts else "time",
-        "split": str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split),
+        "hold_out": "" if architecture == "minirocket" else str(params.get("hold_out", "")),
+        "vibration": "vibration" in config.get("quantities", str(params.get("quantities", "")).split(",")),
+        "layout": layout,
+        "split": split,
         "simulated": run.simulated,
     }
+
+
+def _place(run: Run) -> tuple[str, str]:
+    """Return the split and the layout of a run's slides: what is told together of results is of one of each."""
+    split = run.config.get("split", "")
+    layouts = {one.get("layout", "time") for one in run.config.get("sensors", {}).values()}
+    told = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
+    return told, "authors" if "authors" in layouts else "time"
 
 
 def _whole(runs: Sequence[Run]) -> dict[str, int]:
@@ -270,6 +302,8 @@ def _base(settings: Tree, variants: bool = True) -> str:
     if not variants:
         return name
     parts = [name]
+    if settings["vibration"]:
+        parts.append("with vibration")
     if settings["pairing"] == "permuted":
         parts.append("permuted pairs")
     if settings["labels"] == "permuted":

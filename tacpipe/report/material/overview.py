@@ -49,6 +49,7 @@ def render(methods: Sequence[Method], slides: Sequence[Dataset]) -> str:
     said = headline.sentences(methods)
     told = f'<p class="headline">{"<br>".join(map(escape, said))}</p>' if said else ""
     caution = markup.note(wording.caution(simulated))
+    others = tables.elsewhere(methods)
     reduced, swaps, paired = reduction.tables(methods), tables.swaps(methods), tables.differences(methods)
     parts = [
         f"<h2>{'Materials by touch: ' if runs > 1 else ''}{escape(several)}{badge}</h2>",
@@ -56,6 +57,7 @@ def render(methods: Sequence[Method], slides: Sequence[Dataset]) -> str:
         markup.note(f"{_basis(methods)} {wording.caution(simulated)}"),
         *(["<h3>Which material it is</h3>", tables.accuracies(methods), markup.note(POOLED + printed.BASIS), caution]
           if plain else []),
+        *([others, caution] if others else []),
         *([paired, markup.note(PAIRED), caution] if paired else []),
         *([swaps, caution] if swaps else []),
         *(["<h3>Fewer slides of one sensor</h3>", reduced, caution] if reduced else []),

@@ -49,6 +49,30 @@ def accuracies(methods: Sequence[Method]) -> str:
     return markup.table("Table I in the paper's form: accuracy (%)", heads, rows, kinds)
 
 
+def elsewhere(methods: Sequence[Method]) -> str:
+    """Return accuracies on other splits and layouts than most results have; empty where there are none."""
+    others = [one for one in methods if not one.plain and one.differs_only("elsewhere")]
+    sensors = sensors_of(others)
+    rows = []
+    for method in others:
+        told = [method.of(sensor) for sensor in sensors]
+        cells = [
+            cell
+            for sensor, runs in zip(sensors, told, strict=True)
+            for cell in (
+                wording.share(accuracy(runs, sensor)),
+                wording.share(accuracy(runs, sensor, LEVEL)),
+                markup.decimals(skill(runs, sensor)).replace("+nan", NONE),
+            )
+        ]
+        rows.append([method.name, *cells, str(len(method.runs))])
+    if not rows:
+        return ""
+    parts = ("", "mean level", "skill")
+    heads = ["", *(f"{shown(sensor)} {part}".strip() for sensor in sensors for part in parts), "runs"]
+    return markup.table("Other splits and layouts: accuracy (%)", heads, rows)
+
+
 def swaps(methods: Sequence[Method]) -> str:
     """Return Table II: accuracy before and after classifiers are exchanged; empty where none were."""
     held = [one for one in methods if any(SWAPPED in run.predictions.said for run in one.runs)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,23 +22,27 @@ NOTE = (
 )
 
 
+@dataclass(frozen=True)
+class Untold:
+    """Runs that differ in seed, fold, and in which materials they held out of a sensor's labels."""
+
+    name: str
+    kind: str
+    main: bool  # whether nothing else sets them apart
+    sensor: str
+    trees: tuple[Tree, ...]  # what metrics tell of the held-out materials, one a run
+    materials: int  # that a run held out
+
+
 def table(methods: Sequence[Method]) -> str:
     """Return how often held-out materials are named right across sensors; empty where none were held out."""
     rows = []
-    for method in methods:
-        trees = [run.metrics[ALL] for run in method.runs if ALL in run.metrics]
-        for sensor in dict.fromkeys(name for tree in trees for name in tree["accuracy"]):
-            held = [tree for tree in trees if sensor in tree["accuracy"]]
-            rows.append([f"{method.name}, out of all", shown(sensor), *_cells(held, sensor, _held_out(method, sensor))])
-            among = [tree[AMONG] for tree in held if AMONG in tree]
-            if among:
-                rows.append(
-                    [
-                        f"{method.name}, out of those held out",
-                        shown(sensor),
-                        *_cells(among, sensor, _held_out(method, sensor)),
-                    ]
-                )
+    for one in untold(methods):
+        rows.append([f"{one.name}, out of all", shown(one.sensor), *_cells(one.trees, one.sensor, one.materials)])
+        among = [tree[AMONG] for tree in one.trees if AMONG in tree]
+        if among:
+            cells = _cells(among, one.sensor, one.materials)
+            rows.append([f"{one.name}, out of those held out", shown(one.sensor), *cells])
     if not rows:
         return ""
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
@@ -49,24 +54,39 @@ def table(methods: Sequence[Method]) -> str:
 def sentences(methods: Sequence[Method]) -> list[str]:
     """Return whether one sensor's classifier names what the other never learned, a sentence a method and sensor."""
     told = []
-    for method in methods:
-        trees = [run.metrics[ALL] for run in method.runs if ALL in run.metrics]
-        if not method.differs_only("hold_out"):
+    for one in untold(methods):
+        correct, judged, low, high = _counts(one.trees, one.sensor, one.materials)
+        if not judged or not one.main:
             continue
-        for sensor in dict.fromkeys(name for tree in trees for name in tree["accuracy"]):
-            held = [tree for tree in trees if sensor in tree["accuracy"]]
-            correct, judged, low, high = _counts(held, sensor, _held_out(method, sensor))
-            if not judged:
-                continue
-            chance = _at(held[0], "chance", sensor)
-            unsure = "which cannot be told from chance"
-            word = "above chance" if low > chance else "below chance" if high < chance else unsure
-            told.append(
-                f"Of {shown(sensor)} slides of materials that it never learned, the other sensor's classifier names "
-                f"{wording.percent(correct / judged)} % right ({method.kind}, {correct} of {judged}; 95 % interval "
-                f"{wording.percent(low)} to {wording.percent(high)} %), {word} ({wording.percent(chance)} %)."
-            )
+        chance = _at(one.trees[0], "chance", one.sensor)
+        unsure = "which cannot be told from chance"
+        word = "above chance" if low > chance else "below chance" if high < chance else unsure
+        told.append(
+            f"Of {shown(one.sensor)} slides of materials that it never learned, the other sensor's classifier names "
+            f"{wording.percent(correct / judged)} % right ({one.kind}, {correct} of {judged}; 95 % interval "
+            f"{wording.percent(low)} to {wording.percent(high)} %), {word} ({wording.percent(chance)} %)."
+        )
     return told
+
+
+def untold(methods: Sequence[Method]) -> list[Untold]:
+    """Return the runs that held materials out, those together that differ in which, by sensor."""
+    alike: dict[str, list[Method]] = {}
+    for method in methods:
+        if any(ALL in run.metrics for run in method.runs):
+            alike.setdefault(method.key_without("hold_out"), []).append(method)
+    found = []
+    for same in alike.values():
+        runs = [(run.metrics[ALL], method) for method in same for run in method.runs if ALL in run.metrics]
+        for sensor in dict.fromkeys(name for tree, _ in runs for name in tree["accuracy"]):
+            held = [(tree, method) for tree, method in runs if sensor in tree["accuracy"]]
+            first = held[0][1]
+            sets = {str(method.settings["hold_out"]) for _, method in held}
+            name = first.name if len(sets) == 1 else f"{first.kind} · {len(sets)} sets of materials in turn"
+            trees = tuple(tree for tree, _ in held)
+            main = first.differs_only("hold_out")
+            found.append(Untold(name, first.kind, main, sensor, trees, _held_out(first, sensor)))
+    return found
 
 
 def _counts(trees: Sequence[Tree], sensor: str, materials: int) -> tuple[int, int, float, float]:

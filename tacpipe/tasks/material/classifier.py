@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,9 +21,13 @@ from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.models.spatial_spectrum import Bands
 from tacpipe.models.strong import Strong
 from tacpipe.models.transfer import Transfer
+from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.learning import JUDGED, Network
 from tacpipe.tasks.material.slides import Layout, Slides, difference
 from tacpipe.training.scaling import Affine
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
 
 TASK = "material"
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
@@ -163,6 +167,20 @@ class Classifier:
                 f"Train one on recordings of it."
             )
         return self.layouts[sensor]
+
+    def read(self, recordings: Dataset, *, labelled: bool = False) -> dict[str, Slides]:
+        """Return the slides of a dataset by sensor, as this model reads them.
+
+        Those of other sensors are left out where the model was trained for named ones, and refused where it was trained
+        for all that there were. Raises `TacpipeError` for what `tacpipe.tasks.material.slides.read` refuses.
+        """
+        only = tuple(self.layouts) if self.config["params"]["sensors"] else ()
+        there = {shard.attributes.get("sensor") for shard in recordings.shards.values()}
+        only = tuple(name for name in only if name in there) or only
+        found = slides_of.read(recordings, only=only, quantities=self.quantities, labelled=labelled)
+        for one in found.values():
+            self.check(one)
+        return found
 
     def check(self, slides: Slides) -> None:
         """Raise `TacpipeError` where slides are of another layout than those that the model was trained on."""

@@ -54,7 +54,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known = set(classifier.config["trained_on"].values())
     judged = {
         sensor: _judged(classifier, slides, known)
-        for sensor, slides in slides_of.read(recordings, quantities=classifier.quantities, labelled=True).items()
+        for sensor, slides in classifier.read(recordings, labelled=True).items()
     }
     if not judged:
         raise TacpipeError(
@@ -84,7 +84,6 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
 def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
     """Return what all predictors say of the slides of one sensor."""
-    classifier.check(slides)
     sensor = slides.layout.sensor
     foreign = [index for index, one in enumerate(slides.materials) if int(one) not in classifier.classes]
     if foreign:

@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.stage import Recording, Result
-from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.judging import PREDICTIONS, latent_columns, score_columns
 
@@ -27,8 +26,7 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
     names: list[str] = []
     sensors: list[str] = []
     told = []
-    for sensor, slides in slides_of.read(recordings, quantities=classifier.quantities).items():
-        classifier.check(slides)
+    for sensor, slides in classifier.read(recordings).items():
         names += slides.names
         sensors += [sensor] * len(slides)
         told.append(classifier.readers[sensor].tell(slides.frames))

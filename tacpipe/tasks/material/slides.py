@@ -23,21 +23,23 @@ UNKNOWN = -1  # stands where a slide has no material
 
 @dataclass(frozen=True)
 class Layout:
-    """What a sensor's slides look like: which channels, how many frames, how many a second."""
+    """What a sensor's slides look like: which channels, how many frames, how many a second, and how they are arranged."""
 
     sensor: str
     channels: tuple[str, ...]
     frames: int
     rate_hz: float
+    layout: str = "time"  # frames in the order of time; authors: as published, in another one
 
     def told(self) -> dict[str, Any]:
         """Return what `from_told` reads, as JSON holds it."""
-        return {"channels": list(self.channels), "frames": self.frames, "rate_hz": self.rate_hz}
+        named = {"frames": self.frames, "rate_hz": self.rate_hz, "layout": self.layout}
+        return {"channels": list(self.channels), **named}
 
     @classmethod
     def from_told(cls, sensor: str, told: dict[str, Any]) -> Layout:
         """Return the layout that `told` wrote."""
-        return cls(sensor, tuple(told["channels"]), int(told["frames"]), float(told["rate_hz"]))
+        return cls(sensor, tuple(told["channels"]), int(told["frames"]), float(told["rate_hz"]), told["layout"])
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def _frames(shard: Shard, sensor: str, quantities: Sequence[str]) -> tuple[Layou
             f"Exclude the recording or segment it again."
         )
     rate_hz = float(shard.attributes.get("rate_hz") or 0.0)
-    return Layout(sensor, tuple(channels), len(values), rate_hz), values
+    return Layout(sensor, tuple(channels), len(values), rate_hz, str(shard.attributes.get("layout") or "time")), values
 
 
 def _columns(table: pa.Table, channels: Sequence[str]) -> NDArray[np.float32]:
@@ -161,6 +163,8 @@ def difference(wanted: Layout, found: Layout) -> str:
         return f"has {len(found.channels)} channels{more}, not the same {len(wanted.channels)}"
     if found.frames != wanted.frames:
         return f"has {found.frames} frames, not {wanted.frames}"
+    if found.layout != wanted.layout:
+        return f"has the layout {found.layout}, not {wanted.layout}"
     return f"has {found.rate_hz:g} frames a second, not {wanted.rate_hz:g}"
 
 

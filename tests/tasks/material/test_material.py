@@ -177,6 +177,9 @@ def test_one_sensor_alone_is_trained_where_only_it_is_asked_for(tmp_path: Path) 
     files = trained(tmp_path, **RAEC, sensors="roboskin")
     assert list(json.loads(files[CONFIG])["sensors"]) == ["roboskin"]
     assert judged(files, slides(8, 1, ("roboskin",)))[0]["model"]["n"] == {"roboskin": 4}
+    assert judged(files, slides(8, 1))[0]["model"]["n"] == {"roboskin": 4}
+    with pytest.raises(TacpipeError, match="No recording is of the sensor roboskin; there are biotac"):
+        judged(files, slides(8, 1, ("biotac",)))
 
 
 def test_the_strong_classifier_needs_no_validation_slides_and_learns_from_those_there_are(tmp_path: Path) -> None:
@@ -218,6 +221,7 @@ def same_but(**attributes: Any) -> Any:
         (same_but(sensor=None), {}, "does not say which sensor felt it"),
         (same_but(rate_hz=50.0), {}, "has 50 frames a second, not 100 as roboskin-m01-t000"),
         (same_but(material=9), RAEC, "biotac has no training slide of material 9"),
+        (same_but(layout="authors"), {}, "has the layout authors, not time"),
         (same_but(sensor="biotac"), {}, "has 60 channels, among them channel06, not the same 5"),
     ],
 )
