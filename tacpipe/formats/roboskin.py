@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
 PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
 LARGEST = 255.0  # readings stem from eight bits, compensated for temperature
-ALONG_TIME = 0.85  # correlation of neighbours along time: 0.92 or more in all published slides; taxels side by side reach 0.82
+ALONG_TIME = 0.85  # correlation of neighbours: of published slides 0.92 or more along time, 0.82 or less otherwise
 LAYOUTS = ("time", "authors")
 MADE = "from nominal rate"
 
@@ -183,8 +183,8 @@ def _felt(path: Path, place: int) -> NDArray[np.float32]:
             return felt
     raise TacpipeError(
         f"{path}, slide {place}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
-        f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {ALONG_TIME} or more, "
-        f"and more than along other axes. Check how the array was made."
+        f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {ALONG_TIME} or "
+        f"more, and more than along other axes. Check how the array was made."
     )
 
 

@@ -209,7 +209,8 @@ def test_published_slides_that_went_through_another_wrong_reshape_are_refused(
     tmp_path: Path, order: tuple[int, ...]
 ) -> None:
     right = unscramble(np.load(SAMPLE / "roboskin_slide_20_50" / "icub_fold_0.npy")[:20])
-    write_roboskin(tmp_path, right.transpose(order).reshape(right.shape))
+    path = write_roboskin(tmp_path, right)
+    np.save(path, right.transpose(order).reshape(right.shape))
     for files in discover(Params(), tmp_path).values():
         with pytest.raises(TacpipeError, match="neither as it stands nor unscrambled is its last axis time"):
             roboskin(Params(), files)
