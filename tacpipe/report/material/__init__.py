@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.report import plain
-from tacpipe.report.material import methods, overview, profiles
+from tacpipe.report.material import grouping, overview, profiles
 from tacpipe.report.material.methods import Run
 
 if TYPE_CHECKING:
@@ -28,6 +28,6 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
     runs = [run for run in runs if run.sensors]
     compared = {id(run.dataset) for run in runs}
     bare = [one for one in results if id(one) not in compared]
-    parts = [overview.render(methods.grouped(runs), others)] if runs else []
+    parts = [overview.render(grouping.grouped(runs), others)] if runs else []
     parts += [plain.render(one, number, len(bare)) for number, one in enumerate(bare, 1)]
     return "".join(parts)

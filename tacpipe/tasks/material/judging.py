@@ -95,7 +95,8 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
     predicted = {MODEL: classifier.named(told.scores)}
     if sensor in classifier.last:
         predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].tell(slides.frames).scores)
-    if classifier.config.get("joint") and told.latents is not None:
+    mapped = bool(classifier.config["params"]["known"])  # all have the known sensor's classifier already
+    if classifier.config.get("joint") and told.latents is not None and not mapped:
         predicted[SWAPPED] = _exchanged(classifier, sensor, told.latents)
     for name, by_sensor in classifier.baselines.items():
         frames = slides.frames

@@ -145,6 +145,10 @@ def _networks(
         _same_space(start, params["known"], config, known)
         shapes[params["known"]] = Shape(**start.config["shapes"][params["known"]])
         scalings[params["known"]] = _reader(start, params["known"]).scaling
+        before = start.config["trained_on"].items()
+        now = set(config["trained_on"].values())
+        known_before = {f"{name} of the model before": digest for name, digest in before if digest not in now}
+        config["trained_on"] = {**known_before, **config["trained_on"]}
     felt = [
         {
             name: _felt(config, some, scalings[name], held, device, place)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from scipy import stats
 
-from tacpipe.report.material import comparison, methods
+from tacpipe.report.material import comparison, grouping
 from tacpipe.report.material.methods import Run
 from tests.report.material.material_fakes import result
 
@@ -94,7 +94,7 @@ def test_joint_learning_is_compared_with_the_same_network_alone_the_control_and_
         result("minirocket", wrong=BOTH),
         result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, 64)),
     ]
-    found = comparison.pairs(methods.grouped([Run.read(one) for one in given]))
+    found = comparison.pairs(grouping.grouped([Run.read(one) for one in given]))
     assert [pair.name for pair in found] == [
         "RAEC joint · decoder D1 − RAEC independent · decoder D1",
         "RAEC joint · decoder D1 − RAEC joint · permuted pairs",

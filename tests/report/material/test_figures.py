@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.report.material import confusion, curves, figures, latents, methods, profiles
+from tacpipe.report.material import confusion, curves, figures, grouping, latents, profiles
 from tacpipe.report.material.figures import Band, Cloud
 from tacpipe.report.material.methods import Method, Run
 from tests.report.material import material_fakes
@@ -19,7 +19,7 @@ PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
 
 
 def grouped(*results: Any) -> list[Method]:
-    return methods.grouped([Run.read(one) for one in results])
+    return grouping.grouped([Run.read(one) for one in results])
 
 
 def test_figures_are_drawn_in_the_pages_colours_and_carry_nothing_from_outside() -> None:

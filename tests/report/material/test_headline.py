@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.report.material import headline, methods
+from tacpipe.report.material import grouping, headline
 from tacpipe.report.material.methods import Method, Run
 from tests.report.material.material_fakes import result
 
@@ -15,7 +15,7 @@ PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
 
 
 def grouped(*results: Any) -> list[Method]:
-    return methods.grouped([Run.read(one) for one in results])
+    return grouping.grouped([Run.read(one) for one in results])
 
 
 def joint(swapped: dict[str, int], alignment: float, **params: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.report.material import methods
+from tacpipe.report.material import grouping
 from tacpipe.report.material.methods import Method, Run
 from tests.report.material.material_fakes import result
 
@@ -15,7 +15,7 @@ BOTH = {"biotac": 1, "roboskin": 2}
 
 
 def grouped(*results: Any) -> dict[str, Method]:
-    return {one.name: one for one in methods.grouped([Run.read(each) for each in results])}
+    return {one.name: one for one in grouping.grouped([Run.read(each) for each in results])}
 
 
 def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> None:

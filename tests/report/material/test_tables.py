@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tacpipe.proportions import wilson
-from tacpipe.report.material import methods, reduction, tables, zero_shot
+from tacpipe.report.material import grouping, reduction, tables, zero_shot
 from tacpipe.report.material.methods import Method, Run
 from tests.report.elements import cells
 from tests.report.material.material_fakes import result
@@ -15,7 +15,7 @@ LEVEL = {"mean_level": {"biotac": 4, "roboskin": 8}, "permuted_labels": {"biotac
 
 
 def grouped(*results: Any) -> list[Method]:
-    return methods.grouped([Run.read(one) for one in results])
+    return grouping.grouped([Run.read(one) for one in results])
 
 
 def test_table_1_holds_the_papers_numbers_beside_ours_and_says_what_was_not_run() -> None:

@@ -147,6 +147,15 @@ def test_mapping_to_a_known_space_leaves_the_known_sensor_as_it_was(tmp_path: Pa
             assert torch.equal(after[name], value)
     assert torch.equal(after["biotac.classifier.weight"], before["roboskin.classifier.weight"])
     assert not torch.equal(after["biotac.to_latents.weight"], before["biotac.to_latents.weight"])
+    assert "swapped" not in judged(mapped, slides(8, 1))[0]
+
+
+def test_slides_of_the_model_that_a_mapping_began_with_count_as_seen(tmp_path: Path) -> None:
+    known = trained(tmp_path / "known", slides(20, 6), **RAEC, joint=False)
+    mapped = trained(tmp_path / "mapped", **RAEC, known="roboskin", init=known)
+    metrics, _ = judged(mapped, slides(20, 2))
+    assert metrics["seen"]["counts"]["slides"] == {"biotac": 8, "roboskin": 8}
+    assert metrics["counts"]["slides"] == {"biotac": 0, "roboskin": 0}
 
 
 def test_materials_held_out_are_named_by_the_other_sensors_classifier_alone(tmp_path: Path) -> None:
