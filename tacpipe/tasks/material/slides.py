@@ -84,6 +84,7 @@ def read(
     slides of one sensor differ in channels, frames or rate.
     """
     found: dict[str, list[tuple[Shard, Layout, NDArray[np.float32]]]] = {}
+    there: set[str] = set()
     for name, shard in sorted(recordings.shards.items()):
         sensor = shard.attributes.get("sensor")
         if not isinstance(sensor, str):
@@ -91,14 +92,14 @@ def read(
                 f"Recording {name} does not say which sensor felt it; set it with `tacpipe label RECORDINGS {name} "
                 f"--set sensor=biotac`, or what it is."
             )
+        there.add(sensor)
         if only and sensor not in only:
             continue
         found.setdefault(sensor, []).append((shard, *_frames(shard, sensor, quantities)))
     missing = sorted(set(only) - set(found))
     if missing:
-        raise TacpipeError(
-            f"No recording is of the sensor {missing[0]}; there are {', '.join(sorted(found)) or 'none'}."
-        )
+        told = ", ".join(sorted(there)) or "none"
+        raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {told}. Give others.")
     return {sensor: _bundle(several, labelled) for sensor, several in sorted(found.items())}
 
 
