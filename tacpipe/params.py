@@ -156,8 +156,9 @@ def _from_file(path: Path, block: str, *, required: bool) -> dict[str, Any]:
 
 def _from_preset(name: str, stage: Stage, preset: str) -> dict[str, Any]:
     presets = getattr(stage.params, "PRESETS", {})
-    if preset not in PRESETS:
-        raise UsageError(f"There is no preset {preset}; there are {', '.join(PRESETS)}.")
+    known = dict.fromkeys([*PRESETS, *presets])
+    if preset not in known:
+        raise UsageError(f"There is no preset {preset}; there are {', '.join(known)}.")
     return {
         key: check(stage, key, value, f"preset {preset} of {name}") for key, value in presets.get(preset, {}).items()
     }

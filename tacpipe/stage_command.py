@@ -24,13 +24,17 @@ _PLACES = {  # what examples call the datasets
     "segment": "data/segments",
     "split": "data/split",
     "compress": "data/latents",
+    "segment.slides": "data/slides",
     "train": "models/forward",
+    "train.material": "models/material",
     "evaluate": "results/forward",
     "report": "report.html",
 }
 _BEFORE = {
     "synchronize": "recordings",
     "segment": "synced",
+    "segment.slides": "recordings",
+    "train.material": "slides",
     "split": "segments",
     "compress": "segments",
     "train": "latents",
@@ -166,7 +170,11 @@ def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
         text = f"{helps.get(name, '')} [{default}]".strip()
         found.append(_parameter(name, annotation, typer.Option(None, *flags, help=text, show_default=False)))
     more: list[tuple[str, Any, Any]] = [
-        ("preset", str | None, typer.Option(None, "--preset", help="paper or quick; without one, the best we know.")),
+        (
+            "preset",
+            str | None,
+            typer.Option(None, "--preset", help="paper, quick, or a stage's own; without one, the best we know."),
+        ),
         (
             "params_file",
             Path | None,
@@ -214,7 +222,7 @@ def example(name: str, stage: Stage) -> str:
     kinds = set(stage.arguments.values())
     words += ["published/recordings"] if "Files" in kinds else []
     words += ["models/forward"] if stage.reads_model else []
-    words += [f"data/{_BEFORE.get(group, 'recordings')}"] if kinds & {"Shard", "Dataset"} else []
+    words += [f"data/{_BEFORE.get(name, _BEFORE.get(group, 'recordings'))}"] if kinds & {"Shard", "Dataset"} else []
     words += ["results/forward"] if "Datasets" in kinds else []
     words += ["--split", "data/split"] if stage.needs_split or stage.reads_model else []
-    return " ".join([*words, "-o", _PLACES.get(group, "data/out")])
+    return " ".join([*words, "-o", _PLACES.get(name, _PLACES.get(group, "data/out"))])

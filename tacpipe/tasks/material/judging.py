@@ -108,7 +108,7 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
     counted = np.ones(len(slides), bool)
     if classifier.config["params"]["drop_last"]:
         batch = classifier.config["params"]["batch"]
-        counted[len(slides) // batch * batch :] = False
+        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
     found = Judged(
         slides,
         np.array([digest in known for digest in slides.digests], bool),

@@ -203,7 +203,9 @@ class JointWork:
     def _judged(self, network: nn.Module, felt: Felt) -> dict[str, float]:
         labelled = (felt.classes != NONE).nonzero()[:, 0]
         if self.drop_last:
-            labelled = labelled[: len(labelled) // self.pairs.batch * self.pairs.batch]
+            labelled = labelled[
+                : len(labelled) // self.pairs.batch * self.pairs.batch or None
+            ]  # fewer than one count all
         right = loss = again = 0.0
         for first in range(0, len(labelled), JUDGED):
             some = labelled[first : first + JUDGED]

@@ -11,6 +11,8 @@ import pytest
 import torch
 from safetensors.torch import load as load_tensors
 
+from tacpipe import params as params_of
+from tacpipe import registry
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.proportions import wilson
 from tacpipe.tasks import material
@@ -285,3 +287,22 @@ def test_slides_of_another_shape_are_refused_by_a_loaded_model(tmp_path: Path) -
         found.predict(np.zeros((40, 5)))
     with pytest.raises(TacpipeError, match="not finite"):
         found.predict(np.full((40, 5), np.nan), "biotac")
+
+
+def test_the_published_code_with_its_quirks_is_a_preset() -> None:
+    stage = registry.load("train.material")
+    quirks = params_of.build("train.material", stage, preset="authors")
+    assert (quirks.pairing, quirks.shuffle, quirks.drop_last, quirks.unpool) == ("fixed", False, True, "last")
+    assert (quirks.architecture, quirks.select, quirks.scaling, quirks.epochs) == ("raec", "last", "none", 2000)
+    with pytest.raises(UsageError, match="no preset huge; there are paper, quick, authors"):
+        params_of.build("train.material", stage, preset="huge")
+
+
+def test_the_published_quirks_train_and_are_judged_on_whole_batches(tmp_path: Path) -> None:
+    quirks = {"pairing": "fixed", "shuffle": False, "drop_last": True, "unpool": "last", "select": "last", "seed": 1}
+    files = trained(tmp_path, **RAEC, **quirks)
+    metrics, _ = judged(files, slides(8, 3))
+    assert metrics["model"]["n"] == {"biotac": 8, "roboskin": 8}
+    assert json.loads(files[CONFIG])["shapes"]["roboskin"]["unpool"] == "last"
+    few, _ = judged(trained(tmp_path / "few", validation=slides(6, 1), **RAEC, **quirks), slides(8, 1))
+    assert few["model"]["n"] == {"biotac": 4, "roboskin": 4}
