@@ -7,13 +7,12 @@ stamped by its own clock reading. All rows of the finger's file end in a comma, 
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.folders import Params
+from tacpipe.formats.folders import Params, walk
 from tacpipe.stage import Files, Recording, stage
 
 if TYPE_CHECKING:
@@ -40,13 +39,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     if not source.is_dir():
         raise TacpipeError(f"{source} is no folder; give the folder that holds the slides, mat1_1_bio.csv and so on.")
     found: dict[str, dict[str, Path]] = {}
-    seen: set[str] = set()  # links are followed, circles of them are not
-    for place, below, names in os.walk(source, followlinks=True):
-        real = os.path.realpath(place)
-        if real in seen:
-            below.clear()
-            continue
-        seen.add(real)
+    for place, _, names in walk(source):
         for name in names:
             match = NAME.fullmatch(name)
             if match is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,13 +32,7 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
     wanted = set(names)
     holds: dict[Path, set[str]] = {}  # which of the wanted files each trial has
-    seen: set[str] = set()  # links are followed, circles of them are not
-    for place, folders_below, files in os.walk(source, followlinks=True):
-        real = os.path.realpath(place)
-        if real in seen:
-            folders_below.clear()
-            continue
-        seen.add(real)
+    for place, _, files in walk(source):
         there = wanted.intersection(files)
         if there or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
             holds[Path(place)] = there
@@ -57,6 +51,21 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
             unique = name if len(same) == 1 else _valid("-".join([*folder.relative_to(source).parts[:-1], name]))
             found[unique] = {file: folder / file for file in names if file in holds[folder]}
     return dict(sorted(found.items()))
+
+
+def walk(source: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yield each folder below ``source`` and ``source``, with the folders and files in it, as `os.walk` does.
+
+    Links are followed, circles of them are not. Folders that are taken out of the list are passed over.
+    """
+    seen: set[str] = set()
+    for place, below, files in os.walk(source, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            below.clear()
+            continue
+        seen.add(real)
+        yield place, below, files
 
 
 def require(files: Files, names: Sequence[str]) -> str:

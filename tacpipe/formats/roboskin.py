@@ -8,13 +8,13 @@ has is told from its values. The rate is not published.
 from __future__ import annotations
 
 import ast
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.folders import walk
 from tacpipe.stage import Attribute, Files, Recording, stage
 
 if TYPE_CHECKING:
@@ -103,13 +103,7 @@ def roboskin(params: Params, files: Files) -> Recording:
 def _found(source: Path) -> list[tuple[str, Path]]:
     """Return the blocks below a folder: name within the recordings' names, path."""
     found = []
-    seen: set[str] = set()  # links are followed, circles of them are not
-    for place, below, names in os.walk(source, followlinks=True):
-        real = os.path.realpath(place)
-        if real in seen:
-            below.clear()
-            continue
-        seen.add(real)
+    for place, below, names in walk(source):
         for name in sorted(names):
             match = BLOCK.fullmatch(name)
             if match is not None:

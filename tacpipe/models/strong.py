@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tacpipe.models.minirocket import Rocket
 from tacpipe.models.readout import Readout
+from tacpipe.models.tensors import under
 
 Floats = NDArray[np.floating[Any]]
 Labels = NDArray[np.integer[Any]]
@@ -77,12 +78,10 @@ class Strong:
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Strong:
         """Return the classifier that `to_tensors` described."""
-
-        def part(name: str) -> dict[str, NDArray[Any]]:
-            return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
-
         return cls(
-            Rocket.from_tensors(part("patterns")), Readout.from_tensors(part("readout")), float(tensors["share"][0])
+            Rocket.from_tensors(under("patterns.", tensors)),
+            Readout.from_tensors(under("readout.", tensors)),
+            float(tensors["share"][0]),
         )
 
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
+from tacpipe.models.tensors import under
 from tacpipe.progress import bar
 from tacpipe.training import checkpoint
 
@@ -157,10 +158,10 @@ class _Run:
         if found is None:
             return
         tensors, state = found
-        self.model.load_state_dict(_under("model.", tensors))
-        self.best = _under("best.", tensors)
+        self.model.load_state_dict(under("model.", tensors))
+        self.best = under("best.", tensors)
         slots: dict[int, dict[str, Tensor]] = {}
-        for name, value in _under("adam.", tensors).items():
+        for name, value in under("adam.", tensors).items():
             slot, held = name.split(".", 1)
             slots.setdefault(int(slot), {})[held] = value
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": slots})
@@ -248,8 +249,3 @@ def _pieces(indices: Tensor, batch: int) -> Iterator[Tensor]:
     """Yield the indices in pieces of ``batch``, the last maybe shorter."""
     for first in range(0, len(indices), batch):
         yield indices[first : first + batch]
-
-
-def _under(prefix: str, tensors: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries whose name begins with ``prefix``, without it."""
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -25,6 +25,7 @@ from tacpipe.tasks.forward.forecaster import BASELINES, CONFIG, TASK, WEIGHTS, C
 from tacpipe.tasks.forward.predictors import told
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.seen import seen
 from tacpipe.training import loop, scaling
 
 if TYPE_CHECKING:
@@ -191,10 +192,7 @@ def _reference(quaternions: Sequence[Floats]) -> Floats:
 def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str, str]:
     """Return the digests of all recordings that the model has seen by name, those of the one it began with included."""
     digests = {shard.name: shard.digest for part in parts for shard in part.shards.values()}
-    before = (
-        {f"{name} of the model before": digest for name, digest in start.config["trained_on"].items()} if start else {}
-    )
-    return {**{name: digest for name, digest in before.items() if digest not in digests.values()}, **digests}
+    return seen(digests, start.config["trained_on"] if start else {})
 
 
 def _start(

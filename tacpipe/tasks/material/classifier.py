@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.models.spatial_spectrum import Bands
 from tacpipe.models.strong import Strong
+from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.learning import JUDGED, Network
@@ -251,13 +251,3 @@ def spread(scores: Floats, known: Any, classes: tuple[int, ...]) -> Floats:
     found = np.full((len(scores), len(classes)), -np.inf, np.float32)
     found[:, [classes.index(int(one)) for one in known]] = scores
     return found
-
-
-def under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries whose name begins with ``prefix``, without it."""
-    return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
-
-
-def shape_told(shape: Shape) -> dict[str, Any]:
-    """Return a network's shape as JSON holds it."""
-    return dataclasses.asdict(shape)

@@ -15,7 +15,16 @@ from tacpipe.errors import TacpipeError
 from tacpipe.stage import Recording, Result
 from tacpipe.tasks.material import scorecard
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.classifier import CONFIG, Classifier, Floats, Materials, NetworkReader, SpectraReader, Told
+from tacpipe.tasks.material.classifier import (
+    CONFIG,
+    MEAN_LEVEL,
+    Classifier,
+    Floats,
+    Materials,
+    NetworkReader,
+    SpectraReader,
+    Told,
+)
 from tacpipe.tasks.material.scorecard import LAST_EPOCH, MODEL, SWAPPED, Tree
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.material.training import HISTORY
@@ -100,7 +109,7 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
         predicted[SWAPPED] = _exchanged(classifier, sensor, told.latents)
     for name, by_sensor in classifier.baselines.items():
         frames = slides.frames
-        if name != "mean_level" and told.latents is not None:
+        if name != MEAN_LEVEL and told.latents is not None:
             frames = told.latents[:, None]
         fitted = by_sensor[sensor]
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,11 +32,11 @@ from tacpipe.tasks.material.classifier import (
     Classifier,
     Config,
     NetworkReader,
-    shape_told,
 )
 from tacpipe.tasks.material.learning import Felt, JointWork, Weights
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
 from tacpipe.tasks.material.slides import Slides
+from tacpipe.tasks.seen import seen
 from tacpipe.training import loop
 from tacpipe.training.scaling import Affine
 
@@ -145,10 +146,7 @@ def _networks(
         _same_space(start, params["known"], config, known)
         shapes[params["known"]] = Shape(**start.config["shapes"][params["known"]])
         scalings[params["known"]] = _reader(start, params["known"]).scaling
-        before = start.config["trained_on"].items()
-        now = set(config["trained_on"].values())
-        known_before = {f"{name} of the model before": digest for name, digest in before if digest not in now}
-        config["trained_on"] = {**known_before, **config["trained_on"]}
+        config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
     felt = [
         {
             name: _felt(config, some, scalings[name], held, device, place)
@@ -157,7 +155,7 @@ def _networks(
         for part in (known, watched)
     ]
     config |= {
-        "shapes": {name: shape_told(shape) for name, shape in shapes.items()},
+        "shapes": {name: dataclasses.asdict(shape) for name, shape in shapes.items()},
         "scaling": {
             name: {key: value.tolist() for key, value in one.to_tensors().items()} for name, one in scalings.items()
         },
