@@ -71,7 +71,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         )
     tree = _summary(judged, classifier, seen=False)
     seen = _summary(judged, classifier, seen=True)
-    if seen["counts"]["slides"] and any(seen["counts"]["slides"].values()):
+    if any(seen["counts"]["slides"].values()):
         tree["seen"] = seen
     zero = _zero_shot(judged, classifier)
     if zero:

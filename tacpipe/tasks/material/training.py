@@ -168,34 +168,9 @@ def _networks(
         config["partners"] = {
             str(config["classes"][one]): config["classes"][other] for one, other in sorted(partners.items())
         }
-    work = JointWork(
-        felt[0],
-        felt[1],
-        Pairs(
-            {name: some.classes.cpu() for name, some in felt[0].items()},
-            params["batch"],
-            params["pairing"],
-            params["shuffle"],
-            params["drop_last"],
-            params["reduce"],
-            params["ratio"],
-            partners,
-            params["seed"],
-        ),
-        _weights(params, joint),
-        params["known"],
-        params["drop_last"],
-    )
-    schedule = loop.Schedule(
-        epochs=params["epochs"],
-        batch=params["batch"],
-        learning_rate=params["learning_rate"],
-        patience=params["patience"] or params["epochs"],
-        gradient_clip=math.inf,
-        seed=params["seed"],
-        cycle=params["cycle"],
-    )
-    trained = loop.train(lambda: _built(params, shapes, start).to(device), work, schedule, workspace)
+    pairs = _pairs(params, felt[0], partners)
+    work = JointWork(felt[0], felt[1], pairs, _weights(params, joint), params["known"], params["drop_last"])
+    trained = loop.train(lambda: _built(params, shapes, start).to(device), work, _schedule(params), workspace)
     best, last = (trained.weights, trained.last) if params["select"] == "best" else (trained.last, trained.weights)
     config["validation"] = _validation(trained.history, work.joint)
     files = {
@@ -208,6 +183,32 @@ def _networks(
     if params["baselines"]:
         files[BASELINES] = _network_baselines(Classifier.load(files), known, params)
     return files
+
+
+def _pairs(params: Params, felt: Mapping[str, Felt], partners: Mapping[int, int] | None) -> Pairs:
+    return Pairs(
+        {name: some.classes.cpu() for name, some in felt.items()},
+        params["batch"],
+        params["pairing"],
+        params["shuffle"],
+        params["drop_last"],
+        params["reduce"],
+        params["ratio"],
+        partners,
+        params["seed"],
+    )
+
+
+def _schedule(params: Params) -> loop.Schedule:
+    return loop.Schedule(
+        epochs=params["epochs"],
+        batch=params["batch"],
+        learning_rate=params["learning_rate"],
+        patience=params["patience"] or params["epochs"],
+        gradient_clip=math.inf,
+        seed=params["seed"],
+        cycle=params["cycle"],
+    )
 
 
 def _shape(params: Params, some: Slides, header: str, classes: int) -> Shape:
@@ -291,9 +292,8 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
 
 
 def _weights(params: Params, joint: bool) -> Weights:
-    reconstruction = params["reconstruction_weight"]
     return Weights(
-        MAPPED_RECONSTRUCTION if params["known"] else reconstruction,
+        MAPPED_RECONSTRUCTION if params["known"] else params["reconstruction_weight"],
         params["classification_weight"],
         params["alignment_weight"] if joint else 0.0,
         params["align_from"],
@@ -322,9 +322,8 @@ def _validation(history: Sequence[loop.Line], joint: bool) -> dict[str, Any]:
     """Return the epoch that each sensor's weights are of, and its accuracy there."""
 
     def chosen(sensor: str) -> loop.Line:
-        lines = history
         of = list(history[0]["val"]) if joint else [sensor]
-        return max(lines, key=lambda line: (sum(line["val"][one]["accuracy"] for one in of), line["epoch"]))
+        return max(history, key=lambda line: (sum(line["val"][one]["accuracy"] for one in of), line["epoch"]))
 
     found = {sensor: chosen(sensor) for sensor in history[0]["val"]}
     return {
