@@ -6,8 +6,11 @@ and all metadata are taken out.
 
 from __future__ import annotations
 
+import colorsys
 import io
+import itertools
 import re
+import textwrap
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +25,8 @@ Floats = NDArray[np.floating[Any]]
 INK, FAINT = "#010203", "#010204"
 COLOURS = {"model": "#010301", "persistence": "#010302", "codec": "#010303", "other": "#010304"}
 _THEME = {INK: "currentColor", FAINT: "var(--faint)", **{hexes: f"var(--{name})" for name, hexes in COLOURS.items()}}
+STYLES = tuple(itertools.product(("-", "--", ":"), ("model", "persistence", "codec", "other")))  # of lines
+LEGEND = 52  # letters of a line
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "font.family": "sans-serif",
@@ -61,3 +66,16 @@ def svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float
     for colour, variable in _THEME.items():
         drawn = drawn.replace(colour, variable)
     return drawn.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
+
+
+def legend_below(axes: Axes, columns: int = 1) -> None:
+    """Put the names of what is drawn below the axes, long ones in several lines."""
+    lines, names = axes.get_legend_handles_labels()
+    # a name that is wider than the figure would take the width from what is drawn
+    wrapped = ["\n   ".join(textwrap.wrap(name, LEGEND)) for name in names]
+    axes.legend(lines, wrapped, ncols=columns, loc="upper left", bbox_to_anchor=(0, -0.18), borderaxespad=0)
+
+
+def hue(number: int, of: int) -> tuple[float, float, float]:
+    """Return a colour that is told from its neighbours' on a light page and on a dark one."""
+    return colorsys.hls_to_rgb(number / max(of, 1), (0.45, 0.6)[number % 2], 0.75)

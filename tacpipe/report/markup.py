@@ -116,6 +116,15 @@ def with_sd(mean: float, sd: float, digits: int = 4) -> str:
     return f"{mean:.{digits}f}" + ("" if math.isnan(sd) else f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{sd:.{digits}f}")
 
 
+def listed(names: list[str]) -> str:
+    """Return names as a sentence has them.
+
+    >>> listed(["a", "b", "c"]), listed(["a"]), listed([])
+    ('a, b and c', 'a', '')
+    """
+    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
+
+
 def figure(svg: str, caption: str) -> str:
     """Return a figure with what it shows."""
     return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.report import markup, provenance
+from tacpipe.report import contents, markup, provenance
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 def render(result: Dataset, number: int, of: int) -> str:
     """Return the part of the page that one result has: the ``number``-th ``of`` so many."""
-    config = json.loads(result.files["config.json"]) if "config.json" in result.files else {}
+    config = contents.tree(result, "config.json")
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     badge = ' <span class="badge">simulated</span>' if provenance.simulated(result) else ""
-    rows = [[name, value] for name, value in leaves(json.loads(result.files["metrics.json"])).items()]
+    rows = [[name, value] for name, value in leaves(contents.tree(result, "metrics.json")).items()]
     return (
         f"<h2>{f'{number}. ' if of > 1 else ''}{escape(name.replace('_', ' '))}{badge}</h2>\n"
         f"{markup.table('Metrics', ['', 'value'], rows)}\n{provenance.section(result.manifest)}\n"

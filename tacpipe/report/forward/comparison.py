@@ -19,6 +19,7 @@ from tacpipe.metrics import Interval
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method, Run
+from tacpipe.report.spread import Spread, spread
 
 Floats = NDArray[np.floating[Any]]
 
@@ -88,14 +89,6 @@ class Row:
     def score(self) -> float:
         """The mean skill over the shown steps."""
         return float(self.skill.mean[-1])
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Mean and standard deviation over runs; the latter is NaN for a single one."""
-
-    mean: float
-    sd: float
 
 
 @dataclass(frozen=True)
@@ -197,18 +190,6 @@ def represented(method: Method) -> Represented | None:
         spread([float(one.mse.mean()) for one in pooled]),
         spread([float(one.mse.mean()) for one in known]) if known else None,
         spread([float(one.baseline_mse.mean()) for one in pooled]),
-    )
-
-
-def spread(values: Sequence[float]) -> Spread:
-    """Return mean and standard deviation of one value a run.
-
-    >>> spread([1.0, 3.0])
-    Spread(mean=2.0, sd=1.4142135623730951)
-    """
-    return Spread(
-        float(np.mean(values)) if values else float("nan"),
-        float(np.std(values, ddof=1)) if len(values) > 1 else float("nan"),
     )
 
 

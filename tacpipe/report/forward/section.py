@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.report import markup, provenance
+from tacpipe.report import contents, markup, provenance
 from tacpipe.report.forward import figures, traces
 
 if TYPE_CHECKING:
@@ -72,8 +71,7 @@ def headline(metrics: Tree, rate_hz: float = 0.0) -> tuple[str, str]:
 
 def render(result: Dataset, number: int, of: int, drawn: int) -> str:
     """Return the part of the page that one result has: the ``number``-th ``of`` so many, with ``drawn`` traces."""
-    metrics = json.loads(result.files["metrics.json"])
-    config = json.loads(result.files["config.json"]) if "config.json" in result.files else {}
+    metrics, config = (contents.tree(result, name) for name in ("metrics.json", "config.json"))
     rate_hz = float(config.get("rate_hz", 0.0))
     sentence, word = headline(metrics, rate_hz)
     badge = ' <span class="badge">simulated</span>' if provenance.simulated(result) else ""
@@ -92,7 +90,7 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
         _trials(trials),
         _traces(result, trials, drawn),
         _seen(metrics),
-        _training(result.files),
+        _training(contents.history(result)),
         provenance.section(result.manifest),
     ]
     return "\n".join(part for part in parts if part) + "\n"
@@ -286,11 +284,8 @@ def _seen(metrics: Tree) -> str:
     return f'<h3>Recordings the model has seen</h3><p class="note">{escape(text)}</p>'
 
 
-def _training(files: Mapping[str, bytes]) -> str:
+def _training(history: Sequence[Tree]) -> str:
     """Return the losses by epoch, where the result holds them."""
-    if "history.jsonl" not in files:
-        return ""
-    history = [json.loads(line) for line in files["history.jsonl"].splitlines()]
     if not history:
         return ""
     best = min(history, key=lambda line: line["val_loss"])

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from tacpipe.report import markup
+from tacpipe.report.markup import listed
 from tacpipe.report.material import comparison, figures, tables
 from tacpipe.report.material.figures import Integers
 from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import MODEL, NOTHING
-from tacpipe.report.material.wording import listed
 
 TOLD = 3  # pairs of materials in words
 NOTE = "Blue: named right; orange: wrong, with how often. The stronger, the larger the share of a material's slides."

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from tacpipe.report import markup
+from tacpipe.report import epochs, markup
 from tacpipe.report.material import comparison, figures, tables, wording
 from tacpipe.report.material.accuracy import accuracy
 from tacpipe.report.material.figures import Band
@@ -34,7 +34,7 @@ def convergence(methods: Sequence[Method]) -> str:
         held = {name: found for name, found in curves.items() if found}
         if held:
             title = f"Validation accuracy by epoch, {shown(sensor)}"
-            svg = figures.by_epoch(held, "validation accuracy (%)", title, order)
+            svg = epochs.by_epoch(held, "validation accuracy (%)", title, order)
             caption = (
                 f"Figure 9 in the paper's form: validation accuracy on {shown(sensor)} by epoch. Thick: mean over runs; "
                 f"thin: single runs."
@@ -50,7 +50,7 @@ def alignment(methods: Sequence[Method]) -> str:
     held = {name: found for name, found in curves.items() if found}
     if not held:
         return ""
-    svg = figures.by_epoch(held, "mean squared latent difference", "Latent difference of pairs by epoch", log=True)
+    svg = epochs.by_epoch(held, "mean squared latent difference", "Latent difference of pairs by epoch", log=True)
     caption = (
         "Figure 10 in the paper's form: mean squared difference between the two latents of a training pair, by epoch. "
         "Pairs of permuted materials fall as real ones do where labels alone drive the alignment."

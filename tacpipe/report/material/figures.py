@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
-import itertools
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.report.drawing import COLOURS, FAINT, INK, Floats, svg
+from tacpipe.report.drawing import COLOURS, FAINT, INK, STYLES, Floats, hue, legend_below, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Integers = NDArray[np.integer[Any]]
 
-STYLES = tuple(itertools.product(("-", "--", ":"), ("model", "persistence", "codec", "other")))
-LEGEND = 52  # letters of a line
 MARKERS = ("o", "^", "s", "D")
 
 
@@ -41,43 +36,6 @@ class Cloud:
     sensor: str
     points: Floats  # (slide, 2)
     materials: Integers  # (slide,)
-
-
-def by_epoch(
-    runs: Mapping[str, Sequence[Sequence[float]]],
-    quantity: str,
-    title: str,
-    order: Sequence[str] = (),
-    *,
-    log: bool = False,
-) -> str:
-    """Return a figure with a thin line a run, one value an epoch, and the mean over the runs of each name.
-
-    The mean ends where the first of its runs does. NaN breaks a line. Figures with the same ``order`` of names give a
-    name the same line.
-    """
-
-    def draw(axes: list[Axes]) -> None:
-        names = list(order) or list(runs)
-        for name, curves in runs.items():
-            line, colour = STYLES[names.index(name) % len(STYLES)]
-            if len(curves) > 1:
-                for curve in curves:
-                    epochs = np.arange(1, len(curve) + 1)
-                    axes[0].plot(epochs, curve, color=COLOURS[colour], linewidth=0.6, alpha=0.35)
-            length = min(map(len, curves))
-            mean = np.mean([curve[:length] for curve in curves], axis=0)
-            label = f"{name} ({len(curves)} run{'s' if len(curves) > 1 else ''})"
-            epochs = np.arange(1, length + 1)
-            axes[0].plot(epochs, mean, color=COLOURS[colour], linestyle=line, linewidth=1.8, label=label)
-        if log:
-            axes[0].set_yscale("log")
-        axes[0].set_xlabel("epoch")
-        axes[0].set_ylabel(quantity)
-        axes[0].grid(axis="y")
-        _legend_below(axes[0])
-
-    return svg(draw, title, size=(5.4, 3.2 + 0.2 * len(runs)))
 
 
 def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Sequence[str] = ()) -> str:
@@ -102,7 +60,7 @@ def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Seque
         axes[0].set_xlabel("training slides")
         axes[0].set_ylabel("accuracy (%)")
         axes[0].grid(axis="y")
-        _legend_below(axes[0])
+        legend_below(axes[0])
 
     return svg(draw, title, size=(5.4, 3.4 + 0.2 * len(bands)))
 
@@ -143,7 +101,7 @@ def latents(clouds: Sequence[Cloud], partners: Mapping[int, int], title: str) ->
     def draw(axes: list[Axes]) -> None:
         numbers = sorted({int(one) for cloud in clouds for one in cloud.materials})
         for cloud, marker in zip(clouds, MARKERS, strict=False):
-            colours = [_hue(numbers.index(int(one)), len(numbers)) for one in cloud.materials]
+            colours = [hue(numbers.index(int(one)), len(numbers)) for one in cloud.materials]
             filled = marker == MARKERS[0]
             for points, size, inks in ((cloud.points, 16, colours), (np.empty((0, 2)), 20, INK)):
                 axes[0].scatter(
@@ -195,13 +153,6 @@ def profile(time_s: Floats, lines: Mapping[str, Floats], during: NDArray[np.bool
     return svg(draw, title, size=(5.4, 3.0))
 
 
-def _legend_below(axes: Axes) -> None:
-    lines, names = axes.get_legend_handles_labels()
-    # a name that is wider than the figure would take the width from what is drawn
-    wrapped = ["\n   ".join(textwrap.wrap(name, LEGEND)) for name in names]
-    axes.legend(lines, wrapped, loc="upper left", bbox_to_anchor=(0, -0.18), borderaxespad=0)
-
-
 def _apart(counts: Sequence[int]) -> list[int]:
     """Return those of sorted counts whose labels do not touch on a log axis."""
     kept: list[int] = []
@@ -213,8 +164,3 @@ def _apart(counts: Sequence[int]) -> list[int]:
 
 def _means(cloud: Cloud) -> dict[int, Floats]:
     return {int(one): cloud.points[cloud.materials == one].mean(axis=0) for one in np.unique(cloud.materials)}
-
-
-def _hue(number: int, of: int) -> tuple[float, float, float]:
-    """Return a colour that is told from its neighbours' on a light page and on a dark one."""
-    return colorsys.hls_to_rgb(number / max(of, 1), (0.45, 0.6)[number % 2], 0.75)

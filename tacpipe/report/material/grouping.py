@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tacpipe.report.material.methods import Method, Run, Tree, base_name, ordered, shown
+from tacpipe.report.naming import told_apart
 
 # In these, runs of one method may differ; setting and quantities are told as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "setting", "quantities")
@@ -35,18 +36,11 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
         whole = _whole([one for one, other in zip(runs, places, strict=True) if other == place])
         settings: Tree = {**_settings(run), "elsewhere": place != main, **_few(run, whole, few)}
         found.setdefault(json.dumps(settings, sort_keys=True), (settings, []))[1].append(run)
-    alike: dict[str, list[Tree]] = {}
-    for settings, _ in found.values():
-        alike.setdefault(base_name(settings), []).append(settings)
-    made = []
-    for settings, same in found.values():
-        others = alike[base_name(settings)]
-        told = [
-            f"{name} {value}" if not isinstance(value, bool) else name if value else f"no {name}"
-            for name, value in sorted(settings.items())
-            if (name, value) not in _USUAL and any(other.get(name) != value for other in others) and value != ""
-        ]
-        made.append(Method(" · ".join([base_name(settings), *told]), settings, tuple(told), tuple(same)))
+    names = told_apart([(base_name(settings), settings) for settings, _ in found.values()], _USUAL)
+    made = [
+        Method(name, settings, marks, tuple(same))
+        for (name, marks), (settings, same) in zip(names, found.values(), strict=True)
+    ]
     return sorted(made, key=lambda method: method.name)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.report import provenance
+from tacpipe.report import contents, provenance
 from tacpipe.report.material import predictions
 from tacpipe.report.material.predictions import Predictions
 
@@ -41,10 +41,9 @@ class Run:
     @classmethod
     def read(cls, dataset: Dataset) -> Run:
         """Return the run that a result holds."""
-        config, metrics = (json.loads(dataset.files[name]) for name in ("config.json", "metrics.json"))
-        lines = dataset.files["history.jsonl"].splitlines() if "history.jsonl" in dataset.files else []
+        config, metrics = (contents.tree(dataset, name) for name in ("config.json", "metrics.json"))
         found = predictions.read(dataset.shards["predictions"].table(), config)
-        return cls(dataset, config, metrics, [json.loads(line) for line in lines if line.strip()], found)
+        return cls(dataset, config, metrics, contents.history(dataset), found)
 
     @property
     def params(self) -> Tree:

@@ -88,7 +88,7 @@ def _basis(methods: Sequence[Method]) -> str:
             str(name) for one in methods for run in one.of(sensor) for name in run.predictions.of(sensor).recordings
         }
         trained = sorted({run.learned[sensor] for one in methods for run in one.runs if sensor in run.learned})
-        counts = f" after training on {wording.listed([f'{count:,}' for count in trained])}" if trained else ""
+        counts = f" after training on {markup.listed([f'{count:,}' for count in trained])}" if trained else ""
         told.append(f"{len(names):,} slides of {shown(sensor)}{counts}")
     settings, runs = {}, [run for one in methods for run in one.runs]
     for name in ("seed", "epochs"):
@@ -96,7 +96,7 @@ def _basis(methods: Sequence[Method]) -> str:
         if values:
             settings[name] = ", ".join(str(value) for value in sorted(values))
     shown_settings = "; ".join(f"{name} {values}" for name, values in settings.items())
-    text = f"Judged on {wording.listed(told)}, none of which its model was trained on. Materials are numbers, without names."
+    text = f"Judged on {markup.listed(told)}, none of which its model was trained on. Materials are numbers, without names."
     return f"{text} Settings: {shown_settings}." if settings else text
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.report import markup
+from tacpipe.report.markup import listed
 from tacpipe.report.material import figures
 from tacpipe.report.material.methods import ordered, shown
-from tacpipe.report.material.wording import listed
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset, Shard

@@ -70,12 +70,3 @@ def points_within(mean: float, low: float, high: float) -> Markup:
     '+1.0<br><small>−2.0 to +4.0</small>'
     """
     return Markup(f"{points(mean)}<br><small>{points(low)} to {points(high)}</small>")
-
-
-def listed(names: list[str]) -> str:
-    """Return names as a sentence has them.
-
-    >>> listed(["a", "b", "c"]), listed(["a"])
-    ('a, b and c', 'a')
-    """
-    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from tests.report.stream_shard import StreamShard
 from tests.stages.learning_fakes import FakeDataset, FakeShard
 
 MATERIALS, TRIALS = 4, 5  # of the test slides of a sensor
@@ -22,22 +22,6 @@ MANIFEST = {
     "inputs": {"model": [{"dataset": "cd" * 32, "manifest": "ef" * 32}]},
 }
 Shares = Mapping[str, float]
-
-
-@dataclass
-class SlideShard:
-    """A recording with several streams."""
-
-    name: str
-    tables: Mapping[str, pa.Table]
-    attributes: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def streams(self) -> tuple[str, ...]:
-        return tuple(sorted(self.tables))
-
-    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
 
 
 def slides(
@@ -164,9 +148,9 @@ def recorded(count: int = 3, outside: int = 1) -> Any:
         )
         why = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
         attributes = {"sensor": "biotac", "force_n": 1.0 + index, "outside_protocol": index < outside, **why}
-        shards[f"biotac-m01-t{index:03d}"] = SlideShard(
+        shards[f"biotac-m01-t{index:03d}"] = StreamShard(
             f"biotac-m01-t{index:03d}", {"slide": profile, "profile": profile}, attributes
         )
     attributes = {"sensor": "roboskin", "outside_protocol": False}
-    shards["roboskin-test-000"] = SlideShard("roboskin-test-000", {"slide": pa.table({"t_ns": [0]})}, attributes)
+    shards["roboskin-test-000"] = StreamShard("roboskin-test-000", {"slide": pa.table({"t_ns": [0]})}, attributes)
     return FakeDataset(shards)

@@ -26,7 +26,6 @@ def test_figures_are_drawn_in_the_pages_colours_and_carry_nothing_from_outside()
     points = np.arange(12.0).reshape(6, 2)
     materials = np.array([1, 1, 2, 2, 3, 3])
     drawn = [
-        figures.by_epoch({"a": [[1.0, 0.5], [1.0, 0.4, 0.3]]}, "loss", "t", log=True),
         figures.by_slides({"a": Band([64, 576], [0.5, 0.9], [0.4, 0.8], [0.6, 0.95])}, 0.05, "t"),
         figures.confusion(np.array([[3, 1], [0, 4]]), [1, 2], "t"),
         figures.latents([Cloud("BioTac", points, materials), Cloud("RoboSkin", points + 1, materials)], {}, "t"),
@@ -153,9 +152,3 @@ def test_what_was_not_measured_is_not_drawn(lacking: str) -> None:
     short = shard.tables["profile"].drop_columns([lacking] if lacking == "force_n" else [lacking, "speed_raw_m_s"])
     shard.tables = {**shard.tables, "profile": short}
     assert profiles.section([given]).count("<svg") == 1
-
-
-def test_a_long_name_takes_no_width_from_what_is_drawn() -> None:
-    short, long = (figures.by_epoch({name: [[1.0, 0.5]]}, "loss", "t") for name in ("a", "a name " * 12))
-    widths = [re.findall(r'<path d="M [\d.]+ [\d.]+ \nL ([\d.]+) ', one) for one in (short, long)]
-    assert max(map(float, widths[1])) > 0.9 * max(map(float, widths[0]))
