@@ -1,0 +1,103 @@
+"""A grasp by two fingers: where each touches the object, and how the wrist is turned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Floats = NDArray[np.float64]
+
+POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
+WRIST = tuple(f"wrist_{axis}_{component}" for axis in "xyz" for component in "xyz")
+ORTHONORMAL = 1e-3  # by which a wrist's rotation may miss being one: what files of five digits hold
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Two contact points in the frame of their cloud and, where it is known, the wrist's rotation.
+
+    Raises `TacpipeError` for values that are not finite, two points that are one, and a wrist that is no rotation.
+    """
+
+    g1_m: Floats  # (xyz), metres
+    g2_m: Floats  # (xyz), metres
+    wrist: Floats | None = None  # (component, axis): columns are approach, closing and third axis in the cloud's frame
+
+    def __post_init__(self) -> None:
+        """Refuse what no hand can do."""
+        if not (np.isfinite(self.g1_m).all() and np.isfinite(self.g2_m).all()):
+            raise TacpipeError(f"The grasp points are {self.g1_m} and {self.g2_m}; both must be finite, in metres.")
+        if self.opening_m == 0:
+            raise TacpipeError(f"Both grasp points are {self.g1_m}; the fingers must touch at two different points.")
+        if self.wrist is not None:
+            if self.wrist.shape != (3, 3) or not np.isfinite(self.wrist).all():
+                raise TacpipeError("The wrist's rotation must be nine finite numbers.")
+            off = np.abs(self.wrist.T @ self.wrist - np.eye(3)).max()
+            if off > ORTHONORMAL or np.linalg.det(self.wrist) < 0:
+                raise TacpipeError(
+                    f"The wrist's axes miss being a rotation by {off:.3g}, with determinant "
+                    f"{np.linalg.det(self.wrist):.3g}; they must be three right-handed unit vectors at right angles."
+                )
+
+    @property
+    def opening_m(self) -> float:
+        """How far the fingers are apart, metres."""
+        return float(np.linalg.norm(self.g2_m - self.g1_m))
+
+    @property
+    def middle_m(self) -> Floats:
+        """The point between the fingers (xyz), metres."""
+        return (self.g1_m + self.g2_m) / 2
+
+    @property
+    def closing(self) -> Floats:
+        """The unit vector from g1 to g2 (xyz)."""
+        return (self.g2_m - self.g1_m) / self.opening_m
+
+    @property
+    def swapped(self) -> Grasp:
+        """The same grasp with the fingers' roles exchanged: half a turn about the wrist's approach axis."""
+        wrist = None if self.wrist is None else self.wrist * (1.0, -1.0, -1.0)
+        return Grasp(self.g2_m, self.g1_m, wrist)
+
+    def moved(self, rotation: Floats, shift_m: Floats) -> Grasp:
+        """Return the grasp turned by ``rotation`` (3, 3) and then shifted, as its cloud would be."""
+        wrist = None if self.wrist is None else rotation @ self.wrist
+        return Grasp(rotation @ self.g1_m + shift_m, rotation @ self.g2_m + shift_m, wrist)
+
+    @classmethod
+    def of(cls, table: pa.Table) -> Grasp:
+        """Return the grasp that a table of one row holds. Raises `TacpipeError` if it has no or several rows."""
+        if table.num_rows != 1:
+            raise TacpipeError(f"A grasp's table has {table.num_rows} rows; it must have one.")
+        points = np.array([table.column(name)[0].as_py() for name in POINTS], float)
+        wrist = None
+        if set(WRIST) <= set(table.column_names):
+            wrist = np.array([table.column(name)[0].as_py() for name in WRIST], float).reshape(3, 3).T
+        return cls(points[:3], points[3:], wrist)
+
+    def table(self, t_ns: int) -> pa.Table:
+        """Return a table of one row: ``t_ns``, ``g1_x_m`` … ``g2_z_m``, and ``wrist_x_x`` … if the wrist is known.
+
+        ``wrist_x_y`` is the component along y of the wrist's first axis.
+        """
+        import pyarrow as pa
+
+        from tacpipe.formats import channels
+
+        fields = [channels.float_field(name, "m", "position", name[3]) for name in POINTS]
+        values = [*self.g1_m, *self.g2_m]
+        if self.wrist is not None:
+            fields += [channels.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
+            values += list(self.wrist.T.ravel())
+        schema = pa.schema([channels.time_field(), *fields])
+        arrays = [pa.array([t_ns], pa.int64()), *(pa.array([float(value)], pa.float64()) for value in values)]
+        return pa.Table.from_arrays(arrays, schema=schema)
