@@ -1,0 +1,124 @@
+"""A depth camera that looks down on a table: which points of bodies it sees, how exactly, and in what colours.
+
+The camera's frame: x to the right of the image, y down, z along the optical axis. Its rays run through the pixels of an
+Intel RealSense D415 at 640 x 480. Depth is noisy, the more the farther: 1.5 mm at 1 m, growing with the square, as
+stereo errors do. Colours are random and tell nothing of the object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.simulation.primitives import Rest, Shape
+
+Floats = NDArray[np.float64]
+Colours = NDArray[np.uint8]
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 615.0  # pixels
+DEPTH_NOISE_M = 0.0015  # standard deviation at 1 m
+COLOUR_NOISE = 6.0  # standard deviation, of 255
+RIPPLES = 3  # waves in a texture
+WAVE_M = (0.01, 0.08)  # their lengths
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A body in the camera's frame: the rotation from its own frame (3, 3), and where its origin is (xyz), metres."""
+
+    shape: Shape
+    rotation: Floats
+    origin_m: Floats
+
+    def inward(self, at_m: Floats) -> Floats:
+        """Return points of the camera's frame in the body's (point, xyz), metres."""
+        return np.asarray((at_m - self.origin_m) @ self.rotation)
+
+    def hit(self, origin_m: Floats, direction: Floats) -> Floats:
+        """Return how far along each ray of the camera's frame the body is first met (ray,); inf where never."""
+        return self.shape.hit(self.inward(origin_m), direction @ self.rotation)
+
+    def normal(self, at_m: Floats) -> Floats:
+        """Return the outward unit normals at points of the surface (point, xyz)."""
+        return np.asarray(self.shape.normal(self.inward(at_m)) @ self.rotation.T)
+
+    def bending(self, at_m: Floats) -> Floats:
+        """Return the matrices of the normal curvatures (point, xyz, xyz), 1/m."""
+        return np.asarray(self.rotation @ self.shape.bending(self.inward(at_m)) @ self.rotation.T)
+
+
+def camera(rng: np.random.Generator, height_m: tuple[float, float], tilt_rad: float) -> tuple[Floats, float]:
+    """Return the table's upward normal in the camera's frame (xyz) and how far it is along the optical axis, metres.
+
+    The camera looks straight down but for a tilt of up to ``tilt_rad``.
+    """
+    tilt, turn = tilt_rad * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+    up = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+    return up, float(rng.uniform(*height_m))
+
+
+def put(shape: Shape, rest: Rest, yaw_rad: float, at_m: tuple[float, float], up: Floats, height_m: float) -> Placed:
+    """Return a body lying on the table as ``rest`` says, turned by ``yaw_rad`` about the vertical.
+
+    ``at_m`` is where the camera sees its origin: x and y on the optical axis' plane at ``height_m``, metres.
+    """
+    ray = np.array([*at_m, height_m]) / height_m
+    ground = ray * height_m * up[2] / (ray @ up)
+    own, seen = _basis(rest.up), _basis(up)
+    turn = np.array([[np.cos(yaw_rad), -np.sin(yaw_rad), 0], [np.sin(yaw_rad), np.cos(yaw_rad), 0], [0, 0, 1.0]])
+    return Placed(shape, seen @ turn @ own.T, ground + rest.height_m * up)
+
+
+def rays(rows: range, columns: range) -> Floats:
+    """Return the directions of a window of pixels (ray, xyz), row by row, each one metre deep."""
+    y, x = np.meshgrid(rows, columns, indexing="ij")
+    return (
+        np.column_stack([(x.ravel() - WIDTH / 2 + 0.5), (y.ravel() - HEIGHT / 2 + 0.5), np.full(x.size, FOCAL)]) / FOCAL
+    )
+
+
+def window(placed: Placed) -> tuple[range, range]:
+    """Return the rows and columns of the pixels that may see a body: those about its bounding sphere."""
+    x, y, z = placed.origin_m
+    reach = placed.shape.bound_m / (z - placed.shape.bound_m) * FOCAL * 1.1
+
+    def within(centre: float, size: int) -> range:
+        middle = centre * FOCAL + size / 2
+        return range(max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
+
+    return within(y / z, HEIGHT), within(x / z, WIDTH)
+
+
+def depths(placed: Placed) -> tuple[Floats, Floats]:
+    """Return the directions of the rays that meet a body (ray, xyz), one metre deep, and how deep they do (ray,), metres."""
+    through = rays(*window(placed))
+    deep = placed.hit(np.zeros((1, 3)), through)
+    met = np.isfinite(deep)
+    return through[met], deep[met]
+
+
+def measured(direction: Floats, depth_m: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return the points that the camera gives (point, xyz), metres: true ones, shifted along their rays by noise."""
+    noise = noise_scale * DEPTH_NOISE_M * depth_m**2 * rng.normal(size=len(depth_m))
+    return (direction * (depth_m + noise)[:, None]).astype(np.float32)
+
+
+def painted(own_m: Floats, rng: np.random.Generator) -> Colours:
+    """Return colours (point, rgb) of points in a body's own frame: a random colour, random waves of others, and noise."""
+    found = np.tile(rng.uniform(50, 205, 3), (len(own_m), 1))
+    for _ in range(RIPPLES):
+        along = rng.normal(size=3)
+        along *= 2 * np.pi / rng.uniform(*WAVE_M) / np.linalg.norm(along)
+        found += np.outer(np.sin(own_m @ along + rng.uniform(0, 2 * np.pi)), rng.normal(0, 20, 3))
+    found += rng.normal(0, COLOUR_NOISE, found.shape)
+    return np.rint(found).clip(0, 255).astype(np.uint8)
+
+
+def _basis(third: Floats) -> Floats:
+    """Return a right-handed basis (component, axis) whose third axis is given."""
+    helper = np.eye(3)[int(np.argmin(np.abs(third)))]
+    first = np.cross(helper, third)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(third, first), third])

@@ -1,0 +1,122 @@
+"""The fingertips of a simulated hand, middle finger and thumb: a BioTac SP each, and what it reads of a contact.
+
+An electrode's impedance falls where the skin is pressed towards it and the fluid between gets thin, and rises where the
+fluid goes. The published tip positions are unrolled: an electrode lies at how far it is along the finger and how far
+around the core. Rest and noise are those of the untouched sensors of a published rig; how far electrodes fall and the
+pressure rises is an assumption, of the size of the readings under published grasps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp
+
+Floats = NDArray[np.float64]
+
+CHANNELS = biotac_sp.ELECTRODES + 1  # of a finger that touch is told by: the electrodes, then the fluid's pressure
+GAIN_COUNT = 2600.0  # by which an electrode falls under a contact that squeezes all fluid out
+FLUID_M = 0.0006  # indentation at which 1 - 1/e of that is reached
+BREADTH = 1.1  # sigma of the pressed region over the contact's radius
+BULGE = 0.35  # share of what pressed electrodes fall by that the others rise by
+REST_COUNT = (2400.0, 3480.0)  # of an electrode
+NOISE_COUNT = (3.5, 6.4)  # of an electrode, standard deviation
+PRESSURE_NOISE_COUNT = (0.05, 0.25)
+PRESSURE_COUNT = (1676.0, 2779.0)  # untouched, by finger
+PRESSURE_COUNT_N = 140.0  # slope
+FULL_COUNT = {"electrode": (100, 3800), "pdc": (0, 4095)}  # between which readings lie
+DRIFT_DAYS = (2.0, 3.0, 5.0)  # periods in which a reading drifts
+DAY_NS = 86_400_000_000_000
+OTHERS_COUNT = {"pac0": (2037, 2049), "pac1": (2037, 2049), "tac": (2152, 2051), "tdc": (2620, 2449)}  # by finger
+OTHERS_NOISE_COUNT = {"pac0": 8.0, "pac1": 8.0, "tac": 10.0, "tdc": 6.0}
+VIBRATION_COUNT_S_N = 3.0  # PAC, by the rate at which the force changes
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Two sensors as they were made: rest and noise of their channels (finger, channel) and phases of their drift."""
+
+    rest: Floats
+    noise: Floats
+    phases_rad: Floats  # (period, finger, channel)
+
+
+def sensors(rng: np.random.Generator) -> Sensors:
+    """Return two sensors as ``rng`` draws them."""
+    fingers, electrodes = len(biotac_sp.FINGERS), biotac_sp.ELECTRODES
+    rest = np.column_stack([rng.uniform(*REST_COUNT, (fingers, electrodes)), PRESSURE_COUNT])
+    noise = np.column_stack(
+        [
+            rng.uniform(*NOISE_COUNT, (fingers, electrodes)),
+            rng.uniform(*PRESSURE_NOISE_COUNT, fingers),
+        ]
+    )
+    return Sensors(rest, noise, rng.uniform(0, 2 * np.pi, (len(DRIFT_DAYS), *rest.shape)))
+
+
+def unrolled_m() -> Floats:
+    """Return where electrodes lie on the unrolled core (electrode, axis): along the finger, and around it, metres."""
+    along, depth, across = biotac_sp.electrode_positions_m().T
+    return np.column_stack([along, np.hypot(depth, across) * np.arctan2(across, -depth)])
+
+
+def pressed(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
+    """Return by how many counts a contact changes electrodes (..., electrode).
+
+    ``contact_m`` is the contact's radius (...), ``skin_m`` by how much the skin gives way (...), ``centre_m`` the middle
+    of the contact on the unrolled core (..., axis), all in metres.
+    """
+    way2 = ((unrolled_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
+    sigma2 = np.maximum(BREADTH * contact_m, 1e-9) ** 2
+    near = np.exp(-way2 / (2 * sigma2[..., None]))
+    fall = GAIN_COUNT * (1 - np.exp(-skin_m / FLUID_M))[..., None] * near
+    aside = (1 - near) / (1 - near).sum(axis=-1, keepdims=True)
+    return np.asarray(BULGE * fall.sum(axis=-1, keepdims=True) * aside - fall)
+
+
+def signal(made: Sensors, force_n: Floats, contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
+    """Return what both sensors show without noise and drift (..., finger, channel), counts."""
+    pressure = PRESSURE_COUNT_N * force_n[..., None]
+    return np.asarray(made.rest + np.concatenate([pressed(contact_m, skin_m, centre_m), pressure], axis=-1))
+
+
+def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | NDArray[np.int64] = 0) -> Floats:
+    """Return by how many counts channels have drifted at ``t_ns``, of phases (..., period, finger, channel).
+
+    Each drifts by ``rate_count_day`` counts a day on root-mean-square average, as the sum of three slow waves.
+    """
+    rate = 2 * np.pi / np.array(DRIFT_DAYS)[:, None, None]  # rad a day
+    size = rate_count_day / rate * np.sqrt(2 / len(DRIFT_DAYS))
+    days = np.asarray(t_ns % (400 * DAY_NS), np.float64)[..., None, None, None] / DAY_NS
+    return np.asarray((size * np.sin(rate * days + phases_rad)).sum(axis=-3))
+
+
+def counted(counts: Floats) -> NDArray[np.uint16]:
+    """Return channels (..., channel) as they are logged: whole and within `FULL_COUNT`."""
+    low, high = np.array([FULL_COUNT["electrode"]] * biotac_sp.ELECTRODES + [FULL_COUNT["pdc"]]).T
+    return np.rint(counts).clip(low, high).astype(np.uint16)
+
+
+def rows(counts: NDArray[np.uint16], speed_n_s: Floats, noise_scale: float, rng: np.random.Generator) -> list[Floats]:
+    """Return the 58 columns of `biotac_sp.fields` (time,), of channels (time, finger, channel).
+
+    ``speed_n_s`` is how fast the force changes (time, finger): it shows on the quick readings of the pressure.
+    """
+    found = []
+    for field in biotac_sp.fields():
+        name, channel = field.name.split("_")
+        finger = biotac_sp.FINGERS.index(name)
+        if channel == "pdc":
+            found.append(counts[:, finger, -1].astype(np.float64))
+        elif channel.startswith("electrode"):
+            found.append(counts[:, finger, int(channel.removeprefix("electrode")) - 1].astype(np.float64))
+        else:
+            level = OTHERS_COUNT[channel][finger] + noise_scale * rng.normal(
+                0, OTHERS_NOISE_COUNT[channel], len(counts)
+            )
+            shake = VIBRATION_COUNT_S_N * speed_n_s[:, finger] if channel.startswith("pac") else 0.0
+            found.append(np.rint(level + shake).clip(0, 4095))
+    return found

@@ -1,0 +1,135 @@
+"""Grasps of the simulated table: a camera sees an object, two fingers pinch it, and their sensors read what they feel.
+
+Trial i is of object i mod n. What happens in one:
+
+1. an object comes to rest on the table in a random pose, and `tacpipe.simulation.depth_camera` sees it;
+2. `tacpipe.simulation.antipodal` plans where two fingers take it;
+3. the fingers, a little off, press as `tacpipe.simulation.pinch` tells;
+4. `tacpipe.simulation.fingertip_sp` reads that.
+
+Grasps of an object follow one another in sessions, over which the sensors drift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp
+from tacpipe.errors import TacpipeError
+from tacpipe.formats import channels
+from tacpipe.simulation import fingertip_sp, grasp_truth, pinch, pinch_course, tabletop
+from tacpipe.simulation.grasp_scene import Felt, Rig, Scene, families, feel, perform, sensors, thing
+from tacpipe.stage import Attribute, Recording
+
+Floats = NDArray[np.float64]
+
+START_NS = 1_620_000_000_000_000_000  # UTC stamp of the first grasp
+GRASP_NS = 180_000_000_000  # from one grasp of a session to the next
+SESSION = 20  # grasps
+READ_NS = 5_000_000_000  # from the plan to the reading
+NOISE, BOUND = 4, 5  # streams of random numbers
+
+
+def simulate_trial(seed: int, index: int, rig: Rig) -> Recording:
+    """Return trial ``index`` of the rig: cloud, grasp, reading, truth; or raw: scene, grasp, biotac_sp, scene_truth, truth.
+
+    The same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth. Raises
+    `TacpipeError` for a rig that cannot be.
+    """
+    _check(rig)
+    scene = perform(seed, index, rig)
+    t_ns = stamp_ns(index, rig)
+    made = sensors(seed)
+    felt = feel(made, scene, t_ns, rig)
+    rng = np.random.default_rng([seed, NOISE, index])
+    streams = {"grasp": scene.grasp.table(t_ns)}
+    moments_ns: dict[str, int] = {}
+    if rig.raw:
+        course = pinch_course.course(t_ns, rng)
+        other = thing(seed, index + 1 + int(rng.integers(1_000)), rig)
+        view = tabletop.view(scene.placed, other.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
+        streams |= tabletop.tables(view)
+        streams["biotac_sp"] = _felt_over_time(made, scene, felt, course, rig, rng)
+        moments_ns = course.moments_ns
+    else:
+        streams["cloud"] = scene.cloud.table()
+        still = np.zeros((1, len(biotac_sp.FINGERS)))
+        streams["reading"] = _logged(np.array([t_ns + READ_NS]), made, felt.shown[None], still, rig, rng)
+    bound = grasp_truth.bound(made, scene, rig, np.random.default_rng([seed, BOUND, index]))
+    streams["truth"] = grasp_truth.table(t_ns, scene, felt, bound, moments_ns)
+    return Recording(streams, _attributes(scene, session(index, rig)))
+
+
+def stamp_ns(index: int, rig: Rig) -> int:
+    """Return when trial ``index`` takes place, UTC nanoseconds: objects take turns session by session."""
+    turn, number = divmod(_number(index, rig), SESSION)
+    return START_NS + ((turn * _objects(rig) + index % _objects(rig)) * SESSION + number) * GRASP_NS
+
+
+def session(index: int, rig: Rig) -> int:
+    """Return in which session of its object trial ``index`` is, from 1."""
+    return _number(index, rig) // SESSION + 1
+
+
+def _objects(rig: Rig) -> int:
+    return 1 if rig.spheres else len(families(rig)) * rig.objects
+
+
+def _number(index: int, rig: Rig) -> int:
+    """Return which of the grasps of its object a trial is, from 0."""
+    return index // _objects(rig)
+
+
+def _felt_over_time(
+    made: fingertip_sp.Sensors,
+    scene: Scene,
+    felt: Felt,
+    course: pinch_course.Course,
+    rig: Rig,
+    rng: np.random.Generator,
+) -> pa.Table:
+    """Return the stream of both sensors while fingers close, hold and let go."""
+    force = course.share[:, None] * felt.touch.force_n  # (time, finger)
+    contact, skin = pinch.pressed(scene.situation, force)
+    centre = np.broadcast_to(felt.touch.centre_m, (len(force), *felt.touch.centre_m.shape[1:]))
+    shown = fingertip_sp.signal(made, force, contact, skin, centre) + felt.drift
+    speed = np.gradient(force, course.t_ns / 1e9, axis=0)
+    return _logged(course.t_ns, made, shown, speed, rig, rng)
+
+
+def _logged(
+    t_ns: NDArray[np.int64],
+    made: fingertip_sp.Sensors,
+    shown: Floats,
+    speed_n_s: Floats,
+    rig: Rig,
+    rng: np.random.Generator,
+) -> pa.Table:
+    """Return a stream of readings of what sensors show (time, finger, channel), with noise."""
+    counts = fingertip_sp.counted(shown + rig.noise_scale * made.noise * rng.normal(size=shown.shape))
+    return channels.stream(t_ns, fingertip_sp.rows(counts, speed_n_s, rig.noise_scale, rng), biotac_sp.fields())
+
+
+def _attributes(scene: Scene, session: int) -> dict[str, Attribute]:
+    return {
+        "sensor": "biotac-sp",
+        "simulated": True,
+        "object": scene.of.name,
+        "family": scene.of.family,
+        "session": f"{scene.of.name}-s{session:02d}",
+    }
+
+
+def _check(rig: Rig) -> None:
+    """Refuse a rig that cannot be."""
+    if rig.objects < 1:
+        raise TacpipeError(f"objects is {rig.objects}; a family needs 1 or more.")
+    for name in ("effort_spread", "noise_scale", "drift_count_day"):
+        if getattr(rig, name) < 0:
+            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 0 or more.")
+    if not 0 <= rig.shift <= 1:
+        raise TacpipeError(f"shift is {rig.shift}; it is a share of half the cloud's length, 0 to 1.")
+    if rig.raw and rig.spheres:
+        raise TacpipeError("raw and spheres are both set; spheres of all sizes have no table. Leave one of them out.")

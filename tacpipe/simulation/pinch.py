@@ -1,0 +1,135 @@
+"""A pinch: how hard two fingers press on what lies between them, and where and how widely each touches it.
+
+What a camera and a planned grasp tell is the `Situation`; what they do not is `Unseen`. Each finger presses as hard as
+the torque of its joints allows, the less the wider the hand is open, or, on soft objects, as the object resists:
+F = min(F_max, k s), with k = 2 E R of a flat punch as wide as the tip (K. L. Johnson, *Contact Mechanics*, Cambridge
+1985, section 3.8) and s by how much fingers close beyond touch. The two forces differ by what the table's friction and
+the arm hold, as in published grasps, where the pressures of the two fingers go their own ways.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.simulation import hertz
+from tacpipe.simulation.depth_camera import Placed
+from tacpipe.simulation.primitives import principal_curvatures
+
+Floats = NDArray[np.float64]
+
+TIP_M = 0.0067  # radius of a fingertip, an assumption
+SKIN_PA = 1.0e6  # modulus of its skin, an assumption
+FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # that the joints hold at the least and at the widest opening, by finger
+OPENING_M = (0.02, 0.12)
+SQUEEZE_M = (0.008, 0.012)  # by which fingers close beyond touch
+COMMON = 0.8  # share of the logarithm of the effort that both fingers have in common
+CENTRE_M = (
+    (0.0038, 0.0),
+    (-0.0013, 0.0),
+)  # along and around the finger, where a level contact is, but for the thumb's side
+SIDE_M = (0.003, 0.005)  # by which the thumb touches with its side
+BEND_RAD = 0.3  # by which the last joint is bent at the least opening, and stretched at the widest
+SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's pose
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What geometry tells of a grasp; fingers are middle finger and thumb, axes along and around the finger."""
+
+    opening_m: float
+    curvatures_1_m: Floats  # (finger, 2), principal ones of the object at the contact
+    bending_1_m: Floats  # (finger, axis), its normal curvatures along the axes of the pad
+    lean_rad: Floats  # (finger, axis), of the normal from the pad's own
+    compliance_1_pa: float  # of the object
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """What nobody sees of grasps, drawn any number of times."""
+
+    effort: Floats  # (draw, finger), by which the torque limit is multiplied
+    squeeze_m: Floats  # (draw,)
+    shift_m: Floats  # (draw, finger, axis), of the fingertip across the normal
+    tilt_rad: Floats  # (draw, finger, axis)
+    side_m: Floats  # (draw,), of the thumb
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What comes of both: force, the contact's radius, by how much the skin gives way, and where the contact is."""
+
+    force_n: Floats  # (draw, finger)
+    contact_m: Floats  # (draw, finger)
+    skin_m: Floats  # (draw, finger)
+    centre_m: Floats  # (draw, finger, axis), on the unrolled core
+
+
+def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation:
+    """Return what geometry tells of a grasp whose wrist is known; the middle finger is at ``g1``, the thumb at ``g2``."""
+    assert grasp.wrist is not None
+    at_m = np.stack([grasp.g1_m, grasp.g2_m])
+    normal, bending = placed.normal(at_m), placed.bending(at_m)
+    approach = grasp.wrist[:, 0]
+    lean, along = np.empty((2, 2)), np.empty((2, 2))
+    for finger, pad in enumerate((grasp.closing, -grasp.closing)):
+        axes = np.stack([approach, np.cross(pad, approach)])
+        inward = -normal[finger]
+        lean[finger] = np.arctan2(axes @ inward, pad @ inward)
+        along[finger] = np.einsum("ij,jk,ik->i", axes, bending[finger], axes)
+    return Situation(grasp.opening_m, principal_curvatures(bending, normal), along, lean, compliance_1_pa)
+
+
+def unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen:
+    """Return ``draws`` draws of what nobody sees; ``effort_spread`` is the standard deviation of the effort's logarithm."""
+    common, own = rng.normal(size=(draws, 1)), rng.normal(size=(draws, 2))
+    return Unseen(
+        np.exp(effort_spread * (np.sqrt(COMMON) * common + np.sqrt(1 - COMMON) * own)),
+        rng.uniform(*SQUEEZE_M, draws),
+        rng.uniform(-SHIFT_M, SHIFT_M, (draws, 2, 2)),
+        rng.uniform(-TILT_RAD, TILT_RAD, (draws, 2, 2)),
+        rng.uniform(*SIDE_M, draws),
+    )
+
+
+def limits_n(opening_m: float) -> Floats:
+    """Return the force that the joints' torque allows each finger (finger,), N: it falls with the opening."""
+    share = (opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    return np.array([narrow + share * (wide - narrow) for narrow, wide in FORCE_N])
+
+
+def touch(of: Situation, hidden: Unseen) -> Touch:
+    """Return what comes of a situation and each draw of what nobody sees."""
+    force = hidden.effort * limits_n(of.opening_m)
+    if of.compliance_1_pa:
+        resisted = 2 / of.compliance_1_pa * TIP_M * hidden.squeeze_m
+        force = np.minimum(force, resisted[:, None])
+    return Touch(force, *pressed(of, force), centre(of, hidden))
+
+
+def pressed(of: Situation, force_n: Floats) -> tuple[Floats, Floats]:
+    """Return the contact's radius and by how much the skin gives way, metres, under forces (..., finger).
+
+    Of the whole indentation the skin takes the share E* / E_skin: both bodies give way in proportion to compliance.
+    """
+    radius = hertz.effective_radius_m(TIP_M, of.curvatures_1_m)
+    modulus = hertz.effective_modulus_pa(SKIN_PA, of.compliance_1_pa)
+    contact = hertz.contact_radius_m(force_n, radius, modulus)
+    return contact, hertz.indentation_m(contact, radius) * modulus / SKIN_PA
+
+
+def centre(of: Situation, hidden: Unseen) -> Floats:
+    """Return the middle of the contact on the unrolled core (draw, finger, axis), metres.
+
+    A round tip touches where its normal is the object's. Tips that are shifted by e over a surface of curvature k roll
+    to where the normal leans by e k / (1 + k R).
+    """
+    share = (of.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    lean = of.lean_rad + np.array([BEND_RAD * (2 * share - 1), 0.0]) + hidden.tilt_rad
+    lean = lean + hidden.shift_m * of.bending_1_m / (1 + of.bending_1_m * TIP_M)
+    at = np.array(CENTRE_M) + TIP_M * lean
+    at[:, 1, 1] += hidden.side_m
+    return np.asarray(at)

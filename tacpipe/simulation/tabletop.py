@@ -1,0 +1,85 @@
+"""What the camera sees before anything is cut out: a table, the object that is grasped, and another one beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.formats import channels
+from tacpipe.simulation import depth_camera
+from tacpipe.simulation.depth_camera import Placed
+from tacpipe.simulation.primitives import Shape
+
+Floats = NDArray[np.float64]
+
+TABLE, OBJECT, CLUTTER = 0, 1, 2
+GAP_M = (0.04, 0.10)  # between the spheres that hold the two bodies
+SIDES = 60  # on which the other one is tried
+HALF_M = (0.45, 0.35)  # half the table's edges along x and y
+EDGE_PX = 10  # by which the other body stays within the image
+
+
+@dataclass(frozen=True)
+class View:
+    """All points that the camera gives, and what each lies on: the table, the object or clutter (point,)."""
+
+    cloud: Cloud
+    surface: NDArray[np.int8]
+
+
+def view(
+    placed: Placed, other: Shape, up: Floats, camera_m: float, noise_scale: float, rng: np.random.Generator
+) -> View:
+    """Return the camera's view of a body on the table, with a body ``other`` set down beside it."""
+    through = depth_camera.rays(range(depth_camera.HEIGHT), range(depth_camera.WIDTH))
+    depth = _table(through, up, camera_m)
+    surface = np.full(len(depth), TABLE, np.int8)
+    bodies = [(OBJECT, placed), (CLUTTER, _beside(placed, other, up, camera_m, rng))]
+    for kind, body in bodies:
+        rows, columns = depth_camera.window(body)
+        pixels = (np.array(rows)[:, None] * depth_camera.WIDTH + np.array(columns)).ravel()
+        deep = body.hit(np.zeros((1, 3)), through[pixels])
+        nearer = deep < depth[pixels]
+        depth[pixels[nearer]] = deep[nearer]
+        surface[pixels[nearer]] = kind
+    met = np.isfinite(depth)
+    through, depth, surface = through[met], depth[met], surface[met]
+    colours = depth_camera.painted(through * depth[:, None], rng)
+    for kind, body in bodies:
+        own = surface == kind
+        colours[own] = depth_camera.painted(body.inward(through[own] * depth[own, None]), rng)
+    return View(Cloud(depth_camera.measured(through, depth, noise_scale, rng), colours), surface)
+
+
+def tables(seen: View) -> dict[str, pa.Table]:
+    """Return the stream ``scene``, and ``scene_truth`` with a row a point: 0 the table, 1 the object, 2 another one."""
+    truth = pa.Table.from_arrays([pa.array(seen.surface)], schema=pa.schema([channels.label_field("gt_surface")]))
+    return {"scene": seen.cloud.table(), "scene_truth": truth}
+
+
+def _table(through: Floats, up: Floats, camera_m: float) -> Floats:
+    """Return how deep rays meet the table (ray,), inf beyond its edges."""
+    depth = np.asarray(camera_m * up[2] / (through @ up))
+    off = np.abs(through[:, :2] * depth[:, None]) <= HALF_M
+    return np.where(off.all(axis=1) & (depth > 0), depth, np.inf)
+
+
+def _beside(placed: Placed, other: Shape, up: Floats, camera_m: float, rng: np.random.Generator) -> Placed:
+    """Return a body put down beside another, where the camera sees all of it if there is such a place."""
+    rests = other.rests()
+    rest = rests[int(rng.integers(len(rests)))]
+    centre = placed.origin_m[:2] / placed.origin_m[2] * camera_m
+    found = None
+    for _ in range(SIDES):
+        angle, gap = rng.uniform(0, 2 * np.pi), rng.uniform(*GAP_M)
+        x, y = centre + (placed.shape.bound_m + other.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
+        found = depth_camera.put(other, rest, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m)
+        rows, columns = depth_camera.window(found)
+        if min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < depth_camera.HEIGHT:
+            break
+    assert found is not None
+    return found

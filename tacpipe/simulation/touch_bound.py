@@ -1,0 +1,56 @@
+"""What can be known of a touch from its geometry: the expected reading, and the error that no model falls below.
+
+The effort of the hand, the errors of the fingertips' poses, drift and noise of the sensors do not show in a cloud and a
+planned grasp. The mean over them, E[y | geometry], has the least root-mean-square error of all predictions from these.
+
+Sensors drift alike in grasps that are near in time, so that a model fitted on some of them knows part of the drift of the
+others and may fall below this error. To hold a model against it, let nothing drift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.simulation import fingertip_sp, pinch
+
+Floats = NDArray[np.float64]
+
+DRAWS = 256
+
+
+def readings(
+    of: pinch.Situation,
+    made: fingertip_sp.Sensors,
+    rng: np.random.Generator,
+    *,
+    draws: int = DRAWS,
+    effort_spread: float = 0.15,
+    noise_scale: float = 1.0,
+    drift_count_day: float = 30.0,
+) -> NDArray[np.uint16]:
+    """Return what the sensors may read of one situation (draw, finger, channel), whatever is unseen drawn anew each time.
+
+    Channels are the electrodes, then the pressure; times of drift are drawn too.
+    """
+    felt = pinch.touch(of, pinch.unseen(rng, draws, effort_spread))
+    shown = fingertip_sp.signal(made, felt.force_n, felt.contact_m, felt.skin_m, felt.centre_m)
+    phases = rng.uniform(0, 2 * np.pi, (draws, *made.phases_rad.shape))
+    off = fingertip_sp.drift(phases, drift_count_day) + noise_scale * made.noise * rng.normal(size=shown.shape)
+    return fingertip_sp.counted(shown + off)
+
+
+def known(possible: NDArray[np.uint16]) -> tuple[Floats, Floats]:
+    """Return mean and variance of readings (draw, finger, channel), each (finger, channel), counts and counts squared."""
+    return possible.mean(axis=0), possible.var(axis=0, ddof=1)
+
+
+def irreducible_rmse(variances: Floats) -> dict[str, float]:
+    """Return the least root-mean-square error of each target, counts, over situations (situation, finger, channel).
+
+    It is the root of the mean of the variances given the geometry: C. M. Bishop, *Pattern Recognition and Machine
+    Learning*, 2006, equation (1.90).
+    """
+    mf, th = np.sqrt(variances[:, :, -1].mean(axis=0))
+    e_mf, e_th = np.sqrt(variances[:, :, :-1].mean(axis=(0, 2)))
+    return {"pdc_th": float(th), "pdc_mf": float(mf), "e_th": float(e_th), "e_mf": float(e_mf)}

@@ -1,0 +1,77 @@
+"""What can be known of a touch: the expected reading and its least error, against closed forms and brute force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tacpipe.simulation import fingertip_sp, pinch, touch_bound
+from tacpipe.simulation.grasp import stamp_ns
+from tacpipe.simulation.grasp_scene import Rig, feel, perform, sensors
+from tests.simulation.grasp_datasets import SEED, grasps, readings
+
+RIG = Rig()
+TRIALS = range(240)
+
+
+def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognormal_effort() -> None:
+    of = perform(SEED, 2, Rig(stiffness="rigid")).situation
+    rng = np.random.default_rng(1)
+    possible = touch_bound.readings(
+        of, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
+    )
+    mean, variance = touch_bound.known(possible)
+    limit = 140 * pinch.limits_n(of.opening_m)
+    expected = np.array([1676, 2779]) + limit * np.exp(0.02)
+    np.testing.assert_allclose(mean[:, -1], expected, atol=1.5)
+    np.testing.assert_allclose(variance[:, -1], limit**2 * np.exp(0.04) * (np.exp(0.04) - 1), rtol=0.03)
+
+
+def test_drift_and_noise_add_their_own_variances() -> None:
+    of = perform(SEED, 2, Rig(stiffness="rigid")).situation
+    rng = np.random.default_rng(2)
+    possible = touch_bound.readings(
+        of, sensors(SEED), rng, draws=20_000, effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0
+    )
+    periods = np.array([2.0, 3.0, 5.0])
+    expected = (30**2 / 3 * (periods / (2 * np.pi)) ** 2).sum() + 1 / 12  # of three waves, and of rounding
+    np.testing.assert_allclose(touch_bound.known(possible)[1][:, -1], expected, rtol=0.03)
+
+
+@pytest.mark.parametrize("index", [0, 1, 5])
+def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_the_rig(index: int) -> None:
+    scene = perform(SEED, index, RIG)
+    made = sensors(SEED)
+    rng = np.random.default_rng(index)
+    made_again = []
+    for _ in range(3_000):
+        hidden = pinch.unseen(rng, 1, RIG.effort_spread)
+        t_ns = stamp_ns(int(rng.integers(200_000)), RIG)
+        again = feel(made, replace(scene, hidden=hidden), t_ns, RIG)
+        made_again.append(fingertip_sp.counted(again.shown + made.noise * rng.normal(size=(2, 25))))
+    mean, variance = touch_bound.known(np.array(made_again))
+    found, spread = touch_bound.known(touch_bound.readings(scene.situation, made, rng, draws=3_000))
+    np.testing.assert_allclose(found, mean, atol=5 * np.sqrt(2 / 3_000) * np.sqrt(variance.max()))
+    np.testing.assert_allclose(np.sqrt(spread), np.sqrt(variance), rtol=0.15)
+
+
+def test_no_constant_comes_near_the_bound_and_the_readings_keep_to_it() -> None:
+    made = grasps(RIG, TRIALS)
+    for target in ("pdc_th", "pdc_mf", "e_th", "e_mf"):
+        read = readings(made, target)
+        error = read - readings(made, target, "truth", "gt_expected_")
+        variances = readings(made, target, "truth", "gt_variance_")
+        bound = np.sqrt(variances.mean())
+        constant = np.sqrt(read.var(axis=0).mean())
+        assert np.sqrt((error**2).mean()) == pytest.approx(bound, rel=0.15), target
+        assert bound < 0.85 * constant, target
+
+
+def test_the_least_error_is_the_root_of_the_mean_variance_by_target() -> None:
+    variances = np.zeros((4, 2, 25))
+    variances[:, 0, -1], variances[:, 1, -1] = [9, 9, 25, 25], 4
+    variances[:, 0, :-1], variances[:, 1, :-1] = 1, 36
+    found = touch_bound.irreducible_rmse(variances)
+    assert found == pytest.approx({"pdc_mf": np.sqrt(17), "pdc_th": 2, "e_mf": 1, "e_th": 6})
