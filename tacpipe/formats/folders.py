@@ -44,11 +44,11 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         )
     by_name: dict[str, list[Path]] = {}
     for folder in folders:
-        by_name.setdefault(_valid(folder.name), []).append(folder)
+        by_name.setdefault(valid(folder.name), []).append(folder)
     found: dict[str, dict[str, Path]] = {}
     for name, same in by_name.items():
         for folder in same:
-            unique = name if len(same) == 1 else _valid("-".join([*folder.relative_to(source).parts[:-1], name]))
+            unique = name if len(same) == 1 else valid("-".join([*folder.relative_to(source).parts[:-1], name]))
             found[unique] = {file: folder / file for file in names if file in holds[folder]}
     return dict(sorted(found.items()))
 
@@ -79,7 +79,7 @@ def require(files: Files, names: Sequence[str]) -> str:
     return folder.name
 
 
-def _valid(name: str) -> str:
+def valid(name: str) -> str:
     """Return a folder's name as that of a recording: letters, digits, dots, dashes and underscores."""
     short = name.removeprefix(PREFIX) or name
     return re.sub(r"[^A-Za-z0-9._-]+", "-", short).strip("-.") or "trial"

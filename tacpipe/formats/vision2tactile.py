@@ -1,0 +1,208 @@
+"""Grasps of a Shadow hand, felt by two BioTac SP and seen by a camera before: yayaneath/vision2tactile (RA-L 2020).
+
+A grasp is a folder named after its unix time, in the folder of its object: the object's cloud of points
+(``cloud-object.pcd``), the two points that the fingers were sent to (``best-grasp.txt``), and one reading of both fingers
+after they had closed (``tactile.tac``).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.folders import require, valid, walk
+from tacpipe.hashing import remembered_file_digest
+from tacpipe.stage import Files, Recording, stage
+
+if TYPE_CHECKING:
+    from tacpipe.clouds.cloud import Cloud
+    from tacpipe.clouds.grasp import Grasp
+
+CLOUD, GRASP, READING = NAMES = ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
+TWIN = "duplicate_of="  # begins the name of the file of an earlier grasp with the same reading
+UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 on
+VALUES = 58  # of a reading: 29 of the middle finger, then as many of the thumb
+LARGEST = 4095  # counts; the sensor's converter has twelve bits
+POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the wrist's rotation, row by row
+
+
+@dataclass(frozen=True)
+class Params:
+    """What counts as a grasp of the cloud."""
+
+    beside_mm: float = 20.0  # millimetres that a grasp point may lie from the nearest point of the cloud
+
+
+def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
+    """Return the files of each grasp below ``source`` by recording name, ``bleach-1561629162`` for ``bleach/1561629162/``.
+
+    Files are named as they lie, ``bleach/1561629162/tactile.tac``, so that object and time are part of a key. Where an
+    earlier grasp has the same reading, byte by byte, its file is there too, as ``duplicate_of=`` and that recording's name:
+    no other recording bears on a key. Raises `TacpipeError` if ``source`` is no folder, holds no grasp, or one twice.
+    """
+    if not source.is_dir():
+        raise TacpipeError(f"{source} is no folder; give the folder that holds those of the objects, bleach and so on.")
+    found: dict[str, dict[str, Path]] = {}
+    for place, _, names in walk(source):
+        there = [name for name in NAMES if name in names]
+        if not there:
+            continue
+        above, time_s = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
+        label = os.path.basename(above)  # noqa: PTH119
+        files = {f"{label}/{time_s}/{name}": Path(place, name) for name in there}
+        other = found.setdefault(valid(f"{label}-{time_s}"), files)
+        if other is not files:
+            raise TacpipeError(
+                f"{next(iter(other.values())).parent} and {place} are the same grasp. Give the folder that holds "
+                f"one of them."
+            )
+    if not found:
+        raise TacpipeError(
+            f"{source} holds no grasp: no folder in it has {', '.join(NAMES)}. Give the folder of the unpacked data set."
+        )
+    _add_twins(found)
+    return dict(sorted(found.items()))
+
+
+@stage(version=1, discover=discover)
+def vision2tactile(params: Params, files: Files) -> Recording:
+    """Return the streams cloud, grasp and reading of a grasp; one with the reading of an earlier one is marked."""
+    import numpy as np
+
+    from tacpipe import biotac_sp
+    from tacpipe.clouds.files import require_metres
+    from tacpipe.formats import channels, pcd
+
+    own = {Path(name).name: path for name, path in files.items() if not name.startswith(TWIN)}
+    label, time_s, _ = next(name for name in files if not name.startswith(TWIN)).split("/")
+    require(own, NAMES)
+    if not UNIX_TIME.fullmatch(time_s):
+        raise TacpipeError(
+            f"{own[CLOUD].parent} is named {time_s!r}; a grasp's folder must be named after its time, ten digits of unix "
+            f"seconds. Give it the name that it was published under."
+        )
+    cloud, grasp = pcd.read(own[CLOUD]), _grasp(own[GRASP])
+    require_metres(own[CLOUD], cloud)
+    _check_distance(own[GRASP], cloud, grasp, params.beside_mm)
+    t_ns = int(time_s) * 10**9
+    reading = channels.stream(np.array([t_ns]), [[value] for value in _reading(own[READING])], biotac_sp.fields())
+    twins = [name.removeprefix(TWIN) for name in files if name.startswith(TWIN)]
+    return Recording(
+        {"cloud": cloud.table(), "grasp": grasp.table(t_ns), "reading": reading},
+        {
+            "sensor": "biotac-sp",
+            "object": label,
+            "session": session(label, int(time_s)),
+            **({"duplicate_of": twins[0]} if twins else {}),
+        },
+    )
+
+
+def session(label: str, time_s: int) -> str:
+    """Return the session of a grasp: all of one object on one day (UTC).
+
+    Between days lie 18 hours or more of the published grasps, within one less than two: a grasp's own time tells its
+    session, whichever others are there.
+
+    >>> session("bleach", 1561629162)
+    'bleach-2019-06-27'
+    """
+    return f"{label}-{datetime.fromtimestamp(time_s, UTC).date()}"
+
+
+def _add_twins(found: dict[str, dict[str, Path]]) -> None:
+    """Add to each grasp the file of the earliest one that has the same reading, if that is another one."""
+    same: dict[str, list[tuple[str, str, Path]]] = defaultdict(list)  # digest: time, recording, file
+    for recording, files in found.items():
+        for name, path in files.items():
+            if name.endswith(READING):
+                same[remembered_file_digest(path)].append((name.split("/")[1], recording, path))
+    for several in same.values():
+        (_, first, path), *later = sorted(several)
+        for _, recording, _ in later:
+            found[recording][f"{TWIN}{first}"] = path
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a small file of text. Raises `TacpipeError` if it is empty, or none."""
+    try:
+        lines = path.read_text("ascii").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TacpipeError(f"{path} cannot be read as text: {error}. Copy it again from its source.") from error
+    while lines and not lines[-1].strip():
+        lines.pop()
+    if not lines:
+        raise TacpipeError(f"{path} is empty. Copy it again from its source, or leave the grasp out.")
+    return lines
+
+
+def _grasp(path: Path) -> Grasp:
+    """Return the grasp of a file: six numbers in one line, metres, or these and nine of the wrist's rotation."""
+    import numpy as np
+
+    from tacpipe.clouds.grasp import Grasp
+
+    lines = _lines(path)
+    cells = lines[0].split(",")
+    if len(lines) > 1 or len(cells) not in (POINTS, WITH_WRIST):
+        raise TacpipeError(
+            f"{path} has {len(lines)} lines, the first of {len(cells)} numbers; it must be one line of {POINTS} numbers, "
+            f"two points in metres, or of {WITH_WRIST}, these and the wrist's rotation row by row. Copy it again."
+        )
+    try:
+        values = np.array([float(cell) for cell in cells])
+    except ValueError as error:
+        raise TacpipeError(f"{path}, row 1: {error}; all {len(cells)} cells must be numbers. Copy it again.") from error
+    try:
+        return Grasp(values[:3], values[3:6], values[6:].reshape(3, 3) if len(cells) == WITH_WRIST else None)
+    except TacpipeError as error:
+        raise TacpipeError(f"{path}: {error}") from error
+
+
+def _check_distance(path: Path, cloud: Cloud, grasp: Grasp, beside_mm: float) -> None:
+    """Raise `TacpipeError` where a grasp point lies far from the cloud: then they are of two frames, or two grasps."""
+    import numpy as np
+
+    for name, point_m in (("first", grasp.g1_m), ("second", grasp.g2_m)):
+        distance_mm = 1e3 * float(np.linalg.norm(cloud.points_m - point_m, axis=1).min())
+        if not distance_mm <= beside_mm:
+            raise TacpipeError(
+                f"{path}: the {name} point lies {distance_mm:.1f} mm from the nearest point of {CLOUD}; it must be "
+                f"{beside_mm:g} mm or less, in one frame and in metres. Copy both files again, or allow more with "
+                f"--beside-mm."
+            )
+
+
+def _reading(path: Path) -> list[int]:
+    """Return the 58 counts of a reading's one line, which begins with a comma. Raises `TacpipeError` for another line."""
+    lines = _lines(path)
+    if len(lines) != 1:
+        raise TacpipeError(
+            f"{path} has {len(lines)} rows; a grasp has one reading, in one row. Keep the one that was taken in the grasp."
+        )
+    first, *cells = lines[0].split(",")
+    if first.strip() or len(cells) != VALUES:
+        more = (
+            f", as many as {len(cells) // VALUES} readings" if len(cells) > VALUES and not len(cells) % VALUES else ""
+        )
+        empty = "an empty first one" if not first.strip() else f"{first[:20]!r} as the first one"
+        raise TacpipeError(
+            f"{path}, row 1: there are {len(cells) + 1} fields with {empty}{more}; there must be {VALUES + 1}, the first "
+            f"empty, then {VALUES // 2} counts of the middle finger and {VALUES // 2} of the thumb. Copy it again."
+        )
+    values = []
+    for place, cell in enumerate(cells, start=2):
+        text = cell.strip()
+        if not (text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= LARGEST):
+            raise TacpipeError(
+                f"{path}, row 1, field {place}: {text[:20]!r} is no count; it must be a whole number from 0 to {LARGEST} "
+                f"(12 bits). Copy it again."
+            )
+        values.append(int(text))
+    return values
