@@ -1,0 +1,108 @@
+"""Cut grasps down to what touch is foretold from, and to what was felt: the object's points and one reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Recording, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Shard
+
+RAW, FINISHED = ("scene", "grasp", "biotac_sp"), ("cloud", "grasp", "reading")
+
+
+@dataclass(frozen=True)
+class Params:
+    """What counts as the grasped object in a view of a camera, and as contact in what two BioTac SP felt.
+
+    Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
+    """
+
+    plane_mm: float = 6.0  # millimetres from the table's plane, within which points belong to it; more if it is noisy
+    plane_share: float = 0.2  # of the scene's points, that the table must hold
+    plane_trials: int = 1000  # random samples by which a plane is looked for
+    seed: int = 0  # of these samples
+    cluster_mm: float = 12.0  # millimetres between neighbours in one thing
+    cluster_points: int = 6  # points so near to one another, without which a point is stray
+    object_points: int = 50  # points that a thing must have; fewer are noise of the table
+    near_mm: float = 20.0  # millimetres that the object may be from the line between the fingers, or from its sight
+    outlier_neighbours: int = 20  # points whose mean distance tells a stray one at the object's rim
+    outlier_deviations: float = 5.0  # standard deviations of that distance above its mean, beyond which it is stray
+    rest_s: float = 0.5  # seconds at the start whose median is each finger's pressure without load
+    on_count: float = 20.0  # device counts of pressure above that, from which on a finger surely presses; noise is 0.25
+    settle_s: float = 0.2  # seconds that both must press, and whose median is the reading
+    settled_count: float = 3.0  # device counts by which pressure may vary in that time, and still is settled
+
+
+@stage(version=1)
+def grasps(params: Params, recording: Shard) -> Recording:
+    """Find the grasped object in the camera's view, and what the fingers felt once they had closed on it.
+
+    Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
+    of each channel after contact, stamped where it begins; ``contact_ns`` tells when both fingers first touched. Other
+    streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``reading``
+    already stays as it is.
+    """
+    from tacpipe.clouds.cloud import Cloud
+    from tacpipe.clouds.grasp import Grasp
+    from tacpipe.clouds.segmentation import Limits, object_rows
+
+    given = {name: recording.table(name) for name in recording.streams}
+    if set(FINISHED) <= set(given):
+        return Recording(given)
+    missing = [name for name in RAW if name not in given]
+    if missing:
+        raise TacpipeError(
+            f"Recording {recording.name} has no {' and no '.join(missing)}; a grasp has the streams {', '.join(RAW)}, or "
+            f"{', '.join(FINISHED)} once it is segmented. Give recordings of grasps."
+        )
+    limits = Limits(
+        plane_m=params.plane_mm / 1e3,
+        plane_share=params.plane_share,
+        plane_trials=params.plane_trials,
+        cluster_m=params.cluster_mm / 1e3,
+        cluster_points=params.cluster_points,
+        object_points=params.object_points,
+        near_m=params.near_mm / 1e3,
+        outlier_neighbours=params.outlier_neighbours,
+        outlier_deviations=params.outlier_deviations,
+    )
+    try:
+        scene = Cloud.of(given.pop("scene"))
+        rows = object_rows(scene, Grasp.of(given["grasp"]), limits, params.seed)
+        reading, contact_ns = _reading(params, given.pop("biotac_sp"))
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {recording.name}: {error}") from error
+    kept = {name: table for name, table in given.items() if table.num_rows == 1}
+    cloud = Cloud(scene.points_m[rows], None if scene.colours is None else scene.colours[rows])
+    return Recording({"cloud": cloud.table(), "reading": reading, **kept}, {"contact_ns": contact_ns})
+
+
+def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
+    """Return the row that the fingers felt when they had closed, and when both first touched."""
+    import numpy as np
+
+    from tacpipe import biotac_sp
+    from tacpipe.formats import channels
+    from tacpipe.signals.contact_moment import Limits, contact_row, settled_rows
+
+    fields = biotac_sp.fields()
+    missing = [field.name for field in fields if field.name not in stream.column_names]
+    if missing:
+        raise TacpipeError(
+            f"The stream biotac_sp lacks {len(missing)} of {len(fields)} columns, as {missing[0]}. Record both "
+            f"fingers whole."
+        )
+    limits = Limits(params.rest_s, params.on_count, params.settle_s, params.settled_count)
+    t_ns = stream.column("t_ns").to_numpy()  # (time,)
+    names = [column for target in biotac_sp.TARGETS if target.startswith("pdc") for column in biotac_sp.columns(target)]
+    pressure = np.column_stack([stream.column(name).to_numpy() for name in names]).astype(np.float64)  # (time, finger)
+    contact = contact_row(pressure, t_ns, limits)
+    rows = settled_rows(pressure, t_ns, contact, limits)
+    felt = [np.rint(np.median(stream.column(field.name).to_numpy()[rows], keepdims=True)) for field in fields]
+    return channels.stream(t_ns[rows.start : rows.start + 1], felt, fields), int(t_ns[contact])

@@ -1,0 +1,96 @@
+"""Files of clouds as users have them: PLY, PCD, and points as lines of text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tacpipe.clouds import ply
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.library import open3d
+from tacpipe.errors import TacpipeError
+
+TEXT = (".pts", ".xyz", ".xyzn", ".xyzrgb")  # a line a point
+SUFFIXES = (".pcd", ".ply", *TEXT)
+LARGEST_M = 10.0  # of what a hand's camera sees; a cloud in millimetres is a thousand times as large as one in metres
+
+
+def read(path: Path | str) -> Cloud:
+    """Return the cloud of a file, in metres, with colours where it has any; its ending tells the format.
+
+    Raises `TacpipeError`, naming the file, where it is missing, no cloud, empty or cut off, where points are not finite, and
+    where the cloud is so large that its unit must be another one.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise TacpipeError(f"{path} is no cloud that can be read; it must end in one of {', '.join(SUFFIXES)}.")
+    if not path.is_file():
+        raise TacpipeError(f"There is no file {path}; give the file of a cloud of points.")
+    if not path.stat().st_size:
+        raise TacpipeError(f"{path} is empty. Copy it again from its source.")
+    cloud = _pcd(path) if path.suffix.lower() == ".pcd" else _by_open3d(path, _told(path))
+    require_metres(path, cloud)
+    return cloud
+
+
+def require_metres(path: Path, cloud: Cloud) -> None:
+    """Raise `TacpipeError` where a cloud is larger than `LARGEST_M`."""
+    extent_m = float(np.ptp(cloud.points_m, axis=0).max(initial=0.0))
+    if extent_m > LARGEST_M:
+        raise TacpipeError(
+            f"{path} is {extent_m:.4g} m long; clouds are {LARGEST_M:g} m at most. It looks like millimetres: divide its "
+            f"coordinates by 1000."
+        )
+
+
+def _pcd(path: Path) -> Cloud:
+    from tacpipe.formats import pcd
+
+    header = pcd.read_header(path)
+    return _by_open3d(path, header.points) if header.data == "binary_compressed" else pcd.read(path)
+
+
+def _told(path: Path) -> int:
+    """Return how many points a file tells of: its header, or its lines."""
+    if path.suffix.lower() == ".ply":
+        return ply.points(path)
+    lines = path.read_bytes().splitlines()
+    filled = [line.split() for line in lines if line.strip() and not line.startswith(b"#")]
+    if path.suffix.lower() != ".pts":
+        return len(filled)
+    if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit():
+        raise TacpipeError(f"{path} is no PTS file: its first line must be the number of points alone.")
+    return int(filled[0][0])
+
+
+def _by_open3d(path: Path, told: int) -> Cloud:
+    """Return the cloud that open3d reads, if it is what the file tells."""
+    with open3d() as library:
+        found = library.io.read_point_cloud(str(path), format=path.suffix.lower()[1:])
+        points, colours = np.asarray(found.points), np.asarray(found.colors)  # (point, xyz), (point, rgb) from 0 to 1
+    held = _rows(path) if path.suffix.lower() == ".pts" else len(points)
+    if min(held, len(points)) != told or not told:
+        raise TacpipeError(
+            f"{path} tells of {told} points, and {min(held, len(points))} can be read: it was cut off, or some are no "
+            f"numbers. Copy it again from its source."
+        )
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        raise TacpipeError(
+            f"{path} holds {np.count_nonzero(~finite)} of {told} points that are not finite (NaN), the first being point "
+            f"{int(np.argmin(finite))}. Remove them and save the cloud again."
+        )
+    if not found.has_colors():
+        return Cloud(points.astype(np.float32))
+    if not (colours.min() >= 0 and colours.max() <= 1):
+        raise TacpipeError(
+            f"{path} has colours from {colours.min():g} to {colours.max():g}; in its format they are shares from 0 to 1. "
+            f"Divide them by 255."
+        )
+    return Cloud(points.astype(np.float32), np.rint(colours * 255).astype(np.uint8))
+
+
+def _rows(path: Path) -> int:
+    """Return how many points follow the number of a PTS file; open3d makes up those that are missing."""
+    return sum(1 for line in path.read_bytes().splitlines()[1:] if len(line.split()) >= 3)

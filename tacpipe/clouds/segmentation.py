@@ -1,0 +1,169 @@
+"""The object of a grasp, told from its table and the things beside it in a view of the camera.
+
+What lies in front of the table's plane falls into clusters, and the object is the one that is nearest to the grasp. The
+plane is found by random samples (Fischler and Bolles, "Random Sample Consensus", 1981), clusters by density (Ester et al.,
+"A Density-Based Algorithm for Discovering Clusters", 1996), both through open3d; a seed gives the same again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.clouds.library import open3d
+from tacpipe.errors import TacpipeError
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+PLANES = 4  # the largest ones, among which the table is looked for: a floor, walls and sides of boxes may be larger
+LONGEST_M = 0.4  # that an object may be along any axis; the published ones are 0.28 m at most
+DEEPEST_M = 0.1  # that an object can be above the middle of a grasp: 20 cm are more than a hand can lift so
+NOISES = 3.0  # standard deviations of the table's points about its plane, beyond which a point lies in front of it
+SAMPLED = 10_000  # points that tell a plane as well as all of a view do
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What counts as table, as one thing, and as the thing that was grasped."""
+
+    plane_m: float  # from a plane, within which points belong to it; more where they spread more
+    plane_share: float  # of all points, that the table must hold
+    plane_trials: int  # random samples for each plane
+    cluster_m: float  # between neighbours in one thing
+    cluster_points: int  # that a point must have so near, itself included, to be inside of a thing
+    object_points: int  # that a thing must have
+    near_m: float  # that the object may be from the grasp
+    outlier_neighbours: int  # whose mean distance tells a stray point
+    outlier_deviations: float  # standard deviations of that distance above its mean, beyond which a point is stray
+
+
+def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Rows:
+    """Return which points of a view (point,) are the grasped object, in their order; the camera is at the origin.
+
+    Raises `TacpipeError` where no table is found, nothing stands on it, nothing that stands there is near
+    the grasp, or that is too long for an object.
+    """
+    points_m = scene.points_m.astype(np.float64)
+    above_m = heights_m(points_m, table_plane(points_m, grasp, limits, seed))  # (point,)
+    spread_m = 1.4826 * float(np.median(np.abs(above_m[np.abs(above_m) <= 3 * limits.plane_m])))  # standard deviation
+    front = np.flatnonzero(above_m > max(limits.plane_m, NOISES * spread_m))
+    labels = _clusters(points_m[front], limits)
+    if not (labels >= 0).any():
+        raise TacpipeError(
+            f"Nothing stands on the table: of {len(front)} points in front of it no {limits.object_points} are near one "
+            f"another, within {1e3 * limits.cluster_m:g} mm. Check the scene, or lower --object-points."
+        )
+    distances_m = np.where(labels >= 0, from_grasp_m(points_m[front], grasp), np.inf)
+    nearest = int(distances_m.argmin())
+    if distances_m[nearest] > limits.near_m:
+        raise TacpipeError(
+            f"No object is near the grasp: of {len(np.unique(labels[labels >= 0]))} things on the table the nearest is "
+            f"{1e3 * distances_m[nearest]:.1f} mm from the lines of the grasp; it must be "
+            f"{1e3 * limits.near_m:g} mm or less, in one frame. Check the grasp, or allow more with --near-mm."
+        )
+    rows = front[labels == labels[nearest]]
+    length_m = float(np.ptp(points_m[rows], axis=0).max())
+    if length_m > LONGEST_M:
+        raise TacpipeError(
+            f"What is near the grasp is {1e3 * length_m:.0f} mm long, and what a hand lifts {1e3 * LONGEST_M:g} mm at most: "
+            f"it has grown together with the table, or with things beside it. Raise --plane-mm or lower --cluster-mm."
+        )
+    found: Rows = rows[_inliers(points_m[rows], limits)]
+    return found
+
+
+def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -> Floats:
+    """Return the table's plane (normal and offset, 4): of the large ones behind the middle of the grasp the nearest.
+
+    The normal has length 1 and points to the camera's side, where the grasp lies. Sides of the object are no table: the
+    grasp lies within it, behind what the camera sees. Raises `TacpipeError` if there is no such plane that holds
+    ``plane_share`` of the points (point, xyz).
+    """
+    left = np.arange(len(points_m))
+    found: list[tuple[float, Floats]] = []
+    shares: list[float] = []
+    while len(shares) < PLANES and len(left) >= max(3.0, limits.plane_share * len(points_m)):
+        plane = _largest_plane(points_m[left], limits, seed)
+        within = np.abs(heights_m(points_m[left], plane)) <= limits.plane_m
+        shares.append(np.count_nonzero(within) / len(points_m))
+        height_m = float(heights_m(grasp.middle_m[None], plane)[0])
+        if shares[-1] >= limits.plane_share and height_m > limits.plane_m:
+            found.append((height_m, plane))
+        left = left[~within]
+    if found:
+        return min(found, key=lambda item: item[0])[1]
+    told = ", ".join(f"{100 * share:.0f}" for share in shares) or "0"
+    raise TacpipeError(
+        f"No table is found: the largest planes hold {told} % of {len(points_m)} points, and one with the grasp in front of "
+        f"it must hold {100 * limits.plane_share:g} %. Give the view with its table, or the object's points as the stream "
+        f"`cloud`."
+    )
+
+
+def heights_m(points_m: Floats, plane: Floats) -> Floats:
+    """Return how far points (point, xyz) lie in front of a plane (4,), metres (point,); behind it negative."""
+    found: Floats = points_m @ plane[:3] + plane[3]
+    return found
+
+
+def from_grasp_m(points_m: Floats, grasp: Grasp) -> Floats:
+    """Return how far points (point, xyz) lie from a grasp, metres (point,): from its two lines, whichever is nearer.
+
+    One goes from finger to finger, through the object. The other goes from the middle `DEEPEST_M` towards the camera, and
+    meets what the camera sees of the object, though the fingers may lie far beneath it.
+    """
+    towards = -grasp.middle_m / np.linalg.norm(grasp.middle_m)  # (xyz), from the middle to the camera
+    lines = ((grasp.g1_m, grasp.closing, grasp.opening_m), (grasp.middle_m, towards, DEEPEST_M))
+    return np.minimum(*(_from_line_m(points_m, *line) for line in lines))
+
+
+def _from_line_m(points_m: Floats, start_m: Floats, direction: Floats, length_m: float) -> Floats:
+    """Return how far points (point, xyz) lie from a straight line with two ends, metres (point,)."""
+    along_m = np.clip((points_m - start_m) @ direction, 0, length_m)
+    found: Floats = np.linalg.norm(points_m - start_m - along_m[:, None] * direction, axis=1)
+    return found
+
+
+def _cloud(library: Any, points_m: Floats) -> Any:
+    return library.geometry.PointCloud(library.utility.Vector3dVector(points_m))
+
+
+def _largest_plane(points_m: Floats, limits: Limits, seed: int) -> Floats:
+    """Return the plane (4,) that the most points (point, xyz) lie in, told from `SAMPLED` of them."""
+    sampled = points_m
+    if len(points_m) > SAMPLED:
+        sampled = np.random.default_rng(seed).choice(points_m, SAMPLED, replace=False)
+    with open3d() as library:
+        library.utility.random.seed(seed)
+        plane, _ = _cloud(library, sampled).segment_plane(
+            limits.plane_m, 3, limits.plane_trials, probability=1.0
+        )  # all trials are made: with fewer the result would depend on the number of threads
+    found = np.asarray(plane, dtype=np.float64)
+    found /= np.linalg.norm(found[:3])
+    return found if found[3] >= 0 else -found
+
+
+def _clusters(points_m: Floats, limits: Limits) -> NDArray[np.int64]:
+    """Return the number of the cluster of each point (point,), -1 for those of none with ``object_points``."""
+    if not len(points_m):
+        return np.zeros(0, dtype=np.int64)
+    with open3d() as library:
+        found = _cloud(library, points_m).cluster_dbscan(limits.cluster_m, limits.cluster_points)
+    labels = np.asarray(found, np.int64)
+    sizes = np.bincount(labels + 1)  # (cluster,), the first being that of no cluster
+    return np.where(sizes[labels + 1] >= limits.object_points, labels, -1)
+
+
+def _inliers(points_m: Floats, limits: Limits) -> Rows:
+    """Return which points (point, xyz) are no stray ones."""
+    with open3d() as library:
+        _, kept = _cloud(library, points_m).remove_statistical_outlier(
+            limits.outlier_neighbours, limits.outlier_deviations
+        )
+    return np.sort(np.asarray(kept, dtype=np.intp))

@@ -1,0 +1,176 @@
+"""Raw grasps, made up, cut down to the object's points and one reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe import biotac_sp
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.errors import TacpipeError
+from tacpipe.formats import channels
+from tacpipe.registry import load
+from tacpipe.simulation.tabletop import OBJECT
+from tacpipe.stage import Recording
+from tests.clouds.scene_fakes import Scene, scene
+
+START_NS = 1_561_629_162_000_000_000
+STEP_NS = 10_000_000
+CLOSED, SETTLED = 130, 160  # rows: both fingers touch, and press as hard as they will
+grasps = load("segment.grasps")
+Shard = Callable[..., Any]
+
+
+def felt(rows: int = 300) -> pa.Table:
+    """Return both fingers' stream: channel k has the level 1000 + k, and 300 more from row `SETTLED` on."""
+    level = 1000 + np.arange(58)[:, None] + 300 * np.clip((np.arange(rows) - CLOSED) / (SETTLED - CLOSED), 0, 1)
+    return channels.stream(START_NS + np.arange(rows) * STEP_NS, list(np.rint(level)), biotac_sp.fields())
+
+
+def raw(whole: Scene, **other: pa.Table) -> dict[str, pa.Table]:
+    return {"scene": whole.cloud.table(), "grasp": whole.grasp.table(START_NS), "biotac_sp": felt(), **other}
+
+
+def cut(recording: Any, **params: Any) -> Recording:
+    found = grasps(grasps.params(**params), recording)
+    assert isinstance(found, Recording)
+    return found
+
+
+@pytest.fixture(scope="module")
+def simulated() -> list[Recording]:
+    """Raw grasps of the simulated rig, one of each family of objects."""
+    simulate = load("simulate.touch")
+    params = simulate.params(trials=6, seed=11, objects=1, raw=True)
+    return [simulate(params, trial) for trial in range(6)]
+
+
+def of_truth(recording: Recording, name: str) -> Any:
+    return recording.streams["truth"].column(name)[0].as_py()
+
+
+def test_of_simulated_scenes_nearly_all_points_of_the_object_and_nearly_no_others_are_found(
+    shard: Shard, simulated: list[Recording]
+) -> None:
+    for recording in simulated:
+        found = Cloud.of(cut(shard(recording.streams)).streams["cloud"]).points_m
+        whole = Cloud.of(recording.streams["scene"]).points_m
+        is_object = recording.streams["scene_truth"].column("gt_surface").to_numpy() == OBJECT
+        theirs = set(map(tuple, whole[is_object].tolist()))
+        right = sum(point in theirs for point in map(tuple, found.tolist()))
+        assert right >= 0.95 * len(found) and right >= 0.95 * len(theirs)
+
+
+def test_of_simulated_streams_contact_and_reading_are_those_of_the_truth(
+    shard: Shard, simulated: list[Recording]
+) -> None:
+    for recording in simulated:
+        found, stream = cut(shard(recording.streams)), recording.streams["biotac_sp"]
+        t_ns = stream.column("t_ns").to_numpy()
+        begin_ns, hold_ns, release_ns = (
+            of_truth(recording, f"gt_{name}_ns") for name in ("contact", "hold", "release")
+        )
+        held, free = (t_ns > hold_ns) & (t_ns < release_ns), t_ns < begin_ns
+        at_ns = []  # the force grows as s²(3 - 2s) from contact to hold; here it has raised the pressure by a count
+        for finger in biotac_sp.FINGERS:
+            pressure = stream.column(f"{finger}_pdc").to_numpy().astype(float)
+            share = np.linspace(0, 1, 100_001)
+            rise = (np.median(pressure[held]) - np.median(pressure[free])) * share**2 * (3 - 2 * share)
+            at_ns.append(begin_ns + share[np.searchsorted(rise, 1.0)] * (hold_ns - begin_ns))
+        contact_ns = found.attributes["contact_ns"]
+        assert isinstance(contact_ns, int)
+        assert abs(contact_ns - max(at_ns)) <= 2 * STEP_NS
+        reading = found.streams["reading"]
+        assert abs(reading.column("t_ns")[0].as_py() - hold_ns) <= 6 * STEP_NS
+        for field in biotac_sp.fields():
+            channel = stream.column(field.name).to_numpy()[held].astype(float)
+            error = abs(reading.column(field.name)[0].as_py() - np.median(channel))
+            assert error <= 1 + 4 * channel.std() / np.sqrt(20 / 1.57)  # the spread of a median of 20 rows
+
+
+def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Shard) -> None:
+    whole = scene(1)
+    truth = pa.table({"t_ns": [START_NS], "gt_force_n": [2.0]})
+    found = cut(shard(raw(whole, truth=truth)))
+    assert set(found.streams) == {"cloud", "grasp", "reading", "truth"}
+    cloud = Cloud.of(found.streams["cloud"])
+    theirs = {tuple(point) for point in whole.cloud.points_m[whole.ball].tolist()}
+    right = sum(tuple(point) in theirs for point in cloud.points_m.tolist())
+    assert right >= 0.95 * len(cloud) and right >= 0.95 * len(theirs)
+    of_point = dict(zip(map(tuple, whole.cloud.points_m.tolist()), np.asarray(whole.cloud.colours), strict=True))
+    assert cloud.colours is not None
+    for point, colour in zip(cloud.points_m.tolist(), cloud.colours, strict=True):
+        assert (of_point[tuple(point)] == colour).all()
+    np.testing.assert_array_equal(Grasp.of(found.streams["grasp"]).g1_m, whole.grasp.g1_m)
+    assert found.streams["truth"].equals(truth)
+
+
+def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_one(shard: Shard) -> None:
+    found = cut(shard(raw(scene(1))))
+    reading = found.streams["reading"]
+    assert reading.schema.equals(
+        channels.stream(np.array([0]), [[0]] * 58, biotac_sp.fields()).schema, check_metadata=True
+    )
+    assert reading.num_rows == 1
+    values = [reading.column(field.name)[0].as_py() for field in biotac_sp.fields()]
+    assert values == (1300 + np.arange(58)).tolist()
+    contact_ns = found.attributes["contact_ns"]
+    assert isinstance(contact_ns, int)
+    assert abs(contact_ns - START_NS - CLOSED * STEP_NS) <= 2 * STEP_NS
+    assert SETTLED - 1 <= (reading.column("t_ns")[0].as_py() - START_NS) / STEP_NS <= SETTLED
+
+
+def test_single_wrong_readings_in_the_window_do_not_count(shard: Shard) -> None:
+    stream = felt()
+    column = stream.column("mf_electrode07").to_numpy().copy()
+    column[[SETTLED + 3, SETTLED + 9]] = 4095
+    place = stream.column_names.index("mf_electrode07")
+    stream = stream.set_column(place, stream.schema.field(place), pa.array(column))
+    found = cut(shard(raw(scene(1), biotac_sp=stream)))
+    assert found.streams["reading"].column("mf_electrode07")[0].as_py() == 1306
+
+
+def test_a_scene_without_colours_gives_a_cloud_without_them(shard: Shard) -> None:
+    whole = scene(1)
+    found = cut(shard(raw(whole, scene=Cloud(whole.cloud.points_m).table())))
+    assert found.streams["cloud"].column_names == ["x_m", "y_m", "z_m"]
+
+
+def test_a_finished_grasp_stays_as_it_is(shard: Shard) -> None:
+    whole = scene(1)
+    first = cut(shard(raw(whole)))
+    again = cut(shard(first.streams))
+    assert set(again.streams) == set(first.streams)
+    for name, table in again.streams.items():
+        assert table.equals(first.streams[name], check_metadata=True)
+    assert again.attributes == {}
+
+
+def test_what_a_raw_grasp_lacks_is_told(shard: Shard) -> None:
+    whole = raw(scene(1))
+    with pytest.raises(
+        TacpipeError, match="Recording trial has no scene and no biotac_sp; a grasp has the streams scene"
+    ):
+        cut(shard({"grasp": whole["grasp"]}))
+    with pytest.raises(TacpipeError, match="lacks 1 of 58 columns, as th_pdc"):
+        cut(shard({**whole, "biotac_sp": whole["biotac_sp"].drop_columns("th_pdc")}))
+
+
+def test_what_cannot_be_found_is_told_with_the_recording(shard: Shard) -> None:
+    whole = scene(1)
+    away = whole.grasp.moved(np.eye(3), 0.3 * whole.normal)
+    with pytest.raises(TacpipeError, match=r"Recording trial: No object is near the grasp: .* mm from the lines"):
+        cut(shard(raw(whole, grasp=away.table(START_NS))))
+    with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
+        cut(shard(raw(whole, scene=Cloud(whole.cloud.points_m[whole.ball]).table())))
+    with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
+        cut(shard(raw(whole, biotac_sp=felt(CLOSED))))
+    with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
+        cut(shard(raw(whole)), on_count=400.0)
+    with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
+        cut(shard(raw(whole)), plane_share=0.99)
