@@ -17,6 +17,7 @@ SUMMARIES = {
     "show": "Show what is in a dataset: recordings, streams, rates, gaps, saturation, labels.",
     "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
     "store": "Look after the store: status, verify, repair, gc, link, push, pull.",
+    "candidates": "List grasps that two fingers could make on an object, and what a model says each would feel.",
     "demo": "Run the main job on the simulated rig, small, from recordings to a report.",
 }
 
@@ -71,6 +72,12 @@ def _store(program: typer.Typer) -> None:
     store_command.add(program, SUMMARIES["store"])
 
 
+def _candidates(program: typer.Typer) -> None:
+    from tacpipe import candidates_command
+
+    candidates_command.add(program, SUMMARIES["candidates"])
+
+
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `tacpipe show DATASET | head` ends as it does for any Unix tool
     print(json.dumps(value) if as_json else to_text(value, **options))
@@ -81,5 +88,6 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "show": _show,
     "explain": _explain,
     "store": _store,
+    "candidates": _candidates,
     "demo": _demo,
 }

@@ -34,7 +34,9 @@ def lab(chained: Path) -> Path:
     return chained
 
 
-@pytest.mark.parametrize("words", ["--help", "train --help", "train forward --help", "store gc --help", "show --help"])
+@pytest.mark.parametrize(
+    "words", ["--help", "train --help", "train forward --help", "store gc --help", "show --help", "candidates --help"]
+)
 def test_help_imports_nothing_heavy(tmp_path: Path, words: str) -> None:
     assert imported(tmp_path, words) & HEAVY == set()
 

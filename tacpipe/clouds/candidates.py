@@ -1,0 +1,226 @@
+"""Grasps that two fingers could make on an object seen by one camera, best first.
+
+The way of GeoGrasp (Zapata-Impata, Gil, Pomares, Torres: "Fast geometry-based computation of grasping points on
+three-dimensional point clouds", 2019): a plane at right angles to the object's first principal axis cuts the cloud, and the
+fingers close on the two edges of the cut that lie farthest apart across the view. As in the letter (RA-L 2020, data
+collection) the plane is shifted along the axis at random. Among the points of both edges that pair is taken whose line
+meets both surfaces most squarely, runs across the axis and the view, and stays near the plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.clouds.normals import CAMERA_M, normals
+from tacpipe.errors import TacpipeError, UsageError
+
+Floats = NDArray[np.float64]
+
+COUNT = 10
+SHIFT = (
+    0.4  # share of the object's length: the published grasps lie up to 0.45 from the centroid, nine in ten within 0.33
+)
+OPENING_M = (0.020, 0.130)  # of the published grasps 0.026 to 0.121
+FEWEST = 50  # points of a cloud that tells a shape; published ones have 814 and more
+MOST = 20_000  # points that are looked at: more add time and no shape
+FEWEST_CUT = 6  # points of a cut
+FLAT_M = (
+    0.003  # thickness below which a cloud is a plane with noise (1.5 mm at a metre); the thinnest published has 26 mm
+)
+HALF_CUT_M = 0.007  # half the thickness of a cut, as in GeoGrasp
+TRIM = 0.02  # share of a cut's points at either end that may be stray
+EDGE = 0.2  # share of a cut's width that is an edge
+TRIES = 3  # cuts for each candidate, of which the best stays
+UPRIGHT = (
+    0.9  # cosine to the view above which the first axis cannot be cut across: the object stands towards the camera
+)
+OFF_PLANE = 0.4  # weight of the mean distance to the plane, against 1 for each cosine; chosen on the published grasps
+OFF_CENTRE = 0.5  # weight of the distance to the centroid: what is held far from it turns in the hand
+FIRST = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)  # g1 to g2 points right and down in the picture in all published grasps
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A grasp that could be made, and what speaks for it."""
+
+    grasp: Grasp
+    score: float  # 1 at best; less for each thing that is off
+    off_deg: float  # angle between the closing axis and the surface's normal, at the finger where it is larger
+    shift_m: float  # along the first axis from the centroid to the cut
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A cloud's own directions: along the object, across it as the camera sees it, and the way the camera looks."""
+
+    centre_m: Floats  # (xyz)
+    along: Floats
+    across: Floats
+    view: Floats
+    length_m: float
+
+
+def candidates(
+    cloud: Cloud,
+    count: int = COUNT,
+    seed: int = 0,
+    shift: float = SHIFT,
+    opening_m: tuple[float, float] = OPENING_M,
+    camera_m: Sequence[float] = CAMERA_M,
+) -> list[Candidate]:
+    """Return up to ``count`` grasps spread along the object, best first; the same arguments give the same ones.
+
+    The cuts lie up to ``shift`` of the object's length from its centroid on either side, one in each of ``count`` equal
+    stretches; a stretch where no pair is ``opening_m`` apart has none. Grasp points are points of the cloud. The wrist's
+    axes are approach (the way the camera looks, as far as it is at right angles to the closing axis), closing axis and
+    their cross product. Raises `TacpipeError` for a cloud too small or flat, for a camera within it, and where no cut is as
+    wide as the fingers open; `UsageError` for arguments that cannot be.
+    """
+    _require_possible(count, shift, opening_m)
+    cloud = _thinned(cloud, seed)
+    frame = _frame(cloud, camera_m)
+    cuts = _Cuts(cloud, frame, camera_m, opening_m)
+    bounds = np.linspace(-shift, shift, count + 1) * frame.length_m
+    draws = np.random.default_rng(seed).uniform(size=(count, TRIES))
+    found = []
+    for low, high, shares in zip(bounds[:-1], bounds[1:], draws, strict=True):
+        tried = [cuts.best(low + share * (high - low)) for share in (shares if shift else shares[:1])]
+        held = [candidate for candidate in tried if candidate is not None]
+        if held:
+            found.append(max(held, key=lambda candidate: candidate.score))
+        if not shift:
+            break  # every stretch is the same point
+    if not found:
+        raise TacpipeError(_too_wide(cuts.widths_m, opening_m))
+    return sorted(found, key=lambda candidate: -candidate.score)
+
+
+def _require_possible(count: int, shift: float, opening_m: tuple[float, float]) -> None:
+    if count < 1:
+        raise UsageError(f"{count} candidates were asked for; it must be 1 or more.")
+    if not 0 <= shift <= 0.5:
+        raise UsageError(
+            f"The shift is {shift:g} of the object's length; it must lie between 0 and 0.5, where it ends."
+        )
+    if not 0 < opening_m[0] < opening_m[1]:
+        raise UsageError(
+            f"The fingers open {opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm; the first must be above 0 and below "
+            f"the second."
+        )
+
+
+def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
+    limits = f"{opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm"
+    if not widths_m:
+        return (
+            f"No cut through the cloud has {FEWEST_CUT} points within {HALF_CUT_M * 1e3:g} mm; the cloud is too sparse to "
+            f"tell where its edges are. Take one with more points."
+        )
+    return (
+        f"The object is {min(widths_m) * 1e3:.0f} to {max(widths_m) * 1e3:.0f} mm wide where it was cut, and the fingers "
+        f"open {limits}. Turn the object, or give the limits of your hand."
+    )
+
+
+def _thinned(cloud: Cloud, seed: int) -> Cloud:
+    if len(cloud) < FEWEST:
+        raise TacpipeError(
+            f"The cloud has {len(cloud)} points; to tell a shape it takes {FEWEST} or more. Is it the object's cloud?"
+        )
+    if len(cloud) <= MOST:
+        return cloud
+    kept = np.random.default_rng(seed).choice(len(cloud), MOST, replace=False)
+    return Cloud(cloud.points_m[kept])
+
+
+def _frame(cloud: Cloud, camera_m: Sequence[float]) -> _Frame:
+    points = cloud.points_m.astype(np.float64)
+    centre = points.mean(axis=0)
+    inner = points - centre
+    axes = np.linalg.eigh(inner.T @ inner)[1].T[::-1]  # (axis, xyz), longest first
+    extents = np.ptp(np.quantile(inner @ axes.T, [0.01, 0.99], axis=0), axis=0)  # (axis,), metres
+    if extents.min() < FLAT_M:
+        raise TacpipeError(
+            f"The cloud is {extents[0] * 1e3:.0f} by {extents[1] * 1e3:.0f} mm and {extents[2] * 1e3:.1f} mm thick: it is "
+            f"flat, and has no sides to close on. A camera must see an object's sides; is this the table?"
+        )
+    view = centre - np.asarray(camera_m, np.float64)
+    if np.linalg.norm(view) < extents.max() / 2:
+        raise TacpipeError(
+            f"The camera, at {', '.join(f'{value:g}' for value in camera_m)} m, lies within the cloud, whose middle is "
+            f"{np.linalg.norm(view) * 1e3:.0f} mm away. Give where the camera was in the cloud's frame."
+        )
+    view /= np.linalg.norm(view)
+    along = axes[0]
+    if abs(along @ view) > UPRIGHT:
+        seen = inner - np.outer(inner @ view, view)
+        along = np.linalg.eigh(seen.T @ seen)[1][:, -1]
+    positions = inner @ along
+    along = along * np.sign((positions**3).sum() or 1.0)  # the cloud's own skew gives it a sign
+    across = np.cross(view, along)
+    across *= np.sign(across @ FIRST or 1.0) / np.linalg.norm(across)
+    length_m = float(np.ptp(np.quantile(positions, [0.01, 0.99])))
+    return _Frame(centre, along, across, view, length_m)
+
+
+class _Cuts:
+    """The cuts through one cloud, and how wide those were that had points."""
+
+    def __init__(self, cloud: Cloud, frame: _Frame, camera_m: Sequence[float], opening_m: tuple[float, float]) -> None:
+        self._points = cloud.points_m.astype(np.float64)
+        self._normals = normals(cloud, camera_m=camera_m)
+        self._frame, self._opening_m = frame, opening_m
+        inner = self._points - frame.centre_m
+        self._along_m, self._across_m = inner @ frame.along, inner @ frame.across  # (point,)
+        self.widths_m: list[float] = []
+
+    def best(self, shift_m: float) -> Candidate | None:
+        """Return the best pair of points near the plane at ``shift_m``; None if no pair fits between the fingers."""
+        cut = np.flatnonzero(np.abs(self._along_m - shift_m) < HALF_CUT_M)
+        if len(cut) < FEWEST_CUT:
+            return None
+        low, high = np.quantile(self._across_m[cut], [TRIM, 1 - TRIM])
+        width = high - low
+        self.widths_m.append(float(width))
+        if width > self._opening_m[1]:
+            return None  # narrower pairs lie on its top, where the hand cannot reach around
+        position = self._across_m[cut]
+        lefts = cut[(position >= low) & (position <= low + EDGE * width)]
+        rights = cut[(position >= high - EDGE * width) & (position <= high)]
+        if not len(lefts) or not len(rights):
+            return None
+        scores, cosines = self._judged(lefts, rights, shift_m)
+        left, right = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        if not np.isfinite(scores[left, right]):
+            return None
+        grasp = _grasp(self._points[lefts[left]], self._points[rights[right]], self._frame.view)
+        off_deg = float(np.degrees(np.arccos(np.clip(cosines[left, right], -1, 1))))
+        score = float(scores[left, right] - OFF_CENTRE * abs(shift_m) / self._frame.length_m)
+        return Candidate(grasp, score, off_deg, float(shift_m))
+
+    def _judged(self, lefts: NDArray[np.intp], rights: NDArray[np.intp], shift_m: float) -> tuple[Floats, Floats]:
+        """Return the scores (left, right) of all pairs, and the cosine of the closing axis to the worse normal."""
+        apart = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
+        opening = np.linalg.norm(apart, axis=2)
+        closing = apart / np.maximum(opening, 1e-9)[..., None]
+        on_left = -(closing * self._normals[lefts][:, None]).sum(axis=2)
+        on_right = (closing * self._normals[rights][None]).sum(axis=2)
+        cosines = np.minimum(on_left, on_right)
+        off = np.abs(self._along_m - shift_m) / HALF_CUT_M  # (point,), 1 at the cut's rim
+        off_plane = (off[lefts][:, None] + off[rights][None]) / 2
+        askew = np.abs(closing @ self._frame.along) + np.abs(closing @ self._frame.view)
+        fits = (opening >= self._opening_m[0]) & (opening <= self._opening_m[1])
+        return np.where(fits, cosines - askew - OFF_PLANE * off_plane, -np.inf), cosines
+
+
+def _grasp(left: Floats, right: Floats, view: Floats) -> Grasp:
+    closing = (right - left) / np.linalg.norm(right - left)
+    approach = view - (view @ closing) * closing
+    approach /= np.linalg.norm(approach)
+    return Grasp(left, right, np.column_stack([approach, closing, np.cross(approach, closing)]))

@@ -1,0 +1,149 @@
+"""The command ``tacpipe candidates``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import open3d
+import pytest
+
+import tacpipe
+from tacpipe import candidates_command
+from tacpipe.clouds.candidates import candidates
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tests.clouds import shapes
+from tests.conftest import Lab
+
+
+class Model:
+    """Foretells what can be told from the opening by hand."""
+
+    def predict(self, cloud: Cloud, grasp: Grasp) -> SimpleNamespace:
+        """Return a touch whose pressure is the opening in millimetres, and whose electrodes are numbered."""
+        assert len(cloud) > 1000
+        numbered = np.arange(1, 25.0)
+        return SimpleNamespace(pdc_th=grasp.opening_m * 1e3, pdc_mf=1800.0, e_th=numbered, e_mf=100 * numbered)
+
+
+@pytest.fixture
+def bottle(lab: Lab) -> Cloud:
+    """A file ``bottle.ply`` with a cloud."""
+    cloud = shapes.seen(shapes.cylinder(0.035, 0.2))
+    held = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points_m.astype(float)))
+    open3d.io.write_point_cloud(Path("bottle.ply"), held)
+    return cloud
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_csv_holds_what_the_function_returns(lab: Lab, bottle: Cloud) -> None:
+    found = candidates(bottle, count=4, seed=2)
+    told = rows(lab.run("candidates bottle.ply --count 4 --seed 2").out)
+    assert [row["rank"] for row in told] == ["1", "2", "3", "4"]
+    for row, candidate in zip(told, found, strict=True):
+        assert float(row["opening_m"]) == pytest.approx(candidate.grasp.opening_m, abs=1e-6)
+        assert float(row["g2_y_m"]) == pytest.approx(candidate.grasp.g2_m[1], abs=1e-6)
+        assert candidate.grasp.wrist is not None
+        assert float(row["wrist_x_z"]) == pytest.approx(candidate.grasp.wrist[2, 0], abs=1e-6)
+        assert float(row["wrist_z_x"]) == pytest.approx(candidate.grasp.wrist[0, 2], abs=1e-6)
+
+
+def test_limits_and_the_shift_reach_the_search(lab: Lab, bottle: Cloud) -> None:
+    assert len(rows(lab.run("candidates bottle.ply --shift 0").out)) == 1
+    refused = lab.call("candidates bottle.ply --opening-mm 20 40")
+    assert refused.code == 1
+    assert "mm wide where it was cut, and the fingers open 20 to 40 mm" in refused.err
+
+
+def test_with_a_model_each_row_has_the_fifty_values_with_their_units(
+    lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Path] = []
+
+    def load(path: Path) -> Model:
+        asked.append(path)
+        return Model()
+
+    monkeypatch.setattr(candidates_command, "_touch_model", load)
+    value = json.loads(lab.run("candidates bottle.ply --model models/touch --count 3 --json").out)
+    assert asked == [Path("models/touch")]
+    counts = [name for name, unit in value["units"].items() if unit == "count"]
+    assert len(counts) == 50
+    first = value["candidates"][0]
+    assert first["pdc_th_counts"] == pytest.approx(first["opening_m"] * 1e3, abs=0.06)
+    assert (first["e_th_01_counts"], first["e_mf_24_counts"]) == (1, 2400)
+    assert value["units"]["g1_x_m"] == "m" and value["units"]["off_deg"] == "degree"
+
+
+def test_a_terminal_gets_a_table_with_the_mean_of_the_electrodes(
+    lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(candidates_command, "_touch_model", lambda path: Model())
+    monkeypatch.setattr(candidates_command, "_on_terminal", lambda: True)
+    monkeypatch.setenv("COLUMNS", "160")
+    printed = lab.run("candidates bottle.ply --model models/touch --count 2").out.splitlines()
+    heading = next(line for line in printed if "score" in line)
+    assert "mean E mf" in heading and "approach" in heading
+    assert [line.split()[-2:] for line in printed if line.strip()[:1] in ("1", "2")] == [["12", "1250"]] * 2
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_files_are_written_whole_and_a_picture_is_drawn(lab: Lab, bottle: Cloud, suffix: str) -> None:
+    printed = lab.run(f"candidates bottle.ply -o new/grasps.csv --picture new/grasps.{suffix}").out
+    assert printed == "new/grasps.csv\n"
+    assert len(rows(Path("new/grasps.csv").read_text())) == 10
+    begins = {"png": b"\x89PNG", "svg": b"<?xml"}[suffix]
+    assert Path(f"new/grasps.{suffix}").read_bytes().startswith(begins)
+    assert sorted(path.name for path in Path("new").iterdir()) == sorted(["grasps.csv", f"grasps.{suffix}"])
+
+
+def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = SimpleNamespace(streams=("cloud", "grasp"), table=lambda stream: bottle.table())
+    bare = SimpleNamespace(streams=("grasp",))
+    opened = SimpleNamespace(shards={"bleach-1": held, "bleach-2": bare})
+    monkeypatch.setattr("tacpipe.pipeline.open_dataset", lambda path: opened)
+    told = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
+    assert told == rows(lab.run("candidates bottle.ply --count 3").out)
+    for words, sentence in (
+        ("", "has 2 recordings; pick one with --recording: bleach-1, bleach-2"),
+        ("--recording wood-1", "no recording wood-1"),
+        ("--recording bleach-2", "has no cloud, only 'grasp'"),
+    ):
+        refused = lab.call(f"candidates data/grasps {words}")
+        assert refused.code == 2 and sentence in refused.err, refused.err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("nowhere.ply", "no file nowhere.ply"),
+        ("nowhere", "nowhere is empty or not there"),
+        ("bottle.ply --recording a", "--recording a picks one of a dataset"),
+        ("bottle.ply -o grasps.xlsx", "grasps.xlsx must end in .csv"),
+        ("bottle.ply --picture grasps.doc", ".pdf, .png, .svg"),
+        ("bottle.ply --count 0", "0 candidates"),
+        ("bottle.ply --camera-m 0.05 -0.1 1.2", "lies within the cloud"),
+        ("bottle.ply --model nowhere", "nowhere is empty or not there"),
+    ],
+)
+def test_a_mistake_is_a_sentence(lab: Lab, bottle: Cloud, words: str, sentence: str) -> None:
+    refused = lab.call(f"candidates {words}")
+    assert refused.code in (1, 2)
+    assert sentence in refused.err and "Traceback" not in refused.err
+    assert [path.name for path in Path().iterdir() if path.name.startswith("grasps")] == []
+
+
+def test_a_model_of_another_task_is_refused(lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = {"config.json": json.dumps({"task": "material"}).encode()}
+    monkeypatch.setattr(tacpipe, "open", lambda path: SimpleNamespace(files=files))
+    refused = lab.call("candidates bottle.ply --model models/material")
+    assert refused.code == 2
+    assert "models/material is a model of task material" in refused.err
