@@ -82,6 +82,11 @@ class Affine:
             values = np.log1p(values)
         return ((values - self.offset) / self.scale).astype(np.float32)
 
+    def restore(self, scaled: Floats) -> Floats:
+        """Return scaled values (…, channel) in their own unit, as float64: what `apply` undoes."""
+        values: Floats = scaled.astype(np.float64) * self.scale + self.offset
+        return np.expm1(values) if self.logarithm else values
+
     def to_tensors(self) -> dict[str, Floats]:
         """Return what `from_tensors` reads."""
         return {"offset": self.offset, "scale": self.scale, "logarithm": np.array([float(self.logarithm)])}

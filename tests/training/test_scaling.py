@@ -40,3 +40,24 @@ def test_no_rows_and_values_that_are_not_finite_are_refused() -> None:
         scaling.fit(np.zeros((0, 3)))
     with pytest.raises(TacpipeError, match="Dimension 1"):
         scaling.fit(np.array([[0.0, np.nan]]))
+
+
+@pytest.mark.parametrize("kind", scaling.KINDS)
+def test_what_an_affine_scaling_applies_it_restores_in_float64(kind: str) -> None:
+    values = np.random.default_rng(1).uniform(100, 3800, (9, 4, 3))
+    values[..., 1] = 700  # never moves
+    fitted = scaling.Affine.fit(values, kind)
+    scaled = fitted.apply(values)
+    back = fitted.restore(scaled)
+    assert (str(scaled.dtype), str(back.dtype)) == ("float32", "float64")
+    np.testing.assert_allclose(back, values, rtol=1e-5)
+    again = scaling.Affine.from_tensors(fitted.to_tensors())
+    np.testing.assert_array_equal(again.restore(scaled), back)
+
+
+def test_an_affine_scaling_restores_by_hand() -> None:
+    shares = np.array([[0.0, 1.0], [0.5, -1.0]], np.float32)
+    fitted = scaling.Affine(np.array([2500.0, 100.0]), np.array([900.0, 3500.0]))
+    assert fitted.restore(shares).tolist() == [[2500.0, 3600.0], [2950.0, -3400.0]]
+    heavy = scaling.Affine(np.zeros(1), np.array([2.0]), logarithm=True)
+    np.testing.assert_allclose(heavy.restore(np.array([[0.0], [0.5]], np.float32)), [[0.0], [np.e - 1]], rtol=1e-7)

@@ -1,0 +1,100 @@
+"""Extremely randomised trees (Geurts et al., Extremely randomized trees, 2006), fitted by scikit-learn and kept as arrays.
+
+What scikit-learn keeps of a forest is a pickle, which nobody should open that comes from a stranger. Kept here are the
+cuts and the means of the leaves, from which the same values follow, to the seven digits of a float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Floats = NDArray[np.float64]
+
+FEATURES = 0.4  # share of all features that is tried at a cut
+LEAF = -1  # in place of a child where there is none
+
+
+@dataclass(frozen=True)
+class Forest:
+    """Trees side by side in arrays of all nodes, each tree beginning at one of ``roots``."""
+
+    roots: NDArray[np.int32]  # (tree,)
+    children: NDArray[np.int32]  # (node, left or right); LEAF at a leaf
+    features: NDArray[np.int32]  # (node,)
+    cuts: NDArray[np.float64]  # (node,); a row goes left where its feature is at most that
+    values: NDArray[np.float32]  # (node, value)
+
+    @classmethod
+    def fitted(
+        cls, rows: Floats, values: Floats, *, trees: int, leaf: int, seed: int, features: float = FEATURES
+    ) -> Forest:
+        """Return a forest that tells ``values`` (row, value) of ``rows`` (row, feature); a leaf has ``leaf`` or more."""
+        from sklearn.ensemble import ExtraTreesRegressor
+
+        forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=features, random_state=seed)
+        forest.fit(rows.astype(np.float32), values if values.shape[1] > 1 else values[:, 0])
+        found = [tree.tree_ for tree in forest.estimators_]
+        starts = np.cumsum([0, *(tree.node_count for tree in found)])[:-1]
+        children = [
+            np.where((both := np.column_stack([tree.children_left, tree.children_right])) == LEAF, LEAF, both + start)
+            for tree, start in zip(found, starts, strict=True)
+        ]
+        return cls(
+            starts.astype(np.int32),
+            np.concatenate(children).astype(np.int32),
+            np.concatenate([np.maximum(tree.feature, 0) for tree in found]).astype(np.int32),
+            np.concatenate([tree.threshold for tree in found]),
+            np.concatenate([tree.value[:, :, 0] for tree in found]).astype(np.float32),
+        )
+
+    @staticmethod
+    def out_of_bag_error(
+        rows: Floats, values: Floats, *, leaf: int, seed: int, trees: int = 100, features: float = FEATURES
+    ) -> float:
+        """Return the mean squared error on rows that a tree was not grown on, each tree having a draw of the rows.
+
+        It is over all rows and values at once, in the unit of the values squared (Breiman, Out-of-bag estimation, 1996).
+        """
+        from sklearn.ensemble import ExtraTreesRegressor
+
+        forest = ExtraTreesRegressor(
+            trees, min_samples_leaf=leaf, max_features=features, random_state=seed, bootstrap=True, oob_score=True
+        )
+        forest.fit(rows.astype(np.float32), values if values.shape[1] > 1 else values[:, 0])
+        return float(np.mean((forest.oob_prediction_.reshape(values.shape) - values) ** 2))
+
+    def predict(self, rows: Floats) -> Floats:
+        """Return the mean over trees of the leaf that each row (row, feature) falls into, (row, value); of 1 row or more."""
+        given = rows.astype(np.float32)
+        node = np.broadcast_to(self.roots, (len(given), len(self.roots))).copy()  # (row, tree)
+        row = np.arange(len(given))[:, None]
+        while True:
+            right = (given[row, self.features[node]] > self.cuts[node]).astype(np.int32)
+            child = self.children[node, right]
+            if (child == LEAF).all():
+                break
+            node = np.where(child == LEAF, node, child)
+        return np.stack([self.values[at].mean(axis=0, dtype=np.float64) for at in node])
+
+    def times(self, unit: Floats) -> Forest:
+        """Return the forest that tells the same values (value,) in another unit: each multiplied by its ``unit``."""
+        return replace(self, values=(self.values * unit).astype(np.float32))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what `of` reads."""
+        kept: dict[str, NDArray[Any]] = {"roots": self.roots, "children": self.children, "features": self.features}
+        kept |= {"cuts": self.cuts, "values": self.values}
+        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in kept.items()}
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor]) -> Forest:
+        """Return the forest that `tensors` wrote."""
+        names: Sequence[str] = ("roots", "children", "features", "cuts", "values")
+        return cls(*(tensors[name].numpy() for name in names))
