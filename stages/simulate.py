@@ -72,3 +72,33 @@ def material(params: MaterialParams, trial: Trial) -> Recording:
     del values["trials"]
     seed = values.pop("seed")
     return simulate_trial(seed, trial, Rig(**values))
+
+
+@dataclass(frozen=True)
+class TouchParams:
+    """What lies on the simulated table, how it is grasped, and how well camera and fingertips tell."""
+
+    trials: int = 360  # recordings, each a grasp; the objects take turns
+    seed: int = 0  # of all that is random
+    families: str = "all"  # of objects: box, cylinder, sphere, ellipsoid, cone, bow, separated by commas; or all
+    objects: int = 5  # named objects of each family
+    stiffness: str = "mixed"  # of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
+    spheres: bool = False  # spheres that differ in size alone, seen from as much nearer, grasped through the centre
+    one_pose: bool = False  # each object always lies the same way, and is only shifted and turned about the vertical
+    shift: float = 0.5  # largest share of half the cloud's length by which grasps lie off its middle
+    effort_spread: float = 0.15  # standard deviation of the logarithm of the closing effort, which nobody sees
+    noise_scale: float = 1.0  # times the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
+    drift_count_day: float = 30.0  # counts a day by which the sensors drift, root mean square
+    raw: bool = False  # the camera's whole view and the sensors over time, as before `segment grasps`
+
+
+@stage(version=1)
+def touch(params: TouchParams, trial: Trial) -> Recording:
+    """Return one grasp of an object on a table: cloud, grasp, reading and, with ground truth, truth."""
+    from tacpipe.simulation.grasp import simulate_trial
+    from tacpipe.simulation.grasp_scene import Rig
+
+    values = asdict(params)
+    del values["trials"]
+    seed = values.pop("seed")
+    return simulate_trial(seed, trial, Rig(**values))

@@ -137,3 +137,68 @@ def material(
     from tacpipe.tasks import material as task
 
     return Result(files=task.train(asdict(params), train, val, workspace, init.files if init else None))
+
+
+@dataclass(frozen=True)
+class TouchParams:
+    """Kind of the model of touch, what it reads, and how networks are trained; the defaults are the strongest we know."""
+
+    architecture: str = "strong"  # strong, trees of two kinds; trees, a forest a target; patches; pointnet, the paper's
+    targets: str = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger, with commas
+    together: bool = True  # one network foretells all targets; else one each, as in the paper
+    inputs: str = "rgbcont"  # xyz, rgb, xyzcont, rgbcont, xyzpose or rgbpose; trees and patches: whether rgb is read
+    setting: str = ""  # words that set this run apart from others of its kind in a report, as blocked
+    seed: int = 0  # of first weights, shuffles, drawn points and cuts
+    baselines: bool = True  # keep what was felt in training, so that evaluate shows constant, object mean and nearest
+    use_validation: bool = True  # learn from validation grasps too where nothing is chosen by them
+    place: bool = False  # trees and patches: read where the grasp is before the camera too, not its shape alone
+    trees: int = 300  # of each target's forest
+    leaf: int = 0  # training grasps of a leaf or more; 0: chosen of 2, 4 and 8 by out-of-bag error
+    networks: int = 3  # networks of other first weights whose mean is told
+    backbone: str = "points"  # of patches: points, each alone; edges, each with its nearest ones
+    radius_mm: float = 20.0  # millimetres about a contact that are its patch
+    hidden: int = 256  # units of the patch network's first layer behind the points
+    dropout: float = 0.3  # share of these left out of each training step
+    points: int = 128  # drawn of each cloud, or of each patch, anew at each visit
+    draws: int = 4  # of points, over which a prediction is averaged
+    normalisation: str = "none"  # of a pointnet's cloud: none; sphere; minmax of each axis; wrist, its axes
+    rotation_deg: float = 0.0  # degrees; largest random turn about each axis of a pointnet's training clouds
+    wrist: str = "given"  # of pointnet: given; estimated from closing axis and line of sight where none is recorded
+    head: str = "fc3"  # of pointnet: fc1 to fc6, its fully connected layers
+    transform: bool = True  # of pointnet: transform all channels of a cloud first, by a map that is learned
+    loss: str = "balanced"  # balanced: squared error, all targets alike; rmse of normalised values, the paper's
+    epochs: int = 40  # passes over the training grasps
+    batch: int = 16  # grasps of a step of the optimiser
+    learning_rate: float = 2e-3  # of Adam, without unit; the peak where it goes through a cycle
+    cycle: bool = True  # let the learning rate rise and fall over all epochs
+    weight_decay: float = 0.0  # share of each weight that is added to its gradient
+    patience: int = 0  # epochs without a lower validation loss after which training ends; 0: never before time
+    select: str = "last"  # weights to keep: last, of the last epoch; best, of the lowest validation loss
+    PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {
+        "paper": {
+            "architecture": "pointnet",
+            "together": False,
+            "use_validation": False,
+            "networks": 1,
+            "points": 750,
+            "draws": 1,
+            "normalisation": "minmax",
+            "loss": "rmse",
+            "epochs": 250,
+            "batch": 10,
+            "learning_rate": 0.01,
+            "cycle": False,
+        },
+        "quick": {"trees": 100, "networks": 1, "epochs": 10, "points": 64},
+    }
+
+
+@stage(version=1)
+def touch(params: TouchParams, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
+    """Train the forecast of touch before a grasp: a point cloud and two contact points give what both fingers feel."""
+    from dataclasses import asdict
+
+    from tacpipe.stage import Result
+    from tacpipe.tasks import touch as task
+
+    return Result(files=task.train(asdict(params), train, val, workspace))

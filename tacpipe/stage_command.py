@@ -24,6 +24,7 @@ _PLACES = {  # what examples call the datasets
     "segment": "data/segments",
     "split": "data/split",
     "compress": "data/latents",
+    "segment.grasps": "data/grasps",
     "segment.slides": "data/slides",
     "train": "models/forward",
     "train.material": "models/material",
@@ -33,6 +34,7 @@ _PLACES = {  # what examples call the datasets
 _BEFORE = {
     "synchronize": "recordings",
     "segment": "synced",
+    "segment.grasps": "recordings",
     "segment.slides": "recordings",
     "train.material": "slides",
     "split": "segments",

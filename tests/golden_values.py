@@ -11,6 +11,7 @@ from typing import Any
 
 FILE = Path(__file__).parent / "golden" / "digests.json"
 DIGITS = {"double": 6, "float": 4}  # of a column's largest value: another machine may differ beyond
+RAW = "simulate touch --raw --trials 2 --seed 7 -o raw"  # what `segment grasps` reads; its values are in those below
 COMMANDS = {
     "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
     "synchronize": "synchronize simulate.forward -o {0}",
@@ -18,6 +19,8 @@ COMMANDS = {
     "segment.slips": "segment slips segment.contacts -o {0}",
     "simulate.material": "simulate material --trials 12 --materials 3 --seed 7 -o {0}",
     "segment.slides": "segment slides simulate.material -o {0}",
+    "simulate.touch": "simulate touch --trials 2 --seed 7 -o {0}",
+    "segment.grasps": "segment grasps raw -o {0}",
     "split": "split segment.contacts --scheme random --val 0.34 --test 0.34 -o {0}",
     "compress.pca": "compress pca segment.contacts --split split --components 4 -o {0}",
 }
@@ -52,6 +55,7 @@ def current() -> dict[str, dict[str, Any]]:
 
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / ".tacpipe").mkdir()
+        assert tacpipe(Path(folder), RAW).returncode == 0
         found = {}
         for name, command in COMMANDS.items():
             done = tacpipe(Path(folder), command.format(name))

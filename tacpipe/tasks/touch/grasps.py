@@ -1,0 +1,149 @@
+"""Grasps of a dataset as arrays: clouds, grasps and what was felt."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp
+from tacpipe.clouds.cloud import POSITION, Cloud
+from tacpipe.clouds.grasp import POINTS, Grasp
+from tacpipe.errors import TacpipeError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Dataset, Shard
+
+Floats = NDArray[np.float64]
+
+STREAMS = ("cloud", "grasp")
+READING = "reading"
+FEWEST = 3  # points of a cloud; fewer have neither surface nor main axis
+FARTHEST_M = 0.1  # of a grasp point, maybe on a hidden side, from its cloud: beyond it they are not of one object
+
+
+@dataclass(frozen=True)
+class Grasps:
+    """Grasps side by side, each with its cloud and, where it is known, what both fingers felt."""
+
+    names: tuple[str, ...]
+    objects: tuple[str, ...]  # empty where none is told
+    sessions: tuple[str, ...]
+    t_ns: NDArray[np.int64]  # (grasp,)
+    clouds: tuple[Cloud, ...]
+    grasps: tuple[Grasp, ...]
+    felt: Mapping[str, Floats]  # by target (grasp, value), device counts; empty where nothing was felt
+    digests: tuple[str, ...]  # of the recordings
+
+    def __len__(self) -> int:
+        """Return how many grasps there are."""
+        return len(self.names)
+
+    def joined(self, others: Grasps) -> Grasps:
+        """Return these grasps and then the others."""
+        return Grasps(
+            self.names + others.names,
+            self.objects + others.objects,
+            self.sessions + others.sessions,
+            np.concatenate([self.t_ns, others.t_ns]),
+            self.clouds + others.clouds,
+            self.grasps + others.grasps,
+            {target: np.concatenate([felt, others.felt[target]]) for target, felt in self.felt.items()},
+            self.digests + others.digests,
+        )
+
+
+def read(recordings: Dataset, *, felt: bool = True) -> Grasps:
+    """Return the grasps of a dataset in the order of names; with ``felt`` each must have a reading.
+
+    Raises `TacpipeError` where a recording lacks a stream or a column, where a value is not finite, where a cloud has
+    next to no points, and where a grasp lies far from it.
+    """
+    names = sorted(recordings.shards)
+    shards = [recordings.shards[name] for name in names]
+    clouds, grasps, t_ns = [], [], []
+    readings: dict[str, list[Floats]] = {target: [] for target in biotac_sp.TARGETS}
+    for shard in shards:
+        cloud, grasp, stamp = _geometry(shard)
+        clouds.append(cloud)
+        grasps.append(grasp)
+        t_ns.append(stamp)
+        if felt:
+            for target, values in _felt(shard).items():
+                readings[target].append(values)
+    return Grasps(
+        tuple(names),
+        tuple(str(shard.attributes.get("object") or "") for shard in shards),
+        tuple(str(shard.attributes.get("session") or "") for shard in shards),
+        np.array(t_ns, np.int64),
+        tuple(clouds),
+        tuple(grasps),
+        {target: np.array(values, np.float64) for target, values in readings.items()} if felt else {},
+        tuple(shard.digest for shard in shards),
+    )
+
+
+def check(name: str, cloud: Cloud, grasp: Grasp) -> None:
+    """Raise `TacpipeError` if a cloud has fewer than 3 points or lies more than 10 cm from a grasp point."""
+    if len(cloud) < FEWEST:
+        raise TacpipeError(
+            f"{name} has a cloud of {len(cloud)} points; there must be {FEWEST} or more. Segment it again or leave it out."
+        )
+    for point, place in (("g1", grasp.g1_m), ("g2", grasp.g2_m)):
+        nearest_m = float(np.linalg.norm(cloud.points_m - place, axis=1).min())
+        if nearest_m > FARTHEST_M:
+            raise TacpipeError(
+                f"{name}: grasp point {point} lies {nearest_m * 1000:.0f} mm from the nearest point of the cloud; the two "
+                f"must be in one frame, in metres, no more than {FARTHEST_M * 1000:.0f} mm apart. Check the grasp's frame."
+            )
+
+
+def _geometry(shard: Shard) -> tuple[Cloud, Grasp, int]:
+    missing = [stream for stream in STREAMS if stream not in shard.streams]
+    if missing:
+        raise TacpipeError(
+            f"Recording {shard.name} has the streams {', '.join(shard.streams)} and no {missing[0]}. Give grasps of "
+            f"`tacpipe ingest vision2tactile`; a camera's whole view goes through `tacpipe segment grasps` first."
+        )
+    table, points = shard.table("grasp"), shard.table("cloud")
+    _require(shard, table, ("t_ns", *POINTS))
+    _require(shard, points, POSITION)
+    try:
+        cloud, grasp = Cloud.of(points), Grasp.of(table)
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {shard.name}: {error}") from None
+    check(f"Recording {shard.name}", cloud, grasp)
+    return cloud, grasp, int(table.column("t_ns")[0].as_py())
+
+
+def _felt(shard: Shard) -> dict[str, Floats]:
+    if READING not in shard.streams:
+        raise TacpipeError(
+            f"Recording {shard.name} has no reading of touch to learn from or to judge by. `tacpipe predict` needs none."
+        )
+    table = shard.table(READING)
+    if table.num_rows != 1:
+        raise TacpipeError(
+            f"Recording {shard.name} has {table.num_rows} readings; a grasp has one. `tacpipe segment grasps` picks the one "
+            f"at contact out of a stream."
+        )
+    found = {}
+    for target in biotac_sp.TARGETS:
+        columns = biotac_sp.columns(target)
+        _require(shard, table, columns)
+        found[target] = np.array([table.column(name)[0].as_py() for name in columns], np.float64)  # null becomes NaN
+        if not np.isfinite(found[target]).all():
+            column = columns[int(np.argmin(np.isfinite(found[target])))]
+            raise TacpipeError(f"Recording {shard.name} has no finite reading in the column {column}. Leave it out.")
+    return found
+
+
+def _require(shard: Shard, table: pa.Table, columns: tuple[str, ...] | list[str]) -> None:
+    missing = [name for name in columns if name not in table.column_names]
+    if missing:
+        raise TacpipeError(f"Recording {shard.name} lacks the column {missing[0]}. Ingest or segment it again.")

@@ -1,0 +1,130 @@
+"""How near a model of touch comes on grasps it has not seen, beside what can be said without looking."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Recording, Result
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch import scorecard
+from tacpipe.tasks.touch.baselines import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
+from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
+from tacpipe.tasks.touch.scorecard import Told, Tree
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Mask = NDArray[np.bool_]
+
+MODEL, TRUE, PREDICTIONS = "model", "true", "predictions"
+
+
+def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
+    """Return ``metrics.json``, ``by_object.csv`` and what each predictor told of each grasp.
+
+    The measures are of grasps that the model was not trained on, and again of those among them whose object it knows
+    (``known``) and does not (``novel``); grasps it has seen, and those with the very reading of one of these, are told
+    apart, under ``seen``. Raises `TacpipeError` where grasps have no reading, or are not what the model reads.
+    """
+    predictor = Predictor.load(model)
+    grasps = grasps_of.read(recordings)
+    if not len(grasps):
+        raise TacpipeError(
+            "There is no grasp to judge the model on. Give a dataset with recordings of the role asked for."
+        )
+    if predictor.baselines is None:
+        raise TacpipeError("The model was trained without baselines, and cannot be judged. Train it with --baselines.")
+    told = {TRUE: grasps.felt, MODEL: predictor.foretell(grasps), **predictor.baselines.foretell(grasps)}
+    told = {name: {target: one[target] for target in predictor.targets} for name, one in told.items()}
+    streams = {name: told_table(one) for name, one in told.items()}
+    del told[TRUE]
+    trained = set(predictor.config["trained_on"].values())
+    seen = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.felt_before(grasps)
+    known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
+    tree = _measures(grasps, told, ~seen)
+    for name, mask in (("known", known & ~seen), ("novel", ~known & ~seen), ("seen", seen)):
+        if mask.any():
+            tree[name] = _measures(grasps, told, mask, by_cluster="object" if name == "novel" else "grasp")
+    files = {
+        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
+        "by_object.csv": _by_object_csv(tree),
+        **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
+    }
+    simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.shards.values())
+    streams["grasps"] = _about(grasps, seen, known)
+    return Result({PREDICTIONS: Recording(streams, {"simulated": True} if simulated else {})}, files)
+
+
+def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, by_cluster: str = "grasp") -> Tree:
+    """Return the measures of every predictor on some grasps, over all of them and by object."""
+    if not mask.any():
+        return {"counts": {"grasps": 0}}
+    clusters = np.array(grasps.objects if by_cluster == "object" else grasps.names)
+    objects = np.array(grasps.objects)
+    tree: Tree = {"counts": {"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}}
+    for name, one in told.items():
+        tree[name] = _tree(grasps, one, told[CONSTANT], mask, clusters)
+        tree[name]["by_object"] = {
+            other or "unnamed": _tree(grasps, one, told[CONSTANT], mask & (objects == other), clusters)
+            for other in sorted(set(objects[mask]))
+        }
+    felt, model = (scorecard.chosen(one, mask) for one in (grasps.felt, told[MODEL]))
+    tree[MODEL]["by_electrode"] = scorecard.by_electrode(felt, model)
+    return tree
+
+
+def _tree(grasps: Grasps, told: Told, constant: Told, mask: Mask, clusters: NDArray[Any]) -> Tree:
+    felt, one, mean = (scorecard.chosen(values, mask) for values in (grasps.felt, told, constant))
+    return scorecard.tree(felt, one, mean, clusters[mask].tolist())
+
+
+def _by_object_csv(tree: Tree) -> bytes:
+    """Return a row an object, predictor and target: how many grasps, RMSE in shares and counts, R2, skill."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
+    for predictor in (MODEL, CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME):
+        for name, one in tree.get(predictor, {}).get("by_object", {}).items():
+            for target in one["rmse"]:
+                values = [one[measure][target] for measure in ("rmse", "rmse_counts", "r2", "skill")]
+                rounded = ["" if value is None else f"{value:.6g}" for value in values]
+                writer.writerow([name, predictor, target, one["n"], *rounded])
+    return text.getvalue().encode()
+
+
+def _about(grasps: Grasps, seen: Mask, known: Mask) -> pa.Table:
+    """Return a row a grasp: which recording, object and session, when, and whether the model knows it or its object."""
+    return pa.table(
+        {
+            "recording": pa.array(grasps.names, pa.string()),
+            "object": pa.array(grasps.objects, pa.string()),
+            "session": pa.array(grasps.sessions, pa.string()),
+            "t_ns": pa.array(grasps.t_ns, pa.int64()),
+            "seen": pa.array(seen, pa.bool_()),
+            "known": pa.array(known, pa.bool_()),
+        }
+    )
+
+
+def told_table(told: Told) -> pa.Table:
+    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, as far as told."""
+    fields, arrays = [], []
+    for target, values in told.items():
+        names = (
+            [target] if biotac_sp.width(target) == 1 else [f"{target}_{n:02d}" for n in range(1, values.shape[1] + 1)]
+        )
+        for name, column in zip(names, values.T, strict=True):
+            fields.append(pa.field(name, pa.float32(), metadata={"unit": "count", "quantity": "prediction"}))
+            arrays.append(pa.array(column.astype(np.float32)))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

@@ -1,0 +1,140 @@
+"""What a model of touch consists of: members that each foretell some targets, and whose mean is the model's word."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from tacpipe import biotac_sp
+from tacpipe.clouds import geometry
+from tacpipe.errors import TacpipeError
+from tacpipe.models.forest import Forest
+from tacpipe.models.patches import BACKBONES, PatchNetwork
+from tacpipe.models.pointnet import HEADS, PointNet
+from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.tasks.touch.inputs import Inputs, Sources
+from tacpipe.tasks.touch.learning import Drawn, foretold
+from tacpipe.tasks.touch.patches import Patches, PatchSources
+from tacpipe.training.scaling import Affine
+
+Floats = NDArray[np.float64]
+Params = Mapping[str, Any]
+
+
+class Member(Protocol):
+    """A part of a model that foretells targets of its own."""
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """What it foretells."""
+
+    def foretell(self, grasps: Grasps) -> Floats:
+        """Return the values of its targets side by side (grasp, value), device counts."""
+
+
+@dataclass(frozen=True)
+class ForestMember:
+    """Forests that read the grasp's geometry; where several tell a target their mean counts."""
+
+    targets: tuple[str, ...]
+    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # each with the targets that it tells, side by side
+    coloured: bool
+    placed: bool
+    features: tuple[str, ...]
+
+    def foretell(self, grasps: Grasps) -> Floats:
+        """Return the values of its targets (grasp, value), device counts."""
+        if self.coloured:
+            require_colours(grasps)
+        rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
+        if names != self.features:
+            raise TacpipeError("The model was trained on other features than this version tells. Train it again.")
+        told: dict[str, list[Floats]] = {target: [] for target in self.targets}
+        for group, forest in self.forests:
+            for target, values in parted(forest.predict(rows), group).items():
+                told[target].append(values)
+        return np.concatenate([np.mean(told[target], axis=0) for target in self.targets], axis=1)
+
+
+@dataclass(frozen=True)
+class NetworkMember:
+    """A network that reads points, and the scale of what it tells."""
+
+    targets: tuple[str, ...]
+    network: nn.Module
+    scale: Affine
+    params: Params
+
+    def foretell(self, grasps: Grasps) -> Floats:
+        """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
+        found = foretold(self.network, sources(self.params, grasps), len(grasps), self.params["draws"])
+        return np.asarray(self.scale.restore(found), np.float64)
+
+
+def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
+    """Return values side by side (grasp, value) by target."""
+    ends = np.cumsum([biotac_sp.width(target) for target in targets])[:-1]
+    return dict(zip(targets, np.split(values, ends, axis=1), strict=True))
+
+
+def units(values: Floats, targets: Sequence[str]) -> Floats:
+    """Return what to divide each of the values (grasp, value) by so that every target counts the same, (value,)."""
+    spread = values.std(axis=0)
+    widths = np.concatenate([[biotac_sp.width(target)] * biotac_sp.width(target) for target in targets])
+    unit: Floats = np.where(spread > 0, spread, 1.0) * np.sqrt(widths)
+    return unit
+
+
+def network(params: Params, targets: Sequence[str]) -> nn.Module:
+    """Return an untrained network for params and targets. Raises `TacpipeError` for a head or backbone there is not."""
+    outputs = sum(biotac_sp.width(target) for target in targets)
+    if params["architecture"] == "pointnet":
+        if params["head"] not in HEADS:
+            raise TacpipeError(f"head is {params['head']!r}; it must be one of {', '.join(HEADS)}.")
+        read = inputs(params)
+        return PointNet(
+            read.channels, read.grasp_numbers, outputs, head=HEADS[params["head"]], transform=params["transform"]
+        )
+    if params["backbone"] not in BACKBONES:
+        raise TacpipeError(f"backbone is {params['backbone']!r}; it must be {' or '.join(BACKBONES)}.")
+    sizes = {"backbone": params["backbone"], "hidden": params["hidden"], "dropout": params["dropout"]}
+    near = patches(params)
+    return PatchNetwork(near.channels, near.grasp_numbers, outputs, **sizes)
+
+
+def inputs(params: Params) -> Inputs:
+    """Return what a PointNet reads."""
+    return Inputs(
+        params["inputs"], params["points"], params["normalisation"], float(params["rotation_deg"]), params["wrist"]
+    )
+
+
+def patches(params: Params) -> Patches:
+    """Return what a patch network reads."""
+    return Patches(params["points"], params["radius_mm"] / 1000, coloured(params), params["place"])
+
+
+def coloured(params: Params) -> bool:
+    """Return whether colours are read."""
+    return str(params["inputs"]).startswith("rgb")
+
+
+def sources(params: Params, grasps: Grasps) -> Drawn:
+    """Return where a network's points are drawn from. Raises `TacpipeError` where a grasp lacks what it reads."""
+    if params["architecture"] == "pointnet":
+        return Sources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
+    return PatchSources(patches(params), grasps.names, grasps.clouds, grasps.grasps)
+
+
+def require_colours(grasps: Grasps) -> None:
+    """Raise `TacpipeError` where a cloud has no colours."""
+    for name, cloud in zip(grasps.names, grasps.clouds, strict=True):
+        if cloud.colours is None:
+            raise TacpipeError(
+                f"{name} has a cloud without colours, and the model reads colours. Train with inputs of xyz."
+            )

@@ -1,0 +1,32 @@
+"""What a model says that grasps would feel like, without a word on whether it is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Recording, Result
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch.judging import PREDICTIONS, told_table
+from tacpipe.tasks.touch.predictor import Predictor
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+
+def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
+    """Return one table, ``predictions``: a row a grasp with the recording's name and all values foretold, device counts.
+
+    Grasps need no reading; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where
+    there are no recordings or they are not what the model reads.
+    """
+    predictor = Predictor.load(model)
+    grasps = grasps_of.read(recordings, felt=False)
+    if not len(grasps):
+        raise TacpipeError("There is no grasp to foretell. Give a dataset with recordings of the role asked for.")
+    table = told_table(predictor.foretell(grasps))
+    table = table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))
+    return Result({PREDICTIONS: Recording(table)})

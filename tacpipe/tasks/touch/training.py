@@ -1,0 +1,265 @@
+"""How a model of touch comes about: from grasps and params to its files."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_arrays
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from tacpipe import biotac_sp
+from tacpipe.clouds import geometry
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.models.forest import Forest
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch import members
+from tacpipe.tasks.touch.baselines import Baselines
+from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.tasks.touch.inputs import MODES
+from tacpipe.tasks.touch.learning import Drawn, Felt, TouchWork
+from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
+from tacpipe.training import loop
+from tacpipe.training.scaling import Affine
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+Floats = NDArray[np.float64]
+Params = Mapping[str, Any]
+Config = dict[str, Any]
+
+ARCHITECTURES = ("strong", "trees", "patches", "pointnet")
+LEAVES = (2, 4, 8)  # rows of a leaf that are tried
+LIMITS = {  # least and most of params that nothing else checks
+    **dict.fromkeys(("networks", "draws", "trees"), (1, math.inf)),
+    **dict.fromkeys(("leaf", "patience", "weight_decay"), (0, math.inf)),
+    "hidden": (2, math.inf),  # half of them make the layer behind
+    "dropout": (0, 1),
+    "seed": (0, 2**32 - 1),  # of scikit-learn
+}
+
+
+def train(
+    params: Params,
+    training: Dataset,
+    validation: Dataset | None,
+    workspace: Path,
+) -> dict[str, bytes]:
+    """Return the files of a model trained on the grasps of ``training``.
+
+    ``params`` are those of the stage `train.touch`. Whatever is fitted is fitted on training grasps alone, and on those of
+    ``validation`` too where ``use_validation`` says so and nothing is chosen by them. Raises `TacpipeError` where
+    grasps lack what is to be read or told.
+    """
+    _check(params)
+    targets = _targets(params["targets"])
+    known = grasps_of.read(training)
+    if not len(known):
+        raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
+    watched = grasps_of.read(validation) if validation is not None and validation.shards else None
+    if watched is not None and params["use_validation"] and not _chooses(params):
+        known, watched = known.joined(watched), None
+    config = _config(params, targets, known, watched)
+    tensors: dict[str, Tensor] = {}
+    history: list[loop.Line] = []
+    if params["architecture"] in ("strong", "trees"):
+        _grow(config, tensors, known, targets)
+    else:
+        _learn(config, tensors, history, (known, watched), targets, workspace)
+    files = {WEIGHTS: save_tensors(tensors)}
+    if history:
+        files[HISTORY] = "".join(json.dumps(line) + "\n" for line in history).encode()
+    if params["baselines"]:
+        config["learned_objects"] = list(known.objects)
+        files[BASELINES] = save_arrays(Baselines.of(known).tensors())
+    return {CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), **files}
+
+
+def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Grasps | None) -> Config:
+    """Return what the model's file says of it before anything is learned."""
+    return {
+        "task": TASK,
+        "architecture": params["architecture"],
+        "params": dict(params),
+        "split": params["setting"],
+        "targets": list(targets),
+        "objects": sorted(set(known.objects) - {""}),
+        "counts": {"train": len(known), "val": len(watched) if watched else 0},
+        "trained_on": dict(zip(known.names, known.digests, strict=True))
+        | (dict(zip(watched.names, watched.digests, strict=True)) if watched else {}),
+        "members": [],
+        "parameters": None,
+    }
+
+
+def _check(params: Params) -> None:
+    """Refuse params that cannot be, before anything is read."""
+    if params["architecture"] not in ARCHITECTURES:
+        raise UsageError(f"There is no architecture {params['architecture']}; there are {', '.join(ARCHITECTURES)}.")
+    if params["select"] not in ("best", "last"):
+        raise UsageError(f"select is {params['select']!r}; it must be best or last.")
+    if params["inputs"] not in MODES:
+        raise UsageError(f"inputs is {params['inputs']!r}; it must be one of {', '.join(MODES)}.")
+    for name, (least, most) in LIMITS.items():
+        if not least <= params[name] <= most:
+            allowed = f"be {least} or more" if most == math.inf else f"lie between {least} and {most}"
+            raise UsageError(f"{name} is {params[name]}; it must {allowed}.")
+
+
+def _targets(asked: str) -> tuple[str, ...]:
+    """Return what is to be foretold, in one order whatever that of the names asked for."""
+    named = [name.strip() for name in asked.split(",") if name.strip()]
+    if not named or set(named) - set(biotac_sp.TARGETS):
+        raise UsageError(
+            f"targets is {asked!r}; it must name some of {', '.join(biotac_sp.TARGETS)}, with commas between."
+        )
+    return tuple(target for target in biotac_sp.TARGETS if target in named)
+
+
+def _chooses(params: Params) -> bool:
+    """Return whether something is chosen by validation grasps: a network's epoch, or when its training ends."""
+    return params["architecture"] not in ("strong", "trees") and bool(params["select"] == "best" or params["patience"])
+
+
+def _grow(config: Config, tensors: dict[str, Tensor], known: Grasps, targets: Sequence[str]) -> None:
+    """Add a forest a target and, where the model is to be strong, one that tells all targets by the same cuts.
+
+    Each has the leaves that foretell best what its trees were not shown.
+    """
+    params = config["params"]
+    coloured = members.coloured(params)
+    if coloured:
+        members.require_colours(known)
+    rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params["place"])
+    groups = [[target] for target in targets]
+    if params["architecture"] == "strong" and len(targets) > 1:
+        groups.append(list(targets))
+    about: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": groups, "features": list(names)}
+    about |= {"coloured": coloured, "placed": params["place"], "leaves": []}
+    kept: dict[str, Tensor] = {}
+    for number, group in enumerate(groups):
+        values = _side_by_side(known, group)
+        unit = members.units(values, group)
+        leaf = params["leaf"] or _leaf(rows, values / unit, params)
+        forest = Forest.fitted(rows, values / unit, trees=params["trees"], leaf=leaf, seed=params["seed"])
+        about["leaves"].append(leaf)
+        kept |= {f"{number}.{name}": tensor for name, tensor in forest.times(unit).tensors().items()}
+    _add(config, tensors, about, kept)
+
+
+def _leaf(rows: Floats, values: Floats, params: Params) -> int:
+    """Return the size of leaves whose trees err least on rows outside of the sample that each was grown on."""
+    fitting = [leaf for leaf in LEAVES if 2 * leaf <= len(rows)] or LEAVES[:1]
+    if len(fitting) == 1:
+        return fitting[0]
+    errors = [Forest.out_of_bag_error(rows, values, leaf=leaf, seed=params["seed"]) for leaf in fitting]
+    return fitting[int(np.argmin(errors))]
+
+
+def _learn(
+    config: Config,
+    tensors: dict[str, Tensor],
+    history: list[loop.Line],
+    parts: tuple[Grasps, Grasps | None],
+    targets: Sequence[str],
+    workspace: Path,
+) -> None:
+    """Add the networks: one for all targets or one for each, and as many of each as ``networks`` says."""
+    params = config["params"]
+    known, watched = parts
+    if watched is None and _chooses(params):
+        raise TacpipeError(
+            "No recording has the role val, and select best and patience choose a network's epoch by these. Make a split "
+            "with some, or train with --select last --patience 0."
+        )
+    own = {"architecture": params["architecture"] if params["architecture"] == "pointnet" else "patches"}
+    read = {**params, **own}
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    learned = (members.sources(read, known), known)
+    followed = (members.sources(read, watched), watched) if watched else learned  # without any, what was learned
+    parameters = 0
+    for group in [tuple(targets)] if params["together"] else [(target,) for target in targets]:
+        scale = _scale(known, group, params["loss"])
+        work = _work(params, scale, (learned, followed), group, device)
+        for number in range(params["networks"]):
+            place = workspace / f"{'-'.join(group)}-{number}"
+            schedule = _schedule(params, params["seed"] + 1000 * number)
+            build = functools.partial(_built, read, group, device)
+            trained = loop.train(build, work, schedule, place, weight_decay=params["weight_decay"])
+            kept = trained.weights if params["select"] == "best" else trained.last
+            parameters += _weights_learned(read, group)
+            about = {"kind": NETWORK, "targets": list(group), "params": own}
+            named = {f"network.{name}": value for name, value in kept.items()}
+            named |= {
+                f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
+            }
+            _add(config, tensors, about, named)
+            whose = {"target": "all" if params["together"] else group[0], "network": number}
+            history += [{**line, **whose} for line in trained.history]
+    config["parameters"] = parameters
+
+
+def _work(
+    params: Params, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
+) -> TouchWork:
+    """Return what a network of some targets learns; of ``parts`` the first is learned from and the second watched."""
+    training, watched = (
+        Felt(drawn, torch.from_numpy(scale.apply(_side_by_side(some, group))).to(device)) for drawn, some in parts
+    )
+    return TouchWork(training, watched, params["batch"], params["loss"], _weights(group).to(device))
+
+
+def _built(params: Params, targets: Sequence[str], device: str) -> nn.Module:
+    return members.network(params, targets).to(device)
+
+
+def _weights_learned(params: Params, targets: Sequence[str]) -> int:
+    """Return how many numbers a network learns; the running means of batches are none of them."""
+    with torch.device("meta"):  # shapes alone
+        return sum(weight.numel() for weight in members.network(params, targets).parameters())
+
+
+def _add(config: Config, tensors: dict[str, Tensor], about: dict[str, Any], named: Mapping[str, Tensor]) -> None:
+    number = len(config["members"])
+    config["members"].append(about)
+    tensors.update({f"{number}.{name}": value.clone().contiguous() for name, value in named.items()})
+
+
+def _side_by_side(some: Grasps, group: Sequence[str]) -> Floats:
+    return np.concatenate([some.felt[target] for target in group], axis=1)
+
+
+def _scale(known: Grasps, group: Sequence[str], loss: str) -> Affine:
+    """Return the scale of what a network tells: the letter's ranges for its loss, else mean and spread of each value."""
+    if loss != "rmse":
+        return Affine.fit(_side_by_side(known, group), "standard")
+    ranges = np.concatenate([[biotac_sp.RANGES[target]] * biotac_sp.width(target) for target in group])
+    return Affine(ranges[:, 0], ranges[:, 1] - ranges[:, 0])
+
+
+def _weights(group: Sequence[str]) -> Tensor:
+    """Return how much each value counts (value,), so that every target counts the same; their mean is 1."""
+    shares = [1 / biotac_sp.width(target) for target in group for _ in range(biotac_sp.width(target))]
+    weights = torch.tensor(shares)
+    return weights / weights.mean()
+
+
+def _schedule(params: Params, seed: int) -> loop.Schedule:
+    return loop.Schedule(
+        epochs=params["epochs"],
+        batch=params["batch"],
+        learning_rate=params["learning_rate"],
+        patience=params["patience"] or params["epochs"],
+        gradient_clip=math.inf,
+        seed=seed,
+        cycle=params["cycle"],
+    )

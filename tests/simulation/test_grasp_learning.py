@@ -1,0 +1,141 @@
+"""What models of touch learn on the simulated table, where it is known what can be learned."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tacpipe import biotac_sp, registry
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.simulation.grasp_scene import Rig
+from tacpipe.tasks import touch
+from tests.simulation.grasp_datasets import grasps, readings
+
+POINTNET = {
+    "architecture": "pointnet",
+    "points": 64,
+    "normalisation": "sphere",
+    "transform": False,
+    "networks": 1,
+    "epochs": 25,
+    "learning_rate": 3e-3,
+}
+Metrics = dict[str, Any]
+
+
+def trained(training: Any, workspace: Path, **changed: Any) -> dict[str, bytes]:
+    params = {**asdict(registry.load("train.touch").params()), "trees": 60, **changed}
+    return touch.train(params, training, None, workspace)
+
+
+def judged(training: Any, tested: Any, workspace: Path, **changed: Any) -> Metrics:
+    files = trained(training, workspace, **changed)
+    found: Metrics = json.loads(touch.evaluate(files, tested).files["metrics.json"])
+    return found
+
+
+def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_are_moved_together(
+    tmp_path: Path,
+) -> None:
+    made = grasps(Rig(), range(60))
+    strong = touch.load(trained(made, tmp_path, trees=20, leaf=2))
+    rng = np.random.default_rng(0)
+    for shard in list(made.shards.values())[:12]:
+        cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
+        turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)
+        moved = Cloud((cloud.points_m @ turn.T + shift_m).astype(np.float32), cloud.colours)
+        one, other = strong.predict(cloud, grasp), strong.predict(moved, grasp.moved(turn, shift_m))
+        for target in biotac_sp.TARGETS:
+            np.testing.assert_allclose(getattr(other, target), getattr(one, target), rtol=1e-3)
+
+
+def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_show_it(tmp_path: Path) -> None:
+    rig = Rig(spheres=True, effort_spread=0.05, drift_count_day=0.0)
+    training, tested = grasps(rig, range(160)), grasps(rig, range(160, 240))
+    pressures = {"targets": "pdc_th,pdc_mf"}
+    scaled = {**POINTNET, **pressures, "normalisation": "minmax", "inputs": "xyzpose", "epochs": 15}
+    boxed = judged(training, tested, tmp_path / "boxed", **scaled)
+    metric = judged(training, tested, tmp_path / "metric", **pressures)
+    for target in ("pdc_th", "pdc_mf"):
+        assert boxed["model"]["r2"][target] <= 0.05
+        assert metric["model"]["r2"][target] >= 0.8
+
+
+def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_can_know(tmp_path: Path) -> None:
+    rig = Rig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)  # drift would be learned from time
+    training, tested = grasps(rig, range(1000)), grasps(rig, range(1000, 1200))
+    told = judged(training, tested, tmp_path, leaf=2)
+    for target in biotac_sp.TARGETS:
+        bound = float(np.sqrt(readings(tested, target, "truth", "gt_variance_").mean()))
+        assert (
+            0.9 * bound <= told["model"]["rmse_counts"][target] <= 1.3 * bound
+        )  # 200 grasps tell the bound to a tenth
+        assert told["model"]["rmse_counts"][target] < told["constant"]["rmse_counts"][target]
+
+
+def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
+    made = grasps(Rig(drift_count_day=0.0), range(240))
+    names = list(made.shards)
+    gains: dict[str, list[float]] = {target: [] for target in biotac_sp.TARGETS}
+    for fold in range(4):
+        training, tested = (type(made)({name: made.shards[name] for name in part}, {}) for part in _parted(names, fold))
+        errors = [
+            judged(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
+            for inputs in ("xyzcont", "rgbcont")
+        ]
+        for target, gain in gains.items():
+            gain.append(errors[0][target] - errors[1][target])
+    for gain in gains.values():
+        assert np.mean(gain) <= np.std(gain, ddof=1) / np.sqrt(len(gain)) + 1e-3
+
+
+def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and_who_is_told_can(
+    tmp_path: Path,
+) -> None:
+    rig = Rig(one_pose=True, shift=1.0, drift_count_day=0.0, families="cone,bow", objects=2, stiffness="rigid")
+    training, tested = grasps(rig, range(400)), grasps(rig, range(400, 600))
+    errors = {}
+    for inputs in ("xyz", "xyzcont"):
+        told = judged(training, tested, tmp_path / inputs, **{**POINTNET, "inputs": inputs, "targets": "e_th,e_mf"})
+        errors[inputs] = told["model"]["rmse"]
+    mean = told["object_mean"]["rmse"]
+    for target in ("e_th", "e_mf"):
+        assert errors["xyz"][target] >= 0.95 * mean[target]
+        assert errors["xyzcont"][target] < 0.95 * mean[target]
+
+
+def _parted(names: list[str], fold: int) -> tuple[list[str], list[str]]:
+    """Three quarters of the names, and the quarter that the fold tests."""
+    tested = names[fold::4]
+    return [name for name in names if name not in tested], tested
+
+
+@pytest.mark.parametrize("points", [32, 256])
+def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_were_drawn(
+    points: int, tmp_path: Path
+) -> None:
+    made = grasps(Rig(), range(80))
+    files = trained(made, tmp_path, **{**POINTNET, "points": points, "epochs": 5, "draws": 1, "targets": "pdc_th"})
+    network = touch.load(files)
+    spread = _spread_over_draws(network, made)
+    assert spread > 0
+    assert points == 32 or spread < 0.25  # share of what the pressure differs by from grasp to grasp
+
+
+def _spread_over_draws(network: Any, made: Any) -> float:
+    from tacpipe.tasks.touch import grasps as grasps_of
+    from tacpipe.tasks.touch import members
+    from tacpipe.tasks.touch.learning import told
+
+    some = grasps_of.read(made)
+    (member,) = network.members
+    drawn = members.sources(member.params, some)
+    visits = [told(member.network, drawn.fixed(range(len(some)), visit)).detach().numpy() for visit in range(8)]
+    return float(np.std(visits, axis=0).mean() / np.std(member.scale.apply(some.felt["pdc_th"])))

@@ -1,0 +1,123 @@
+"""Reading grasps of a dataset: what they become, and what is refused with the recording's name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe import biotac_sp
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks.touch import grasps as grasps_of
+from tests.tasks.touch.handmade import GraspShard, cloud, dataset, grasp, recording, recordings
+
+
+def without(shard: GraspShard, stream: str, column: str = "") -> GraspShard:
+    tables = dict(shard.tables)
+    if column:
+        tables[stream] = tables[stream].drop_columns([column])
+    else:
+        del tables[stream]
+    return GraspShard(tables, shard.name, shard.attributes)
+
+
+def with_table(shard: GraspShard, stream: str, table: pa.Table) -> GraspShard:
+    return GraspShard({**shard.tables, stream: table}, shard.name, shard.attributes)
+
+
+def test_grasps_come_in_the_order_of_their_names_with_all_that_was_felt() -> None:
+    one, other = recording(7, "melon"), recording(3)
+    found = grasps_of.read(dataset(one, other))
+    assert found.names == ("ball-003", "melon-007")
+    assert found.objects == ("ball", "melon")
+    assert found.sessions == ("ball-s01", "melon-s01")
+    assert found.t_ns.tolist() == [180_000_000_000, 420_000_000_000]
+    assert found.digests == (other.digest, one.digest)
+    assert {target: felt.shape for target, felt in found.felt.items()} == {
+        "pdc_th": (2, 1),
+        "pdc_mf": (2, 1),
+        "e_th": (2, 24),
+        "e_mf": (2, 24),
+    }
+    row = one.tables["reading"].to_pylist()[0]
+    assert found.felt["pdc_mf"][1].tolist() == [row["mf_pdc"]]
+    assert found.felt["e_th"][1].tolist() == [row[f"th_electrode{n:02d}"] for n in range(1, 25)]
+    np.testing.assert_array_equal(found.clouds[0].points_m, cloud(3).points_m)
+
+
+def test_grasps_need_no_reading_where_none_is_asked_for() -> None:
+    found = grasps_of.read(recordings(felt=False), felt=False)
+    assert len(found) == 12
+    assert found.felt == {}
+
+
+def test_objects_and_sessions_that_are_not_told_are_empty() -> None:
+    found = grasps_of.read(dataset(recording(0, object=None, session=None)))
+    assert (found.objects, found.sessions) == (("",), ("",))
+
+
+def test_joined_grasps_stand_one_after_the_other() -> None:
+    one, other = grasps_of.read(recordings(0, 2)), grasps_of.read(recordings(5, 1))
+    both = one.joined(other)
+    assert both.names == one.names + other.names
+    assert len(both.clouds) == len(both.grasps) == len(both.digests) == len(both) == 6
+    np.testing.assert_array_equal(both.t_ns[-2:], other.t_ns)
+    for target in biotac_sp.TARGETS:
+        np.testing.assert_array_equal(both.felt[target], np.concatenate([one.felt[target], other.felt[target]]))
+
+
+FAR = Grasp(np.array([0.02, -0.1, 0.8]), np.array([0.02, -0.1, 1.2]))
+NAN = pa.table({name: np.array([0.0, np.nan, 1.0, 2.0], np.float32) for name in ("x_m", "y_m", "z_m")})
+
+
+@pytest.mark.parametrize(
+    ("shard", "sentence"),
+    [
+        (without(recording(0), "cloud"), "ball-000 has the streams grasp, reading and no cloud.*segment grasps"),
+        (without(recording(0), "grasp"), "ball-000 has the streams cloud, reading and no grasp"),
+        (without(recording(0), "reading"), "ball-000 has no reading of touch.*tacpipe predict"),
+        (without(recording(0), "cloud", "y_m"), "ball-000 lacks the column y_m"),
+        (without(recording(0), "grasp", "g2_z_m"), "ball-000 lacks the column g2_z_m"),
+        (without(recording(0), "reading", "th_pdc"), "ball-000 lacks the column th_pdc"),
+        (without(recording(0), "reading", "mf_electrode24"), "ball-000 lacks the column mf_electrode24"),
+        (recording(0, cloud=Cloud(np.zeros((0, 3), np.float32))), "ball-000 has a cloud of 0 points.*3 or more"),
+        (recording(0, cloud=Cloud(np.ones((2, 3), np.float32))), "ball-000 has a cloud of 2 points"),
+        (with_table(recording(0), "cloud", NAN), "ball-000: 1 of 4 points are not finite"),
+        (
+            with_table(recording(0), "grasp", pa.concat_tables([grasp(0).table(0)] * 2)),
+            "ball-000: A grasp's table has 2 rows",
+        ),
+        (
+            with_table(recording(0), "reading", pa.concat_tables([recording(0).tables["reading"]] * 3)),
+            "ball-000 has 3 readings; a grasp has one",
+        ),
+        (recording(0, grasp=FAR), "Recording ball-000: grasp point g2 lies 3[0-9][0-9] mm from the nearest point"),
+    ],
+)
+def test_what_is_no_grasp_is_refused_by_name(shard: GraspShard, sentence: str) -> None:
+    with pytest.raises(TacpipeError, match=sentence):
+        grasps_of.read(dataset(shard))
+
+
+@pytest.mark.parametrize("value", [None, float("nan"), float("inf")])
+def test_a_reading_that_is_not_finite_is_refused_by_column(value: Any) -> None:
+    shard = recording(0)
+    table = shard.tables["reading"]
+    index = table.column_names.index("th_electrode05")
+    broken = table.set_column(index, "th_electrode05", pa.array([value], pa.float64()))
+    with pytest.raises(TacpipeError, match="ball-000 has no finite reading in the column th_electrode05"):
+        grasps_of.read(dataset(with_table(shard, "reading", broken)))
+
+
+def test_a_grasp_point_may_lie_on_a_hidden_side_but_not_beyond() -> None:
+    seen = Cloud(np.array([[0, 0, 1.0], [0.01, 0, 1.0], [0, 0.01, 1.0]], np.float32))
+    limit = grasps_of.FARTHEST_M
+    made = Grasp(np.array([0, 0, 1.0]), np.array([0, 0, 1.0 + 0.99 * limit]))
+    grasps_of.check("The grasp", seen, made)
+    far = Grasp(np.array([0, 0, 1.0 - 1.01 * limit]), np.array([0, 0, 1.0]))
+    with pytest.raises(TacpipeError, match=f"The grasp: grasp point g1 lies {1010 * limit:.0f} mm from the nearest"):
+        grasps_of.check("The grasp", seen, far)

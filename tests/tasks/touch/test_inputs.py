@@ -1,0 +1,177 @@
+"""What a PointNet reads of a grasp, in all six modes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
+
+from tacpipe.clouds import frame, normalisation
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.normalisation import Extent
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks.touch.inputs import MODES, Inputs, Sources
+from tests.tasks.touch.handmade import cloud, grasp
+
+COUNTS = {"xyz": (3, 0), "rgb": (6, 0), "xyzcont": (3, 6), "rgbcont": (6, 6), "xyzpose": (3, 15), "rgbpose": (6, 15)}
+
+
+def sources(
+    mode: str = "xyzcont", points: int = 10, normalisation: str = "none", count: int = 3, **given: Any
+) -> Sources:
+    numbers = range(count)
+    inputs = Inputs(mode, points, normalisation, **given)
+    return Sources(inputs, [f"g{n}" for n in numbers], [cloud(n) for n in numbers], [grasp(n) for n in numbers])
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("normalisation", normalisation.NORMALISATIONS)
+def test_each_mode_has_the_channels_and_numbers_of_the_letter(mode: str, normalisation: str) -> None:
+    drawn = sources(mode, 10, normalisation)
+    channels, numbers = COUNTS[mode]
+    assert (drawn.inputs.channels, drawn.inputs.grasp_numbers) == (channels, numbers)
+    for points, grasps in (drawn.draw([2, 0], rng()), drawn.fixed([2, 0], 0)):
+        assert (points.shape, grasps.shape) == ((2, 10, channels), (2, numbers))
+        assert points.dtype == grasps.dtype == np.float32
+
+
+def rows_of(points: np.ndarray, among: np.ndarray) -> list[int]:
+    """Which of the cloud's points these are."""
+    return [int(np.flatnonzero((among == point).all(axis=1))[0]) for point in points]
+
+
+def test_points_are_drawn_without_replacement_and_anew_at_each_visit() -> None:
+    drawn, generator = sources("rgbcont", 30), rng()
+    first, again = (drawn.draw([1], generator)[0][0] for _ in range(2))
+    one, other = (rows_of(points[:, :3], cloud(1).points_m) for points in (first, again))
+    assert len(set(one)) == len(set(other)) == 30
+    assert set(one) != set(other)
+    colours = cloud(1).colours
+    assert colours is not None
+    np.testing.assert_allclose(first[:, 3:], colours[one] / 255.0, atol=1e-6)
+
+
+def test_every_point_is_as_likely_as_any_other() -> None:
+    drawn, generator = sources(points=10), rng(4)
+    seen = np.zeros(40)
+    for _ in range(400):
+        seen[rows_of(drawn.draw([0], generator)[0][0], cloud(0).points_m)] += 1
+    assert np.abs(seen - 100).max() < 5 * np.sqrt(400 * 0.25 * 0.75)  # 5 standard deviations
+
+
+def test_fixed_draws_depend_on_the_cloud_and_the_visit_alone() -> None:
+    drawn = sources(count=4, rotation_deg=180.0)
+    points, numbers = drawn.fixed([3, 1], 0)
+    np.testing.assert_array_equal(drawn.fixed([1], 0)[0][0], points[1])
+    np.testing.assert_array_equal(drawn.fixed([0, 1, 2, 3], 0)[0][3], points[0])
+    assert not np.array_equal(drawn.fixed([3], 1)[0][0], points[0])
+    alone = Sources(Inputs("xyzcont", 10, "none"), ["other"], [cloud(3)], [grasp(3)])
+    np.testing.assert_array_equal(alone.fixed([0], 0)[0][0], points[0])
+    np.testing.assert_array_equal(numbers[0], np.concatenate([grasp(3).g1_m, grasp(3).g2_m]).astype(np.float32))
+
+
+def test_the_grasps_points_are_normalised_with_the_clouds_own_constants() -> None:
+    seen, made = cloud(2), grasp(2)
+    whole = seen.points_m.astype(float)
+    low, high = whole.min(axis=0), whole.max(axis=0)
+    numbers = sources("xyzcont", 10, "minmax").draw([2], rng())[1][0]
+    np.testing.assert_allclose(numbers[:3], 2 * (made.g1_m - low) / (high - low) - 1, atol=1e-5)
+    np.testing.assert_allclose(numbers[3:], 2 * (made.g2_m - low) / (high - low) - 1, atol=1e-5)
+    centre = whole.mean(axis=0)
+    radius = np.linalg.norm(whole - centre, axis=1).max()
+    numbers = sources("xyzcont", 10, "sphere").draw([2], rng())[1][0]
+    np.testing.assert_allclose(numbers[:3], (made.g1_m - centre) / radius, atol=1e-5)
+    numbers = sources("xyzpose", 10, "wrist").draw([2], rng())[1][0]
+    assert made.wrist is not None
+    np.testing.assert_allclose(numbers[3:6], made.wrist.T @ made.g2_m, atol=1e-6)
+    np.testing.assert_allclose(numbers[6:], made.wrist.ravel(), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["minmax", "sphere"])
+def test_a_cloud_is_scaled_the_same_way_whichever_points_are_drawn(method: str) -> None:
+    drawn = sources("rgbcont", 10, method)
+    whole = Sources(Inputs("rgbcont", 40, method), ["all"], [cloud(1)], [grasp(1)]).draw([0], rng())[0][0]
+    for seed in range(5):
+        for point in drawn.draw([1], rng(seed))[0][0]:
+            assert np.abs(whole - point).max(axis=1).min() < 1e-6
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["none", "sphere", "minmax"]))
+def test_a_random_turn_takes_cloud_grasp_and_wrist_along(seed: int, method: str) -> None:
+    drawn = sources("xyzpose", 40, method, rotation_deg=180.0)
+    points, numbers = (one[0].astype(float) for one in drawn.draw([0], rng(seed)))
+    made, seen = grasp(0), cloud(0).points_m.astype(float)
+    turn = normalisation.random_rotation(rng(seed), 180.0)  # the first that is drawn
+    assert made.wrist is not None
+    np.testing.assert_allclose(numbers[6:].reshape(3, 3), turn @ made.wrist, atol=1e-6)
+    known = normalisation.normalised(method, seen @ turn.T, Extent.of(cloud(0)), turn, None)
+    np.testing.assert_allclose(np.sort(points, axis=0), np.sort(known, axis=0), atol=1e-5)
+    if method == "none":
+        ends = np.stack([made.g1_m, made.g2_m])
+        np.testing.assert_allclose(numbers[:6].reshape(2, 3), ends @ turn.T, atol=1e-6)
+        np.testing.assert_allclose(np.sort(pdist(points)), np.sort(pdist(seen)), atol=1e-6)
+
+
+def test_in_the_wrists_axes_turns_are_not_seen() -> None:
+    still, turned = (sources("xyzcont", 40, "wrist", rotation_deg=deg) for deg in (0.0, 180.0))
+    one, other = (drawn.draw([1], rng(1))[0][0] for drawn in (still, turned))
+    np.testing.assert_allclose(np.sort(other, axis=0), np.sort(one, axis=0), atol=1e-6)
+
+
+def test_an_estimated_wrist_stands_for_the_one_that_is_told() -> None:
+    numbers = sources("xyzpose", wrist="estimated").fixed([0], 0)[1][0]
+    np.testing.assert_allclose(numbers[6:].reshape(3, 3), frame.estimated_wrist(grasp(0)), atol=1e-6)
+    blind = Sources(Inputs("xyzpose", 5, "wrist", wrist="estimated"), ["g"], [cloud(0)], [grasp(0, wrist=False)])
+    assert blind.draw([0], rng())[1].shape == (1, 15)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "given_cloud", "given_grasp", "sentence"),
+    [
+        (Inputs("xyz", 41, "none"), cloud(0), grasp(0), "ball-7 has a cloud of 40 points, and 41 are to be drawn"),
+        (
+            Inputs("rgb", 5, "none"),
+            cloud(0, coloured=False),
+            grasp(0),
+            "ball-7 has a cloud without colours.*inputs rgb",
+        ),
+        (Inputs("xyzpose", 5, "none"), cloud(0), grasp(0, wrist=False), "ball-7 does not tell how the wrist is turned"),
+        (Inputs("xyz", 5, "wrist"), cloud(0), grasp(0, wrist=False), "ball-7 does not tell how.*--wrist estimated"),
+    ],
+)
+def test_a_grasp_that_lacks_what_is_read_is_refused_by_name(
+    inputs: Inputs, given_cloud: Cloud, given_grasp: Any, sentence: str
+) -> None:
+    with pytest.raises(TacpipeError, match=sentence):
+        Sources(inputs, ["ball-7"], [given_cloud], [given_grasp])
+
+
+def test_a_cloud_of_just_as_many_points_is_read_whole_and_colours_are_not_asked_for_in_vain() -> None:
+    drawn = Sources(Inputs("xyzcont", 40, "minmax"), ["g"], [cloud(0, coloured=False)], [grasp(0, wrist=False)])
+    points = drawn.draw([0], rng())[0][0]
+    assert len(np.unique(points, axis=0)) == 40
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"mode": "grey"}, "inputs is 'grey'; it must be one of xyz, rgb"),
+        ({"points": 0}, "points is 0; it must be 1 or more"),
+        ({"normalisation": "box"}, "normalisation is 'box'; it must be one of none, sphere"),
+        ({"rotation_deg": 181.0}, "rotation_deg is 181.0; it must lie between 0 and 180"),
+        ({"rotation_deg": float("nan")}, "rotation_deg is nan"),
+        ({"wrist": "guessed"}, "wrist is 'guessed'; it must be one of given, estimated"),
+    ],
+)
+def test_inputs_that_there_are_not_are_refused(given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(TacpipeError, match=sentence):
+        Inputs(**{"mode": "xyz", "points": 5, "normalisation": "none", **given})

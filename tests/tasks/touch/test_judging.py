@@ -1,0 +1,230 @@
+"""Measures of a model against scikit-learn's on the predictions that are written, and who counts as seen and known."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_error
+
+from tacpipe import biotac_sp, regression
+from tacpipe.errors import TacpipeError
+from tacpipe.stage import Result
+from tacpipe.tasks import touch
+from tests.tasks.touch.handmade import dataset, judged, recording, recordings, trained
+
+PREDICTORS = ("model", "constant", "object_mean", "nearest_in_time")
+FAST = {"architecture": "trees", "inputs": "xyz"}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return trained(tmp_path_factory.mktemp("model"), **FAST)
+
+
+@pytest.fixture(scope="module")
+def asked() -> Any:
+    """Two seen grasps, six unseen of a known object, four of two novel ones, one of no named object."""
+    shards: list[Any] = [recording(n) for n in (0, 1)] + [recording(n, "melon") for n in range(20, 26)]
+    shards += [recording(n, kind) for kind in ("egg", "shoe") for n in (30, 31)]
+    return dataset(*shards, recording(40, object=None))
+
+
+@pytest.fixture(scope="module")
+def result(model: dict[str, bytes], asked: Any) -> Result:
+    return judged(model, asked)[1]
+
+
+@pytest.fixture(scope="module")
+def metrics(result: Result) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(result.files["metrics.json"])
+    return found
+
+
+def columns(target: str) -> list[str]:
+    return [target] if target.startswith("pdc") else [f"{target}_{n:02d}" for n in range(1, 25)]
+
+
+def rows(table: pa.Table, target: str) -> np.ndarray:
+    """What a stream tells of a target (grasp, value), counts."""
+    return np.column_stack([table.column(name).to_numpy() for name in columns(target)]).astype(float)
+
+
+def masks(result: Result) -> dict[str, np.ndarray]:
+    about = result.recordings["predictions"].streams["grasps"].to_pydict()
+    seen, known = np.array(about["seen"]), np.array(about["known"])
+    return {"": ~seen, "seen": seen, "known": known & ~seen, "novel": ~known & ~seen}
+
+
+@pytest.mark.parametrize("part", ["", "seen", "known", "novel"])
+@pytest.mark.parametrize("target", biotac_sp.TARGETS)
+def test_measures_are_scikit_learns_on_the_predictions_written(
+    part: str, target: str, result: Result, metrics: dict[str, Any]
+) -> None:
+    streams, mask = result.recordings["predictions"].streams, masks(result)[part]
+    tree = metrics[part] if part else metrics
+    true = rows(streams["true"], target)[mask]
+    low, high = biotac_sp.RANGES[target]
+    for name in PREDICTORS:
+        told = rows(streams[name], target)[mask]
+        one = tree[name]
+        rmse = root_mean_squared_error(true.ravel(), told.ravel())
+        assert one["n"] == mask.sum()
+        assert one["rmse_counts"][target] == pytest.approx(rmse, rel=1e-5)
+        assert one["rmse"][target] == pytest.approx(rmse / (high - low), rel=1e-5)
+        mae = mean_absolute_error(true.ravel(), told.ravel()) / (high - low)
+        assert one["mae"][target] == pytest.approx(mae, rel=1e-4)
+        r2 = r2_score(true, told, multioutput="variance_weighted")
+        assert one["r2"][target] == pytest.approx(r2, rel=1e-3, abs=1e-4)
+        constant = root_mean_squared_error(true.ravel(), rows(streams["constant"], target)[mask].ravel())
+        assert one["skill"][target] == pytest.approx(1 - rmse / constant, abs=1e-5)
+        if mask.sum() <= 10:  # one batch
+            assert one["rmse_batch_mean"][target] == pytest.approx(one["rmse"][target])
+
+
+def test_the_letters_figure_is_no_larger_than_the_error_over_all(model: dict[str, bytes]) -> None:
+    tree, result = judged(model, recordings(10, 20))  # four batches of ten
+    true, told = (result.recordings["predictions"].streams[name] for name in ("true", "model"))
+    for target in biotac_sp.TARGETS:
+        mine, batch = (tree["model"][name][target] for name in ("rmse", "rmse_batch_mean"))
+        assert 0 < batch <= mine
+        shares = [biotac_sp.normalised(target, rows(table, target)) for table in (true, told)]
+        by_hand = [
+            root_mean_squared_error(shares[0][at : at + 10].ravel(), shares[1][at : at + 10].ravel())
+            for at in range(0, 40, 10)
+        ]
+        assert batch == pytest.approx(np.mean(by_hand), rel=1e-5)
+
+
+@pytest.mark.parametrize("target", ["e_th", "e_mf"])
+def test_each_electrode_is_told_alone(target: str, result: Result, metrics: dict[str, Any]) -> None:
+    streams, mask = result.recordings["predictions"].streams, masks(result)[""]
+    shares = [biotac_sp.normalised(target, rows(streams[name], target)[mask]) for name in ("true", "model")]
+    told = metrics["model"]["by_electrode"][target]
+    assert list(told) == [f"{n:02d}" for n in range(1, 25)]
+    for index, one in enumerate(told.values()):
+        true, model = (values[:, index] for values in shares)
+        assert one["rmse"] == pytest.approx(root_mean_squared_error(true, model), rel=1e-4)
+        assert one["r2"] == pytest.approx(r2_score(true, model), rel=1e-3, abs=1e-3)
+    assert "by_electrode" not in metrics["constant"]
+
+
+def test_seen_known_and_novel_grasps_are_told_apart(result: Result, metrics: dict[str, Any]) -> None:
+    about = result.recordings["predictions"].streams["grasps"].to_pydict()
+    assert about["recording"] == sorted(about["recording"])
+    assert [name for name, seen in zip(about["recording"], about["seen"], strict=True) if seen] == [
+        "ball-000",
+        "ball-001",
+    ]
+    known = {name for name, is_known in zip(about["object"], about["known"], strict=True) if is_known}
+    assert known == {"ball", "melon"}
+    assert about["object"][about["recording"].index("ball-040")] == ""
+    assert metrics["counts"] == {"grasps": 11, "objects": 4}
+    counts = {part: metrics[part]["counts"]["grasps"] for part in ("known", "novel", "seen")}
+    assert counts == {"known": 6, "novel": 5, "seen": 2}
+
+
+def test_each_object_has_measures_of_its_own_also_as_rows(result: Result, metrics: dict[str, Any]) -> None:
+    tree = metrics["model"]["by_object"]
+    assert {name: one["n"] for name, one in tree.items()} == {"unnamed": 1, "egg": 2, "shoe": 2, "melon": 6}
+    streams = result.recordings["predictions"].streams
+    mask = np.array([name == "egg" for name in streams["grasps"].to_pydict()["object"]])
+    rmse = root_mean_squared_error(*(rows(streams[name], "pdc_mf")[mask] for name in ("true", "model")))
+    assert tree["egg"]["rmse_counts"]["pdc_mf"] == pytest.approx(rmse, rel=1e-5)
+    lines = list(csv.DictReader(io.StringIO(result.files["by_object.csv"].decode())))
+    assert len(lines) == 4 * 4 * 4  # objects, predictors, targets
+    line = next(one for one in lines if (one["object"], one["predictor"], one["target"]) == ("egg", "model", "pdc_mf"))
+    assert int(line["n"]) == 2
+    assert float(line["rmse_counts"]) == pytest.approx(rmse, rel=1e-4)
+    alone = next(one for one in lines if one["object"] == "unnamed")
+    assert alone["r2"] == ""  # of one grasp nothing varies
+
+
+def test_novel_objects_are_resampled_whole_and_known_ones_by_grasp(result: Result, metrics: dict[str, Any]) -> None:
+    streams = result.recordings["predictions"].streams
+    about = streams["grasps"].to_pydict()
+    for part, by in (("novel", "object"), ("known", "recording")):
+        mask = masks(result)[part]
+        true, told, constant = (
+            biotac_sp.normalised("pdc_th", rows(streams[name], "pdc_th")[mask])
+            for name in ("true", "model", "constant")
+        )
+        model, baseline = (regression.squared_sums(true, one) for one in (told, constant))
+        known = regression.skill_interval(model, baseline, np.array(about[by])[mask])
+        found = [metrics[part]["model"][name]["pdc_th"] for name in ("skill", "skill_low", "skill_high")]
+        assert found == pytest.approx(list(known), abs=1e-4)
+
+
+def test_the_metrics_are_json_without_values_that_are_not_numbers(model: dict[str, bytes]) -> None:
+    files = judged(model, dataset(recording(50, "shoe")))[1].files  # one grasp: no spread, no interval
+
+    def refuse(name: str) -> float:
+        raise AssertionError(name)
+
+    tree = json.loads(files["metrics.json"], parse_constant=refuse)
+    assert tree["model"]["r2"]["pdc_th"] is None
+    assert tree["model"]["skill_low"]["e_th"] is None
+    assert tree["model"]["rmse"]["e_th"] > 0
+
+
+def test_the_streams_have_the_columns_and_types_that_are_promised(result: Result, asked: Any) -> None:
+    found = result.recordings["predictions"]
+    assert set(found.streams) == {"grasps", "true", *PREDICTORS}
+    names = [name for target in biotac_sp.TARGETS for name in columns(target)]
+    for stream in ("true", *PREDICTORS):
+        assert found.streams[stream].column_names == names
+        assert {str(field.type) for field in found.streams[stream].schema} == {"float"}  # of 32 bits
+        assert found.streams[stream].num_rows == len(asked.shards)
+    about = found.streams["grasps"]
+    assert [(field.name, str(field.type)) for field in about.schema] == [
+        *(("recording", "string"), ("object", "string"), ("session", "string")),
+        *(("t_ns", "int64"), ("seen", "bool"), ("known", "bool")),
+    ]
+    felt = asked.shards["egg-030"].tables["reading"].column("th_pdc")[0].as_py()
+    assert rows(found.streams["true"], "pdc_th")[about.to_pydict()["recording"].index("egg-030")] == felt
+    assert dict(found.attributes) == {}
+
+
+def test_grasps_all_seen_leave_nothing_to_judge_but_what_was_seen(model: dict[str, bytes]) -> None:
+    tree, result = judged(model, recordings())
+    assert tree["counts"] == {"grasps": 0}
+    assert "model" not in tree
+    assert tree["seen"]["model"]["n"] == 12
+    assert result.files["by_object.csv"].decode().count("\n") == 1
+
+
+def test_a_grasp_counts_as_seen_by_its_content_or_its_reading_and_not_by_its_name(model: dict[str, bytes]) -> None:
+    copy = dataclasses.replace(recording(0), name="ball-000")
+    changed = recording(0, session="other")
+    tree, _ = judged(model, dataset(copy))
+    assert tree["seen"]["counts"]["grasps"] == 1
+    assert judged(model, dataset(changed))[0]["seen"]["counts"]["grasps"] == 1  # a reading that was logged twice
+
+
+def test_results_on_simulated_grasps_say_so(model: dict[str, bytes]) -> None:
+    _, result = judged(model, dataset(recording(60, simulated=True)))
+    assert dict(result.recordings["predictions"].attributes) == {"simulated": True}
+
+
+def test_the_model_and_its_history_come_along(tmp_path: Path) -> None:
+    files = trained(tmp_path, architecture="patches", inputs="xyz")
+    result = judged(files, recordings(6, 1))[1]
+    assert set(result.files) == {"metrics.json", "by_object.csv", "config.json", "history.jsonl"}
+    assert all(result.files[name] == files[name] for name in ("config.json", "history.jsonl"))
+
+
+def test_what_cannot_be_judged_is_refused(model: dict[str, bytes], tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="There is no grasp to judge the model on"):
+        touch.evaluate(model, dataset())
+    with pytest.raises(TacpipeError, match="ball-000 has no reading of touch"):
+        touch.evaluate(model, dataset(recording(0, felt=False)))
+    bare = trained(tmp_path, **FAST, baselines=False)
+    with pytest.raises(TacpipeError, match="trained without baselines, and cannot be judged"):
+        touch.evaluate(bare, recordings(6, 1))
