@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import json
 from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.report import markup, plain
+from tacpipe.report import contents, markup, plain
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
 TASKS = {  # the package whose functions ``report`` and ``reads`` tell of a task's results, by the task's name
     "forward": "tacpipe.report.forward",
     "material": "tacpipe.report.material",
+    "touch": "tacpipe.report.touch",
 }
 
 
@@ -52,8 +52,7 @@ def render(given: Sequence[Dataset], *, title: str, traces: int = 2) -> bytes:
 
 def _task(result: Dataset) -> str:
     """Return the task of a result, empty where it does not say."""
-    config = json.loads(result.files["config.json"]) if "config.json" in result.files else {}
-    return str(config.get("task", ""))
+    return str(contents.tree(result, "config.json").get("task", ""))
 
 
 def _users(dataset: Dataset, packages: dict[str, Any]) -> list[str]:

@@ -1,0 +1,33 @@
+"""The part of the page that tells of touch: how well a cloud and a grasp foretell what fingers feel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from tacpipe.report import plain
+from tacpipe.report.touch import clouds, overview, predictions
+from tacpipe.report.touch.methods import Run, grouped
+
+if TYPE_CHECKING:
+    from tacpipe.dataset import Dataset
+
+
+def reads(dataset: Dataset) -> bool:
+    """Say whether a dataset that is no result helps to tell of touch: one of clouds and grasps does."""
+    return clouds.reads(dataset)
+
+
+def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> str:
+    """Return what ``results`` of this task tell, pooled by method; ``others`` are datasets that `reads` takes.
+
+    A result without predictions of unseen grasps has nothing to compare and is told as its metrics name it. Nothing is
+    drawn over time, so ``traces`` is of no effect.
+    """
+    runs = [Run.read(one) for one in results if predictions.RECORDING in one.shards]
+    runs = [run for run in runs if len(run.predictions.recordings)]
+    compared = {id(run.dataset) for run in runs}
+    bare = [one for one in results if id(one) not in compared]
+    parts = [overview.render(grouped(runs), others)] if runs else []
+    parts += [plain.render(one, number, len(bare)) for number, one in enumerate(bare, 1)]
+    return "".join(parts)

@@ -1,0 +1,76 @@
+"""Losses over the epochs of training, among them Figure 8 of the paper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from tacpipe import biotac_sp
+from tacpipe.report import epochs, markup
+from tacpipe.report.touch import forms, wording
+from tacpipe.report.touch.methods import PAPERS, Group, Method, Run
+
+ALL = "all"  # stands where one network foretells all targets
+UNWATCHED = " Where no grasps were kept for validation, it is the loss on those of training, judged after each epoch."
+
+
+def section(group: Group) -> str:
+    """Return validation losses of one method an architecture, a figure a target; empty without epochs."""
+    drawn = []
+    for target in (*biotac_sp.TARGETS, ALL):
+        curves = {one.name: found for one in group.main if (found := _curves(one, target, "val_loss"))}
+        if curves:
+            name = wording.TARGETS.get(target, "one network for all targets")
+            svg = epochs.by_epoch(curves, "validation loss", f"Validation loss by epoch, {name}", log=True)
+            caption = f"Validation loss by epoch, {name}, each method's own. Thick: mean over runs; thin: single runs."
+            drawn.append(markup.figure(svg, f"{caption}{_unwatched(group.main)}"))
+    return f'<h4>Training</h4><div class="pair">{"".join(drawn)}</div>' if drawn else ""
+
+
+def figure_8(methods: Sequence[Method]) -> str:
+    """Return Figure 8 in the paper's form: both losses of its network, of most epochs; empty where it was not run."""
+    found = [
+        (method, target)
+        for method in methods
+        for target in (forms.TARGET, ALL)
+        if method.architecture == PAPERS and _curves(method, target, "train_loss")
+    ]
+    if not found:
+        return ""
+    method, target = max(found, key=lambda one: (len(_curves(one[0], one[1], "train_loss")[0]), len(one[0].runs)))
+    named = {"training": "train_loss", "validation": "val_loss"}
+    curves = {name: told for name, loss in named.items() if (told := _curves(method, target, loss))}
+    quantity = "loss (RMSE, share of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
+    svg = epochs.by_epoch(curves, quantity, "Training and validation loss by epoch", log=True)
+    simulated = " Simulated." if method.simulated else ""
+    caption = (
+        f"Figure 8 in the paper's form: training and validation loss by epoch, {method.name}, "
+        f"{wording.TARGETS.get(target, 'all targets')}. {wording.basis([method])} The paper's figure has 1,000 epochs."
+        f"{_unwatched([method])}{simulated}"
+    )
+    return markup.figure(svg, caption)
+
+
+def losses(run: Run, target: str, name: str) -> list[float]:
+    """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none tells it.
+
+    The mean ends where the first network does. NaN stands where an epoch does not tell the loss.
+    """
+    networks: dict[object, list[float]] = {}
+    for line in run.history:
+        if line.get("target", ALL) == target:
+            told = line.get(name)
+            networks.setdefault(line.get("network"), []).append(float("nan") if told is None else float(told))
+    length = min(map(len, networks.values()), default=0)
+    mean = [sum(values) / len(values) for values in zip(*(one[:length] for one in networks.values()), strict=True)]
+    return mean if any(not math.isnan(value) for value in mean) else []
+
+
+def _curves(method: Method, target: str, name: str) -> list[list[float]]:
+    return [curve for run in method.runs if (curve := losses(run, target, name))]
+
+
+def _unwatched(methods: Sequence[Method]) -> str:
+    """Return what must be said where some runs had no validation grasps."""
+    runs = [run for one in methods for run in one.runs if run.history]
+    return UNWATCHED if any(run.config.get("counts", {}).get("val") == 0 for run in runs) else ""

@@ -1,0 +1,156 @@
+"""The paper's own tables and figures in its form: what one setting of its network changes, on one target."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from tacpipe.report import markup
+from tacpipe.report.markup import NONE
+from tacpipe.report.touch import figures, printed, scores, tables, wording
+from tacpipe.report.touch.methods import PAPERS, Method
+from tacpipe.report.touch.scores import Score
+
+TARGET = "pdc_th"  # on which the paper compares settings
+
+
+@dataclass(frozen=True)
+class Form:
+    """A table of the paper: which setting varies, its values, and what was printed."""
+
+    title: str
+    setting: str
+    names: Mapping[object, str]  # what a row is called, by the setting's value
+    printed: Mapping[object, tuple[float, float]] = field(default_factory=dict)  # mean and sd of the RMSE
+    seconds: Mapping[object, float] = field(default_factory=dict)  # an epoch
+    drawn: bool = False  # whether the paper has a figure and no table
+    also: tuple[str, ...] = ()  # settings that only some of the values have
+
+
+FORMS = (
+    Form(
+        "Table I in the paper's form: number of hidden layers of the head",
+        "head",
+        {
+            "fc1": "FC1: 1024",
+            "fc2": "FC2: 1024-512",
+            "fc3": "FC3: 1024-512-256",
+            "fc4": "FC4: … 128",
+            "fc5": "FC5: … 64",
+            "fc6": "FC6: … 32",
+        },
+        printed.HEADS,
+    ),
+    Form(
+        "Table II in the paper's form: number of points",
+        "points",
+        {count: f"{count} points" for count in printed.POINTS},
+        printed.POINTS,
+        printed.SECONDS,
+    ),
+    Form(
+        "Figure 9 in the paper's form: what the network is told",
+        "inputs",
+        {
+            "xyz": "XYZ",
+            "rgb": "RGB",
+            "xyzcont": "XYZCont",
+            "rgbcont": "RGBCont",
+            "xyzpose": "XYZPose",
+            "rgbpose": "RGBPose",
+        },
+        drawn=True,
+        also=("wrist",),
+    ),
+    Form(
+        "Table III in the paper's form: normalisation of a cloud",
+        "normalisation",
+        {"none": "none", "sphere": "unit sphere", "minmax": "min-max", "wrist": "wrist frame"},
+        printed.NORMALISATIONS,
+        also=("wrist",),
+    ),
+    Form(
+        "Table IV in the paper's form: random rotation in training",
+        "rotation_deg",
+        {angle: f"±{angle}°" if angle else "none" for angle in printed.ROTATIONS},
+        printed.ROTATIONS,
+    ),
+)
+ORDER = (
+    "The paper prints no numbers of Figure 9: it ranks pose before contacts before the cloud alone, finds colour worse than "
+    "none but for RGBPose, and chooses that (0.01859 without normalisation)."
+)
+
+ESTIMATED = (
+    "How the wrist was turned was not recorded: where it is read here, it is estimated from the two contacts and the "
+    "line of sight, and tells nothing that these do not."
+)
+
+
+def section(methods: Sequence[Method]) -> str:
+    """Return the tables of which at least two rows were run; empty where there is none."""
+    told = "".join(_table(form, methods) for form in FORMS)
+    return f"{told}{markup.note(printed.SCALES)}" if told else ""
+
+
+def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
+    """Return the methods of a table by their setting: of the paper's network, alike but for it.
+
+    Of several such families the one with most rows is told, then that with most runs.
+    """
+    alike: dict[str, dict[object, Method]] = {}
+    for method in methods:
+        value = method.settings.get(form.setting)
+        if method.architecture == PAPERS and value in form.names and scores.score(method.runs, TARGET, True):
+            alike.setdefault(method.key_without(form.setting, *form.also), {}).setdefault(value, method)
+
+    def place(one: Mapping[object, Method]) -> tuple[int, int]:
+        return len(one), sum(len(method.runs) for method in one.values())
+
+    return max(alike.values(), key=place, default={})
+
+
+def _table(form: Form, methods: Sequence[Method]) -> str:
+    found = family(methods, form)
+    if len(found) < 2:
+        return ""
+    told = {value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names}
+    least = min((one.each.mean, name) for value, name in form.names.items() if (one := told[value]))[1]
+    rows = [
+        [name, *tables.cells(told[value]), *_printed(form, value), *_seconds(form, value, found)]
+        for value, name in form.names.items()
+    ]
+    kinds = {number: "best" for number, name in enumerate(form.names.values()) if name == least}
+    baselines = tables.baseline_rows(list(found.values()), TARGET, True)
+    blank = [NONE] * (bool(form.printed) + 2 * bool(form.seconds))
+    kinds |= dict.fromkeys(range(len(rows), len(rows) + len(baselines)), "quiet")
+    rows += [[name, *tables.cells(one), *blank] for name, one in baselines]
+    heads = ["", *tables.ROWS, *(["paper: RMSE"] if form.printed else [])]
+    heads += ["seconds an epoch", "paper: seconds"] if form.seconds else []
+    simulated = any(one.simulated for one in found.values())
+    title = f"{form.title}{' (simulated)' if simulated else ''}"
+    notes = [wording.basis(list(found.values())), wording.caution(simulated), ORDER if form.drawn else ""]
+    notes += [ESTIMATED] if any(one.settings.get("wrist") == "estimated" for one in found.values()) else []
+    drawn = _figure(form, told, dict(baselines)) if form.drawn else ""
+    table = markup.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)
+    return f"{table}{drawn}{markup.note(' '.join(one for one in notes if one))}"
+
+
+def _printed(form: Form, value: object) -> list[str]:
+    return [markup.with_sd(*form.printed[value], digits=5)] if form.printed else []
+
+
+def _seconds(form: Form, value: object, found: Mapping[object, Method]) -> list[str]:
+    """Return how long an epoch took, where training told it, and how long the paper's did."""
+    if not form.seconds:
+        return []
+    runs = found[value].runs if value in found else ()
+    told = [float(line["seconds"]) for run in runs for line in run.history if line.get("seconds") is not None]
+    return [f"{sum(told) / len(told):.2g}" if told else NONE, f"{form.seconds[value]:g}"]
+
+
+def _figure(form: Form, told: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> str:
+    errors = {form.names[value]: one.each for value, one in told.items() if one}
+    levels = {name: one.each.mean for name, one in baselines.items() if one}
+    svg = figures.settings(errors, levels, "Error by what the network is told")
+    return markup.figure(svg, "Mean and standard deviation over runs; lines are baselines on the same grasps.")

@@ -1,0 +1,93 @@
+"""Figures 10 and 11 of the paper: errors on known objects beside those on novel ones, of each target."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tacpipe.report import markup
+from tacpipe.report.markup import NONE, Markup
+from tacpipe.report.touch import printed, scores, tables, wording
+from tacpipe.report.touch.methods import DEFAULT, PAPERS, Method
+from tacpipe.report.touch.scores import Score
+
+TITLE = "Figures 10 and 11 in the paper's form: known objects (test) beside novel ones"
+PARTS = ("RMSE over runs", "R²", "skill")
+
+
+def section(methods: Sequence[Method]) -> str:
+    """Return the table of the paper's network and that of the default method, where they foretold two targets or more."""
+    told = []
+    for architecture in (PAPERS, DEFAULT):
+        pairs = _pairs([one for one in methods if one.architecture == architecture])
+        told.append(max(pairs, key=_weight, default=None))
+    return "".join(_table(*pair) for pair in told if pair)
+
+
+def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
+    """Return pairs of methods, one judged on known objects and one on novel ones, that are the same or differ in split.
+
+    The paper trains anew, on all grasps of known objects, for novel ones.
+    """
+    known, novel = ([one for one in methods if len(_targets(one, of)) > 1] for of in (True, False))
+    return [(one, other) for one in known for other in novel if one.key_without("split") == other.key_without("split")]
+
+
+def _weight(pair: tuple[Method, Method]) -> tuple[int, int, bool]:
+    """Return how much a pair tells: targets, then runs; of two that tell as much, one method on both."""
+    known, novel = pair
+    common = set(_targets(known, True)) & set(_targets(novel, False))
+    return len(common), len(known.runs) + len(novel.runs), known is novel
+
+
+def _targets(method: Method, known: bool) -> list[str]:
+    return [target for target in method.targets if scores.score(method.runs, target, known)]
+
+
+def _table(known: Method, novel: Method) -> str:
+    rows: list[list[str]] = []
+    pairs: list[tuple[Score | None, Score | None]] = []
+    kinds: dict[int, str] = {}
+    for target, name in wording.TARGETS.items():
+        test, other = (scores.score(one.runs, target, of) for one, of in ((known, True), (novel, False)))
+        if test is None and other is None:
+            continue
+        pairs.append((test, other))
+        rows.append([name, *_cells(test, other), *_printed(target)])
+        baselines = zip(
+            *(tables.baseline_rows([one], target, of) for one, of in ((known, True), (novel, False))), strict=False
+        )
+        for (called, first), (_, second) in baselines:
+            kinds[len(rows)] = "quiet"
+            rows.append([f"· {called.partition(':')[0]}", *_cells(first, second), *[NONE] * 3])
+    heads = ["", *(f"test: {part}" for part in PARTS), *(f"novel: {part}" for part in PARTS), "change (%)"]
+    heads += ["paper: test", "paper: novel", "change (%)"]
+    simulated = known.simulated or novel.simulated
+    chosen = [known] if known is novel else [known, novel]
+    counted = [max(one.grasps for one in told if one) for told in zip(*pairs, strict=True)]
+    judged = f"Judged on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
+    note = f"{wording.basis(chosen)} {judged} {wording.caution(simulated)}"
+    title = f"{TITLE}{' (simulated)' if simulated else ''}; {known.name}"
+    return f"{markup.table(title, heads, rows, kinds)}{markup.note(note)}"
+
+
+def _cells(test: Score | None, novel: Score | None) -> list[str]:
+    change = NONE
+    if test and novel and test.each.mean > 0:
+        change = f"{round(100 * (novel.each.mean / test.each.mean - 1)):+d}".replace("-", "−")
+    return [*_part(test), *_part(novel), change]
+
+
+def _part(found: Score | None) -> list[str]:
+    """Return what `PARTS` name."""
+    error, counts, *rest = tables.cells(found)[: len(PARTS) + 1]
+    return [_above_counts(error, counts) if found else NONE, *rest]
+
+
+def _printed(target: str) -> list[str]:
+    one = printed.FINAL[target]
+    pairs = ((one.test, one.test_counts), (one.novel, one.novel_counts))
+    return [*(_above_counts(f"{share:.5f}", str(counts)) for share, counts in pairs), f"+{one.change}"]
+
+
+def _above_counts(error: str, counts: str) -> Markup:
+    return Markup(f"{error}<br><small>{counts} counts</small>")

@@ -1,0 +1,85 @@
+"""What a result's model and baselines foretold of each grasp that the model has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Shard
+
+Floats = NDArray[np.float64]
+Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
+
+RECORDING = "predictions"
+GRASPS, TRUE = "grasps", "true"
+MODEL, LAST = "model", "last_epoch"
+UNNAMED = "unnamed"  # an object of which no recording tells the name
+CONSTANT, OBJECT, TIME = "constant", "object_mean", "nearest_in_time"
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """One row a grasp, those of training left out."""
+
+    recordings: NDArray[np.str_]  # (grasp,)
+    objects: NDArray[np.str_]  # (grasp,)
+    known: NDArray[np.bool_]  # (grasp,), whether the model was trained on other grasps of the object
+    true: Touch
+    said: Mapping[str, Touch]  # by predictor
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """What the model foretells, in the order of tables."""
+        return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.said[MODEL])
+
+    def of(self, known: bool | None) -> Predictions:
+        """Return the rows of known or of novel objects, or all."""
+        return self if known is None else self.rows(self.known == known)
+
+    def rows(self, chosen: NDArray[Any]) -> Predictions:
+        """Return some rows, told by a mask (grasp,) or by their numbers."""
+        said = {name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.said.items()}
+        true = {target: one[chosen] for target, one in self.true.items()}
+        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, said)
+
+
+def read(shard: Shard) -> Predictions:
+    """Return what the recording ``predictions`` of a result says of grasps that its model has not seen."""
+    grasps = shard.table(GRASPS)
+    others = {name: _touch(shard.table(name)) for name in shard.streams if name != GRASPS}
+    found = Predictions(
+        np.array(grasps["recording"].to_pylist(), dtype=np.str_),
+        np.array([name or UNNAMED for name in grasps["object"].to_pylist()], dtype=np.str_),
+        np.array(grasps["known"].to_pylist(), dtype=bool),
+        others.pop(TRUE),
+        others,
+    )
+    return found.rows(~np.array(grasps["seen"].to_pylist(), dtype=bool))
+
+
+def columns(target: str) -> list[str]:
+    """Return the columns of a target in the streams of a result.
+
+    >>> columns("pdc_th"), columns("e_mf")[:2]
+    (['pdc_th'], ['e_mf_01', 'e_mf_02'])
+    """
+    width = biotac_sp.width(target)
+    return [target] if width == 1 else [f"{target}_{number:02d}" for number in range(1, width + 1)]
+
+
+def _touch(table: pa.Table) -> Touch:
+    """Return the targets that a stream holds in full."""
+    held = [target for target in biotac_sp.TARGETS if set(columns(target)) <= set(table.column_names)]
+    return {
+        target: np.column_stack([table[name].to_numpy() for name in columns(target)]).astype(np.float64)
+        for target in held
+    }

@@ -1,0 +1,138 @@
+"""How far a method's predictions are from the truth, pooled over its runs, and how much nearer than a constant's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp, regression
+from tacpipe.regression import Interval
+from tacpipe.report.spread import Spread, spread
+from tacpipe.report.touch.methods import Method, Run
+from tacpipe.report.touch.predictions import CONSTANT, LAST, MODEL
+
+Floats = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one predictor does on one target; errors are shares of the target's range (`biotac_sp.RANGES`)."""
+
+    target: str
+    rmse: float  # global, over the grasps of all runs
+    each: Spread  # of the RMSE of single runs
+    batch_mean: float  # mean over runs of the mean RMSE of batches
+    mae: float
+    r2: float
+    skill: Interval  # over the constant
+    grasps: int  # each counted once
+    objects: int
+    runs: int
+
+    @property
+    def counts(self) -> float:
+        """The RMSE in device counts."""
+        return in_counts(self.target, self.rmse)
+
+
+def in_counts(target: str, share: float) -> float:
+    """Return a share of a target's range in device counts.
+
+    >>> in_counts("pdc_th", 0.1)
+    90.0
+    """
+    low, high = biotac_sp.RANGES[target]
+    return share * (high - low)
+
+
+class _Rows(NamedTuple):
+    """What a run tells of a target."""
+
+    true: Floats  # (grasp, value), normalised
+    said: Floats  # (grasp, value)
+    constant: Floats  # (grasp, value), NaN where the result holds none
+    recordings: NDArray[np.str_]  # (grasp,)
+    objects: NDArray[np.str_]  # (grasp,)
+
+
+def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str = MODEL) -> Score | None:
+    """Return how a predictor of some runs does on known or on novel objects, or on all; None where it says nothing.
+
+    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs said of each,
+    where objects are known, and else from drawing objects: what is asked then is how the next object would fare.
+    """
+    parts = _rows(runs, target, known, predictor)
+    if not parts:
+        return None
+    rows = _pooled(parts)
+    return Score(
+        target,
+        regression.rmse(rows.true, rows.said),
+        spread([regression.rmse(one.true, one.said) for one in parts]),
+        float(np.mean([regression.batch_mean_rmse(one.true, one.said) for one in parts])),
+        regression.mae(rows.true, rows.said),
+        regression.r2(rows.true, rows.said),
+        _skill(rows, rows.recordings if known else rows.objects),
+        len(np.unique(rows.recordings)),
+        len(np.unique(rows.objects)),
+        len(parts),
+    )
+
+
+def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:
+    """Return the method whose runs tell of a baseline: that with most runs which hold it; None where none does."""
+    held = [one for one in methods if any(target in run.predictions.said.get(predictor, ()) for run in one.runs)]
+    return max(held, key=lambda one: len(one.runs), default=None)
+
+
+def baselines(methods: Sequence[Method]) -> list[str]:
+    """Return the predictors that are no model's own, in the order of their names."""
+    return sorted(
+        {name for one in methods for run in one.runs for name in run.predictions.said if name not in (MODEL, LAST)}
+    )
+
+
+def best(methods: Sequence[Method], target: str, known: bool | None) -> Method | None:
+    """Return the method of least RMSE on a target; of two that err alike the first."""
+    found = [(told.rmse, one) for one in methods if (told := score(one.runs, target, known))]
+    return min(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> Floats | None:
+    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is said of the target."""
+    parts = _rows(runs, target, known, MODEL)
+    return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
+
+
+def of_object(runs: Sequence[Run], name: str) -> list[Run]:
+    """Return runs as if they had been judged on the grasps of one object alone."""
+    told = [(run, run.predictions) for run in runs]
+    return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in told]
+
+
+def _rows(runs: Sequence[Run], target: str, known: bool | None, predictor: str) -> list[_Rows]:
+    """Return what each run tells that holds the target, the predictor and such objects."""
+    found = []
+    for rows in (run.predictions.of(known) for run in runs):
+        said = rows.said.get(predictor, {})
+        if target not in said or target not in rows.true or not len(rows.recordings):
+            continue
+        constant = rows.said.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
+        true, told, mean = (biotac_sp.normalised(target, one) for one in (rows.true[target], said[target], constant))
+        found.append(_Rows(true, told, mean, rows.recordings, rows.objects))
+    return found
+
+
+def _pooled(parts: Sequence[_Rows]) -> _Rows:
+    return _Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Interval:
+    """Return the skill over the constant on rows where there is one."""
+    held = ~np.isnan(rows.constant).any(axis=1)
+    model, baseline = (regression.squared_sums(rows.true[held], one[held]) for one in (rows.said, rows.constant))
+    return regression.skill_interval(model, baseline, clusters[held])

@@ -1,0 +1,146 @@
+"""The tables in which methods and baselines stand beside each other, of one way to part grasps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from tacpipe.report import markup
+from tacpipe.report.markup import NONE
+from tacpipe.report.touch import scores, wording
+from tacpipe.report.touch.methods import Group, Method, Run
+from tacpipe.report.touch.predictions import LAST, MODEL, OBJECT
+from tacpipe.report.touch.scores import Score
+
+HEADS = (
+    "RMSE",
+    "counts",
+    "R²",
+    "skill",
+    "RMSE over runs",
+    "batch mean",
+    "MAE (counts)",
+    "grasps",
+    "runs",
+)
+ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # of a table in the paper's form
+
+
+def errors(group: Group, known: bool) -> str:
+    """Return a table a target with every method and baseline on known or on novel objects; empty where none was judged."""
+    return "".join(_errors(group, target, known) for target in wording.TARGETS)
+
+
+def by_object(group: Group) -> str:
+    """Return errors and skill by object of one method an architecture; empty where no object was judged."""
+    return "".join(_by_object(group, method) for method in group.main)
+
+
+def every_run(methods: Sequence[Method]) -> str:
+    """Return one row a run."""
+    rows = []
+    for method in methods:
+        for run in sorted(
+            method.runs, key=lambda run: (str(run.config.get("fold", "")), str(run.params.get("seed", "")))
+        ):
+            for known in (True, False):
+                told = [scores.score([run], target, known) for target in wording.TARGETS]
+                if not any(told):
+                    continue
+                trained = NONE if run.trained is None else f"{run.trained:,}"
+                about = [method.name, wording.split(method.split), str(run.params.get("seed", NONE)), trained]
+                counted = max(one.grasps for one in told if one)
+                cells = [cell for one in told for cell in _short(one)]
+                rows.append([*about, wording.OBJECTS[known], f"{counted:,}", *cells, str(len(run.history) or NONE)])
+    parts = [f"{name} {part}" for name in wording.TARGETS.values() for part in ("RMSE", "R²")]
+    heads = ["", "split", "seed", "trained on", "judged on", "grasps", *parts, "epochs"]
+    runs = sum(len(one.runs) for one in methods)
+    told_runs = f"All {runs} runs" if runs > 1 else "The run"
+    return f"<details><summary>{told_runs}</summary>{markup.table('Each run', heads, rows)}</details>"
+
+
+def cells(found: Score | None) -> list[str]:
+    """Return what a table in the paper's form says of a score, as `ROWS` names it."""
+    if found is None:
+        return [NONE] * len(ROWS)
+    error = markup.with_sd(found.each.mean, found.each.sd)
+    counts = f"{scores.in_counts(found.target, found.each.mean):.0f}"
+    return [error, counts, wording.signed(found.r2), wording.skill(found), f"{found.grasps:,}", str(found.runs)]
+
+
+def baseline_rows(methods: Sequence[Method], target: str, known: bool | None) -> list[tuple[str, Score | None]]:
+    """Return the mandatory baselines and any others that some methods' results hold, by what a table calls them."""
+    found = []
+    for predictor in dict.fromkeys([*wording.BASELINES, *scores.baselines(methods)]):
+        source = scores.reference(methods, target, predictor)
+        told = scores.score(source.runs, target, known, predictor) if source else None
+        found.append((wording.baseline(predictor), told))
+    return found
+
+
+def _errors(group: Group, target: str, known: bool) -> str:
+    told: list[tuple[str, Score | None]] = []
+    first = scores.best(group.methods, target, known)
+    if first is None:
+        return ""
+    for method in group.methods:
+        told += [(method.name, scores.score(method.runs, target, known, MODEL))]
+        told += [(f"{method.name} · last epoch", scores.score(method.runs, target, known, LAST))]
+    told = [one for one in told if one[1]]
+    baselines = baseline_rows(group.methods, target, known)
+    rows = [[name, *_cells(one)] for name, one in [*told, *baselines]]
+    kinds = dict.fromkeys(range(len(told), len(rows)), "quiet")
+    kinds[[name for name, _ in told].index(first.name)] = "best"
+    return markup.table(f"{wording.TARGETS[target]}, {wording.OBJECTS[known]}", ["", *HEADS], rows, kinds)
+
+
+def _cells(found: Score | None) -> list[str]:
+    """Return what `HEADS` name."""
+    if found is None:
+        return [NONE] * len(HEADS)
+    return [
+        wording.share(found.rmse),
+        f"{found.counts:.0f}",
+        wording.signed(found.r2),
+        wording.skill(found),
+        markup.with_sd(found.each.mean, found.each.sd),
+        wording.share(found.batch_mean),
+        f"{scores.in_counts(found.target, found.mae):.0f}",
+        f"{found.grasps:,}",
+        str(found.runs),
+    ]
+
+
+def _by_object(group: Group, method: Method) -> str:
+    targets = method.targets
+    rows: list[list[str]] = []
+    kinds: dict[int, str] = {}
+    for known in (True, False):
+        names = {str(name) for run in method.runs for name in run.predictions.of(known).objects}
+        for name in sorted(names):
+            runs = scores.of_object(method.runs, name)
+            row = []
+            for target in targets:
+                row += _of_object(runs, target, known)
+            counted = len({str(one) for run in runs for one in run.predictions.of(known).recordings})
+            if not known:
+                kinds[len(rows)] = "quiet"
+            rows.append([name if known else f"{name} (novel)", f"{counted:,}", *row])
+    if not rows:
+        return ""
+    heads = ["", "grasps", *(part for target in targets for part in (wording.TARGETS[target], "skill"))]
+    return markup.table(f"By object, {method.name}: RMSE above that of the object's mean", heads, rows, kinds)
+
+
+def _short(found: Score | None) -> list[str]:
+    return [wording.share(found.rmse), wording.signed(found.r2)] if found else [NONE, NONE]
+
+
+def _of_object(runs: Sequence[Run], target: str, known: bool) -> list[str]:
+    """Return the RMSE on an object, above that of its mean where there is one, and the skill over the constant."""
+    found, mean = (scores.score(runs, target, known, one) for one in (MODEL, OBJECT))
+    if found is None:
+        return [NONE, NONE]
+    below = f"<br><small>{wording.share(mean.rmse)}</small>" if mean and known else ""
+    skill = NONE if math.isnan(found.skill.mean) else markup.decimals(found.skill.mean)
+    return [markup.Markup(f"{wording.share(found.rmse)}{below}"), skill]

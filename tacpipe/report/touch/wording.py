@@ -1,0 +1,141 @@
+"""How numbers and names of this task are written, and what must be said beside an error."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+from tacpipe.report import markup
+from tacpipe.report.markup import NONE
+from tacpipe.report.touch import printed
+from tacpipe.report.touch.methods import PAPERS, Method, Run
+from tacpipe.report.touch.predictions import CONSTANT, OBJECT, TIME
+from tacpipe.report.touch.scores import Score
+
+TARGETS = {
+    "pdc_th": "PDC thumb",
+    "pdc_mf": "PDC middle finger",
+    "e_th": "electrodes thumb",
+    "e_mf": "electrodes middle finger",
+}
+FINGERS = {"e_th": "thumb", "e_mf": "middle finger"}
+BASELINES = {  # rows that every table has
+    CONSTANT: "constant: the mean of training",
+    OBJECT: "mean of the object",
+    TIME: "mean of the nearest in time",
+}
+OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
+SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor or about the paper's numbers."
+RECORDED = (
+    "An object's grasps were recorded together, so what is told of known objects rests on its session as well: the mean of "
+    "the grasps nearest in time, whatever their object, says how much."
+)
+
+
+def caution(simulated: bool) -> str:
+    """Return what is said beside every table of errors."""
+    return SIMULATED if simulated else RECORDED
+
+
+def baseline(predictor: str) -> str:
+    """Return what a table calls a predictor that is no model's own.
+
+    >>> baseline("object_mean"), baseline("nearest_neighbours")
+    ('mean of the object', 'nearest neighbours')
+    """
+    return BASELINES.get(predictor, predictor.replace("_", " "))
+
+
+def skill(found: Score) -> str:
+    """Return a skill over the constant above its interval."""
+    told = markup.sure(*found.skill)
+    return NONE if math.isnan(found.skill.mean) else told
+
+
+def skill_within(found: Score) -> str:
+    """Return a skill and its interval in a sentence."""
+    mean, low, high = found.skill
+    if math.isnan(mean):
+        return "no constant to compare with"
+    told = markup.decimals(mean)
+    return told if math.isnan(low) else f"{told} ({markup.decimals(low)} to {markup.decimals(high)})"
+
+
+def share(value: float) -> str:
+    """Return an error as a share of a range.
+
+    >>> share(0.05496), share(float("nan"))
+    ('0.0550', '–')
+    """
+    return NONE if math.isnan(value) else f"{value:.4f}"
+
+
+def signed(value: float) -> str:
+    """Return R², which may lie below 0.
+
+    >>> signed(0.4567), signed(-0.02), signed(-0.001), signed(float("nan"))
+    ('0.46', '−0.02', '0.00', '–')
+    """
+    return NONE if math.isnan(value) else f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
+
+
+def signed_short(value: float) -> str:
+    """Return R² where there is little room.
+
+    >>> [signed_short(value) for value in (0.456, -0.02, -3.04, -1234.5)]
+    ['0.46', '−0.02', '−3.0', '< −9']
+    """
+    if value >= -1 or math.isnan(value):
+        return signed(value)
+    return f"−{-value:.1f}" if value > -9 else "< −9"
+
+
+def split(told: str) -> str:
+    """Return how grasps were parted, where somebody said so."""
+    return told.replace("-", " ").replace("_", " ") or "one split"
+
+
+def place(told: str, simulated: bool) -> str:
+    """Return how grasps were parted and whether they were simulated.
+
+    >>> place("by-day", True), place("simulated", True), place("", False)
+    ('by day, simulated', 'simulated', 'one split')
+    """
+    name = split(told)
+    return f"{name}, simulated" if simulated and "simulated" not in name else name
+
+
+def schedule(run: Run) -> str:
+    """Return how a run was trained, and whether that is the paper's way."""
+    if not run.history:
+        return "fitted without epochs"
+    params = run.params
+    epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
+    told = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
+    if run.architecture != PAPERS:
+        return told
+    if (batch, rate) == (printed.BATCH, printed.LEARNING_RATE) and int(epochs or 0) >= printed.EPOCHS:
+        return f"paper schedule ({told})"
+    return f"quick ({told}; the paper: {printed.EPOCHS}, {printed.BATCH}, {printed.LEARNING_RATE})"
+
+
+def basis(methods: Sequence[Method]) -> str:
+    """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
+    runs = [run for one in methods for run in one.runs]
+    told = [
+        f"{count} run{'s' if count > 1 else ''}: {one}"
+        for one, count in Counter(schedule(run) for run in runs).most_common()
+    ]
+    trained = sorted({run.trained for run in runs if run.trained is not None})
+    counts = f" Trained on {span(trained)} grasps." if trained else ""
+    return f"{'; '.join(told)}.{counts}"
+
+
+def span(counts: Sequence[int]) -> str:
+    """Return the least and the largest of sorted counts.
+
+    >>> span([412, 9000]), span([7])
+    ('412 to 9,000', '7')
+    """
+    return " to ".join(f"{count:,}" for count in dict.fromkeys((counts[0], counts[-1])))

@@ -1,0 +1,72 @@
+"""Which results are runs of one method, and what it is called."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tacpipe.report.touch.methods import Method, Run, grouped, groups
+from tests.report.touch.touch_fakes import result
+
+
+def methods(*results: Any) -> list[Method]:
+    return grouped([Run.read(one) for one in results])
+
+
+def test_runs_that_differ_in_seed_words_or_other_networks_targets_are_one_method() -> None:
+    found = methods(
+        result(seed=0), result(seed=1, setting="random"), result(seed=2, baselines={}), result(targets=("pdc_th",))
+    )
+    assert [(one.name, len(one.runs)) for one in found] == [("strong", 4)]
+
+
+def test_one_network_for_other_targets_is_another_method() -> None:
+    found = methods(result(together=True), result(together=True), result(together=True, targets=("pdc_th",)))
+    assert [one.name for one in found] == ["strong", "strong · targets pdc_th"]
+
+
+def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -> None:
+    found = methods(
+        *(result("pointnet", head=head) for head in ("fc3", "fc1")),
+        result("pointnet", points=250),
+        result("pointnet", transform=False),
+        result("trees", head="fc6"),
+    )
+    assert [one.name for one in found] == [
+        "PointNet",
+        "PointNet · head fc1",
+        "PointNet · no transform",
+        "PointNet · points 250",
+        "trees on hand geometry",
+    ]
+
+
+def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
+    pairs = [("rgbcont", "given"), ("rgbcont", "estimated"), ("rgbpose", "given"), ("rgbpose", "estimated")]
+    found = methods(*(result("pointnet", inputs=inputs, wrist=wrist) for inputs, wrist in pairs))
+    assert sorted(len(one.runs) for one in found) == [1, 1, 2]
+
+
+def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None:
+    found = groups(
+        methods(
+            *(result("pointnet", split="folds", seed=seed, targets=("pdc_th",)) for seed in range(5)),
+            result(split="random"),
+            result("trees", split="random"),
+            result(simulated=True),
+        )
+    )
+    assert [(one.split, one.simulated) for one in found] == [("random", False), ("folds", False), ("random", True)]
+    assert [one.name for one in found[0].methods] == ["strong", "trees on hand geometry"]
+    assert {one.name for group in found for one in group.methods} == {"strong", "PointNet", "trees on hand geometry"}
+
+
+def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
+    (both,) = groups(methods(result(), result("trees", seed=0), result("trees", seed=1)))
+    assert both.default.name == "strong"
+    (others,) = groups(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
+    assert others.default.name == "trees on hand geometry"
+
+
+def test_one_method_an_architecture_is_told_in_detail() -> None:
+    (group,) = groups(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
+    assert [one.name for one in group.main] == ["PointNet", "strong"]

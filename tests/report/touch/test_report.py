@@ -1,0 +1,89 @@
+"""The page as a whole."""
+
+from __future__ import annotations
+
+from html import unescape
+from typing import Any
+
+import pytest
+
+from tacpipe.report import page
+from tacpipe.report.touch import wording
+from tests.report import elements
+from tests.report.touch.touch_fakes import NOVEL, recorded, result
+from tests.stages.learning_fakes import FakeDataset
+
+BASELINES = {"object_mean": 0.08, "nearest_in_time": 0.09}
+FULL: dict[str, Any] = {"novel": NOVEL, "baselines": BASELINES}
+
+
+def everything(simulated: bool = False) -> list[Any]:
+    return [
+        *(result(seed=seed, simulated=simulated, **FULL) for seed in (0, 1)),
+        result("trees", off=0.06, simulated=simulated, **FULL),
+        result("pointnet", off=0.07, epochs=4, last=0.08, simulated=simulated, **FULL),
+        result("pointnet", head="fc1", targets=("pdc_th",), epochs=4, simulated=simulated, **FULL),
+    ]
+
+
+def test_all_parts_are_told_on_one_page_that_is_the_same_each_time() -> None:
+    given = [*everything(), recorded()]
+    told = page.render(given, title="t")
+    assert told == page.render(given, title="t")
+    text = told.decode()
+    elements.check(text)
+    for part in (
+        "4 methods in 5 results",
+        "Known objects:",
+        "Novel objects:",
+        "PDC thumb, known objects",
+        "electrodes middle finger, novel objects",
+        "By object, strong",
+        "R² of each electrode on novel objects",
+        "Worst decile by error",
+        "Clouds and their grasps",
+        "Table I in",
+        "Figures 10 and 11 in",
+        "Figure 8 in",
+        "All 5 runs",
+        "cd" * 32,
+    ):
+        assert part in text, part
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_page_says_what_its_errors_cannot_show(simulated: bool) -> None:
+    text = unescape(page.render(everything(simulated), title="t").decode())
+    assert wording.caution(simulated) in text
+    assert wording.caution(not simulated) not in text
+    assert ('<span class="badge">simulated</span>' in text) == simulated
+
+
+def test_simulated_results_beside_recorded_ones_are_marked_and_kept_apart() -> None:
+    text = page.render([result(), result(simulated=True)], title="t").decode()
+    elements.check(text)
+    assert text.count('<span class="badge">simulated</span>') == 1
+    assert "What is marked simulated is no evidence about a real sensor." in text
+    assert text.count("PDC thumb, known objects") == 2
+
+
+def test_one_result_of_one_target_is_told_without_what_it_lacks() -> None:
+    text = page.render([result("trees", targets=("pdc_mf",), known=(), novel=("drill",))], title="t").decode()
+    elements.check(text)
+    assert "<h2>trees on hand geometry</h2>" in text
+    text = unescape(text)
+    for lacking in ("in the paper's form", "Electrodes", "Clouds and", "known objects</h4>"):
+        assert lacking not in text, lacking
+
+
+def test_a_result_without_a_constant_is_told_without_skill() -> None:
+    given = result()
+    del given.shards["predictions"].tables["constant"]
+    elements.check(page.render([given], title="t").decode())
+
+
+def test_a_result_without_unseen_grasps_is_told_as_its_metrics_name_it() -> None:
+    given = result(metrics={"seen": {"n": 7}})
+    bare: Any = FakeDataset({}, given.files, given.manifest)
+    text = page.render([bare], title="t").decode()
+    assert elements.cells(text, "seen, n") == ["7"]

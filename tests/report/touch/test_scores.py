@@ -1,0 +1,108 @@
+"""Pooled errors against numbers worked out by hand: the constant of the fakes is off by 0.1 of the range."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe import biotac_sp
+from tacpipe.report.touch import scores
+from tacpipe.report.touch.methods import Run, grouped
+from tests.report.touch.touch_fakes import KNOWN, NOVEL, result
+
+
+def runs(*results: Any) -> list[Run]:
+    return [Run.read(one) for one in results]
+
+
+@pytest.mark.parametrize("target", biotac_sp.TARGETS)
+def test_errors_are_shares_of_the_range_and_counts_and_skill_is_over_the_constant(target: str) -> None:
+    found = scores.score(runs(result(off=0.05)), target, True)
+    assert found is not None
+    low, high = biotac_sp.RANGES[target]
+    assert found.rmse == pytest.approx(0.05, abs=1e-6)
+    assert found.counts == pytest.approx(0.05 * (high - low), abs=1e-3)
+    assert found.mae == pytest.approx(0.05, abs=1e-6)
+    assert found.skill.mean == pytest.approx(0.5, abs=1e-4)
+    assert found.r2 == pytest.approx(0.75, abs=1e-3)  # 1 - 0.05² / 0.1²
+    assert (found.grasps, found.objects, found.runs) == (24, 3, 1)
+
+
+def test_runs_on_the_same_grasps_are_pooled_but_claim_no_more_grasps() -> None:
+    found = scores.score(runs(result(off=0.03, seed=0), result(off=0.05, seed=1)), "pdc_th", True)
+    assert found is not None
+    assert found.rmse == pytest.approx(math.sqrt((0.03**2 + 0.05**2) / 2), abs=1e-6)
+    assert found.each.mean == pytest.approx(0.04, abs=1e-6)
+    assert found.each.sd == pytest.approx(0.02 / math.sqrt(2), abs=1e-6)
+    assert (found.grasps, found.runs) == (24, 2)
+
+
+def test_runs_of_other_folds_add_their_grasps() -> None:
+    found = scores.score(runs(result(), result(first=50)), "pdc_th", True)
+    assert found is not None and found.grasps == 48
+
+
+def test_a_batch_mean_is_no_larger_than_the_error_over_all() -> None:
+    found = scores.score(runs(result(off={"bleach": 0.01, "coffee": 0.05, "spam": 0.2})), "pdc_th", True)
+    assert found is not None
+    assert found.batch_mean < found.rmse == pytest.approx(math.sqrt((0.01**2 + 0.05**2 + 0.2**2) / 3), abs=1e-6)
+
+
+def test_objects_are_drawn_where_they_are_novel_and_grasps_where_they_are_known() -> None:
+    apart = {"bleach": 0.02, "coffee": 0.02, "spam": 0.02, "drill": 0.01, "shoe": 0.09}
+    novel = scores.score(runs(result(off=apart, novel=NOVEL)), "pdc_th", False)
+    known = scores.score(runs(result(off=apart, known=(*KNOWN, *NOVEL))), "pdc_th", True)
+    assert novel is not None and known is not None
+    # of two objects, a resample holds one alone in half of the cases
+    assert novel.skill.low == pytest.approx(0.1, abs=1e-4)
+    assert novel.skill.high == pytest.approx(0.9, abs=1e-4)
+    assert known.skill.high - known.skill.low < 0.5
+    assert novel.objects == 2
+
+
+def test_one_novel_object_gives_no_interval() -> None:
+    found = scores.score(runs(result(novel=("drill",))), "pdc_th", False)
+    assert found is not None and math.isnan(found.skill.low)
+
+
+def test_where_nothing_is_said_there_is_no_score() -> None:
+    given = runs(result(targets=("pdc_th",)))
+    assert scores.score(given, "e_th", True) is None
+    assert scores.score(given, "pdc_th", False) is None
+    assert scores.score(given, "pdc_th", True, "nearest_in_time") is None
+
+
+def test_without_a_constant_there_is_no_skill() -> None:
+    given = result()
+    del given.shards["predictions"].tables["constant"]
+    found = scores.score(runs(given), "pdc_th", True)
+    assert found is not None and math.isnan(found.skill.mean)
+    assert found.rmse == pytest.approx(0.05, abs=1e-6)
+
+
+def test_the_best_method_errs_least_and_baselines_come_from_most_runs() -> None:
+    methods = grouped(
+        runs(
+            result(off=0.05),
+            result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=0),
+            result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=1),
+        )
+    )
+    best = scores.best(methods, "pdc_th", True)
+    source = scores.reference(methods, "pdc_th", "object_mean")
+    assert best is not None and best.name == "trees on hand geometry"
+    assert source is not None and len(source.runs) == 2
+    assert scores.best(methods, "pdc_th", False) is None
+    assert scores.baselines(methods) == ["constant", "object_mean"]
+
+
+def test_each_electrode_has_its_own_share_of_explained_variance() -> None:
+    given = runs(result(off=0.05))
+    found = scores.by_electrode(given, "e_th", True)
+    assert found is not None and found.shape == (24,)
+    spread = biotac_sp.normalised("e_th", given[0].predictions.true["e_th"]).std(axis=0)
+    np.testing.assert_allclose(found, 1 - 0.05**2 / spread**2, rtol=1e-3)
+    assert scores.by_electrode(given, "e_th", False) is None

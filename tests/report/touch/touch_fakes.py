@@ -1,0 +1,153 @@
+"""Results of the task ``touch`` made by hand, with what the report reads of real ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe import biotac_sp
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.report.touch.predictions import columns
+from tests.report.stream_shard import StreamShard
+from tests.stages.learning_fakes import FakeDataset
+
+KNOWN, NOVEL = ("bleach", "coffee", "spam"), ("drill", "shoe")
+PER_OBJECT = 8  # unseen grasps
+MANIFEST = {
+    "stage": "evaluate",
+    "version": 3,
+    "params": {},
+    "digest": "ab" * 32,
+    "chain": [{"stage": "segment.grasps", "version": 1, "params": {}, "fitted": None}],
+    "inputs": {"model": [{"dataset": "cd" * 32, "manifest": "ef" * 32}]},
+}
+PARAMS = {
+    "inputs": "rgbcont",
+    "points": 750,
+    "normalisation": "minmax",
+    "rotation_deg": 0,
+    "head": "fc3",
+    "together": False,
+    "transform": True,
+    "epochs": 250,
+    "batch": 10,
+    "learning_rate": 0.01,
+}
+Errors = Mapping[str, float]  # by object; how far what is said lies from the truth, as a share of the range
+
+
+def truth(target: str, grasps: int, seed: int = 0) -> NDArray[Any]:
+    """Return true values (grasp, value) as shares of the range, 0.5 on average and 0.1 off it."""
+    width = biotac_sp.width(target)
+    signs = np.where(np.arange(grasps) % 2 == 0, 1.0, -1.0)[:, None]
+    pattern = np.cos(np.arange(width) + seed)[None] if width > 1 else np.ones((1, 1))
+    shares: NDArray[Any] = 0.5 + 0.1 * signs * pattern / np.sqrt(np.mean(pattern**2))
+    return shares
+
+
+def result(
+    architecture: str = "strong",
+    *,
+    off: float | Errors = 0.05,
+    known: Sequence[str] = KNOWN,
+    novel: Sequence[str] = (),
+    targets: Sequence[str] = biotac_sp.TARGETS,
+    per_object: int = PER_OBJECT,
+    baselines: Mapping[str, float] | None = None,
+    last: float | None = None,
+    split: str = "random",
+    epochs: int = 0,
+    train: int = 100,
+    first: int = 0,
+    seconds: float | None = None,
+    simulated: bool = False,
+    metrics: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    **params: Any,
+) -> Any:
+    """Return one result whose model is ``off`` by so much of the range on every value, by turns above and below.
+
+    The constant says 0.5 of the range, which is off by 0.1 on average; other ``baselines`` are off as told. One more
+    grasp, which the model was trained on, is told with values that would be seen in any sum.
+    """
+    objects = [name for name in (*known, *novel) for _ in range(per_object)]
+    number = [first + index % per_object for index in range(len(objects))]
+    rows = len(objects)
+    offs = np.array([off[name] if isinstance(off, Mapping) else off for name in objects])
+    side = np.where(np.arange(rows) % 4 < 2, 1.0, -1.0)
+    shares = {"true": {target: truth(target, rows, seed=3) for target in targets}}
+    true = shares["true"]
+    shares["constant"] = {target: np.full_like(one, 0.5) for target, one in true.items()}
+    said = {"model": offs, **{name: np.full(rows, value) for name, value in (baselines or {}).items()}}
+    if last is not None:
+        said["last_epoch"] = np.full(rows, last)
+    shares |= {name: {one: values + (side * by)[:, None] for one, values in true.items()} for name, by in said.items()}
+    grasps = {
+        "recording": [*(f"{name}-{index:03d}" for name, index in zip(objects, number, strict=True)), "bleach-seen"],
+        "object": [*objects, "bleach"],
+        "session": ["s01"] * (rows + 1),
+        "t_ns": np.arange(rows + 1) * 60_000_000_000,
+        "seen": [False] * rows + [True],
+        "known": [*(name in known for name in objects), True],
+    }
+    tables = {name: _table(touch) for name, touch in shares.items()}
+    attributes = {"simulated": True} if simulated else {}
+    shard: Any = StreamShard("predictions", {"grasps": pa.table(grasps), **tables}, attributes)
+    config = {
+        "task": "touch",
+        "architecture": architecture,
+        "params": {**PARAMS, "architecture": architecture, "targets": ",".join(targets), "seed": seed, **params},
+        "split": split,
+        "targets": list(targets),
+        "objects": sorted(known),
+        "counts": {"train": train, "val": 10},
+        "trained_on": {"bleach-seen": "00"},
+        "parameters": 1000 if epochs else None,
+    }
+    files = {
+        "config.json": json.dumps(config).encode(),
+        "metrics.json": json.dumps({"model": {"n": rows}, **(metrics or {})}).encode(),
+    }
+    if epochs:
+        lines = [json.dumps(line) for target in targets for line in history(target, epochs, seconds, seed)]
+        files["history.jsonl"] = "\n".join([*lines, ""]).encode()
+    return FakeDataset({"predictions": shard}, files, MANIFEST)
+
+
+def history(target: str, epochs: int, seconds: float | None = None, seed: int = 0) -> list[dict[str, Any]]:
+    """Return lines of ``history.jsonl`` of one network."""
+    lines = []
+    for epoch in range(1, epochs + 1):
+        loss = 0.05 + 0.1 * float(np.exp(-4 * epoch / epochs)) + 0.005 * np.sin(epoch + seed)
+        line = {"epoch": epoch, "train_loss": loss, "val_loss": 1.2 * loss, "best": epoch == epochs, "target": target}
+        lines.append(line if seconds is None else {**line, "seconds": seconds})
+    return lines
+
+
+def recorded(names: Sequence[str] = ("bleach-001", "drill-002")) -> Any:
+    """Return grasps on halves of cylinders, as a camera above sees them."""
+    shards: dict[str, Any] = {}
+    for seed, name in enumerate(names):
+        rng = np.random.default_rng(seed)
+        angle, along = rng.uniform(np.pi, 2 * np.pi, 2000), rng.uniform(-0.1, 0.1, 2000)
+        points = np.column_stack([0.035 * np.cos(angle), along, 0.8 + 0.035 * np.sin(angle)]).astype(np.float32)
+        cloud = Cloud(points, np.full(points.shape, 128, np.uint8))
+        grasp = Grasp(np.array([-0.035, 0.02, 0.8]), np.array([0.035, 0.02, 0.8]))
+        tables = {"cloud": cloud.table(), "grasp": grasp.table(0), "reading": pa.table({"t_ns": [0]})}
+        shards[name] = StreamShard(name, tables, {"object": name.partition("-")[0]})
+    return FakeDataset(shards)
+
+
+def _table(touch: Mapping[str, NDArray[Any]]) -> pa.Table:
+    """Return shares of ranges as the stream that holds them, in device counts, with a row of the seen grasp."""
+    found: dict[str, Any] = {}
+    for target, shares in touch.items():
+        counts = np.vstack([biotac_sp.counts(target, shares), np.full((1, shares.shape[1]), 1e6)])
+        found |= {name: counts[:, index].astype(np.float32) for index, name in enumerate(columns(target))}
+    return pa.table(found)
