@@ -19,7 +19,16 @@ from pathlib import Path
 
 import timing
 
-MODULES = ("startup", "small", "synchronization", "forward_training", "material_training", "chain", "sizes")
+MODULES = (
+    "startup",
+    "small",
+    "synchronization",
+    "forward_training",
+    "material_training",
+    "touch_training",
+    "chain",
+    "sizes",
+)
 RESULTS = Path(__file__).with_name("results.md")
 
 
