@@ -134,6 +134,7 @@ class PlainFeatures(nn.Module):
         self.norms = nn.ModuleList(nn.BatchNorm1d(outputs) for outputs, _ in widths)
         with torch.no_grad():
             for layer, own in zip(self.layers, (*like.layers, like.last), strict=True):
+                assert isinstance(layer, nn.Conv1d)
                 layer.weight.copy_(own.weight[:, :, None])
 
     def forward(self, points: Tensor) -> Tensor:
@@ -178,6 +179,6 @@ def _plain_pieces(first: dict[str, Tensor], clouds: list[Cloud], grasps: list[Gr
         model.train()
         for points, numbers, felt in loader:
             optimiser.zero_grad()
-            _loss(model(points, numbers), felt).backward()
+            _loss(model(points, numbers), felt).backward()  # type: ignore[no-untyped-call]
             optimiser.step()
         yield

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from tacpipe.dataset import Shard
 
-RAW, FINISHED = ("scene", "grasp", "biotac_sp"), ("cloud", "grasp", "reading")
+FINISHED = ("cloud", "grasp")
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,21 @@ def grasps(params: Params, recording: Shard) -> Recording:
 
     Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
     of each channel after contact, stamped where it begins; ``contact_ns`` tells when both fingers first touched. Other
-    streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``reading``
-    already stays as it is.
+    streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
+    already stays as it is; one that was not made yet has no ``biotac_sp``, and gets no ``reading``.
     """
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
     from tacpipe.clouds.segmentation import Limits, object_rows
 
     given = {name: recording.table(name) for name in recording.streams}
-    if set(FINISHED) <= set(given):
+    if set(FINISHED) <= set(given) and "biotac_sp" not in given:
         return Recording(given)
-    missing = [name for name in RAW if name not in given]
+    missing = [name for name in ("scene", "grasp") if name not in given]
     if missing:
         raise TacpipeError(
-            f"Recording {recording.name} has no {' and no '.join(missing)}; a grasp has the streams {', '.join(RAW)}, or "
-            f"{', '.join(FINISHED)} once it is segmented. Give recordings of grasps."
+            f"Recording {recording.name} has no {' and no '.join(missing)}; a grasp has the streams scene and grasp, and "
+            f"biotac_sp once it was made, or {', '.join(FINISHED)} if its object is cut out already. Give such recordings."
         )
     limits = Limits(
         plane_m=params.plane_mm / 1e3,
@@ -72,15 +72,18 @@ def grasps(params: Params, recording: Shard) -> Recording:
         outlier_neighbours=params.outlier_neighbours,
         outlier_deviations=params.outlier_deviations,
     )
+    felt: dict[str, pa.Table] = {}
+    told: dict[str, int] = {}
     try:
         scene = Cloud.of(given.pop("scene"))
         rows = object_rows(scene, Grasp.of(given["grasp"]), limits, params.seed)
-        reading, contact_ns = _reading(params, given.pop("biotac_sp"))
+        if "biotac_sp" in given:
+            felt["reading"], told["contact_ns"] = _reading(params, given.pop("biotac_sp"))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     kept = {name: table for name, table in given.items() if table.num_rows == 1}
     cloud = Cloud(scene.points_m[rows], None if scene.colours is None else scene.colours[rows])
-    return Recording({"cloud": cloud.table(), "reading": reading, **kept}, {"contact_ns": contact_ns})
+    return Recording({"cloud": cloud.table(), **felt, **kept}, told)
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:

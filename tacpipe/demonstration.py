@@ -10,11 +10,13 @@ from tacpipe.errors import TacpipeError
 
 TRIALS = 30
 MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
+OBJECTS, GRASPS = 1, 90  # of each of six families; and as many grasps of each object
 
 
 def commands(output: Path) -> list[list[str]]:
     """Return the commands of the demo without the leading ``tacpipe``: in each task the default model and the paper's."""
-    return [*forward(output), *material(output), ["report", *_results(output), "-o", str(output / "report.html")]]
+    given = [*_results(output), str(output / "grasps")]
+    return [*forward(output), *material(output), *touch(output), ["report", *given, "-o", str(output / "report.html")]]
 
 
 def forward(output: Path) -> list[list[str]]:
@@ -54,8 +56,31 @@ def material(output: Path) -> list[list[str]]:
     ]
 
 
+def touch(output: Path) -> list[list[str]]:
+    """Return the commands of the task ``touch`` up to its results."""
+    names = ("pinched", "grasps", "grasps-split", "touch", "touch-results", "pointnet", "pointnet-results")
+    place = {name: str(output / name) for name in names}
+    split = ["--split", place["grasps-split"]]
+    many = ["--trials", str(GRASPS), "--objects", str(OBJECTS)]
+    paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # of the paper's 250 epochs and 750 points
+    return [
+        ["simulate", "touch", *many, "-o", place["pinched"]],
+        ["segment", "grasps", place["pinched"], "-o", place["grasps"]],
+        ["split", place["grasps"], "-o", place["grasps-split"], "--scheme", "random", "--stratify", "object"],
+        ["train", "touch", place["grasps"], *split, "-o", place["touch"], "--preset", "quick"],
+        ["evaluate", place["touch"], place["grasps"], *split, "-o", place["touch-results"]],
+        ["train", "touch", place["grasps"], *split, "-o", place["pointnet"], *paper],
+        ["evaluate", place["pointnet"], place["grasps"], *split, "-o", place["pointnet-results"]],
+    ]
+
+
 def _results(output: Path) -> list[str]:
-    return [str(output / name) for name in ("results", "paper-results", "materials-results", "joint-results")]
+    tasks = (
+        ("results", "paper-results"),
+        ("materials-results", "joint-results"),
+        ("touch-results", "pointnet-results"),
+    )
+    return [str(output / name) for pair in tasks for name in pair]
 
 
 def run(output: Path) -> Path:

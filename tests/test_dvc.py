@@ -208,6 +208,43 @@ def test_a_method_of_the_material_chain_runs_once_and_is_reported(
 
 @pytest.mark.dvc
 @NEEDS_DVC
+def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
+    tmp_path: Path, environment: Mapping[str, str]
+) -> None:
+    project = Project(tmp_path / "touch", environment)
+    project.folder.mkdir()
+    for name in ("dvc.yaml", "params.yaml"):
+        shutil.copy(HERE / name, project.folder / name)
+    (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
+    params = yaml.safe_load((project.folder / "params.yaml").read_text())
+    small = {"folds": [0], "objects": [0], "methods": ["trees", "pointnet"], "settings": ["xyz"]}
+    params["touch"] |= {"recordings": "simulate touch --trials 24 --objects 1 --families box,sphere", **small}
+    methods, settings = params["touch"]["quick"]["methods"], params["touch"]["quick"]["settings"]
+    methods["trees"]["trees"] = 5
+    for one in (methods["pointnet"], settings["xyz"]):
+        one |= {"epochs": 1, "points": 32, "head": "fc1"}
+    (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
+    project.start()
+    project.run("dvc repro touch")
+    again = project.run("dvc repro touch")
+
+    assert "Running stage" not in again
+    found = sorted(
+        str(path.relative_to(project.folder / "results")) for path in project.folder.glob("results/touch/*/*")
+    )
+    both = [f"touch/{method}-{split}/0" for method in ("pointnet", "trees") for split in ("known", "later", "novel")]
+    assert found == [*both, "touch/xyz/0"]
+    metrics = {name: json.loads((project.folder / f"results/{name}/metrics.json").read_text()) for name in both}
+    assert metrics["touch/trees-known/0"]["known"]["counts"]["grasps"] in (4, 5, 6)  # of 24 in 5 folds of 2 objects
+    assert metrics["touch/trees-novel/0"]["novel"]["counts"] == {"grasps": 12, "objects": 1}
+    assert metrics["touch/trees-later/0"]["known"]["counts"] == {"grasps": 6, "objects": 2}
+    page = (project.folder / "results/touch.html").read_text()
+    for told in ("5 folds", "leave one object out", "later grasps", "XYZCont", "Figures 10 and 11"):
+        assert told in page
+
+
+@pytest.mark.dvc
+@NEEDS_DVC
 def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
     assert toy.values("data/scaled") == expected(3)
     toy.run("git checkout --quiet HEAD~1")
@@ -308,7 +345,9 @@ def items_of(value: Mapping[str, Any], params: Mapping[str, Any]) -> Iterator[di
 def stages(preset: str) -> Iterator[tuple[str, dict[str, Any], list[list[str]]]]:
     """Yield each stage of the project's own chains in its first fold, and the words of each of its commands."""
     params = yaml.safe_load((HERE / "params.yaml").read_text())
-    known = {"forward.recordings": params["forward"]["recordings"]}
+    known = {
+        f"{task}.{name}": text for task, own in params.items() for name, text in own.items() if isinstance(text, str)
+    }
     known |= {f"{task}.preset": preset for task in params}
     for name, value in yaml.safe_load((HERE / "dvc.yaml").read_text())["stages"].items():
         for items in items_of(value, params):

@@ -13,7 +13,8 @@ RNG_POINTS = 400
 
 def on_ellipsoid(rng: np.random.Generator, radii_m: np.ndarray) -> np.ndarray:
     directions = rng.normal(size=(RNG_POINTS, 3))
-    return directions / np.linalg.norm(directions, axis=1)[:, None] * radii_m
+    points: np.ndarray = directions / np.linalg.norm(directions, axis=1)[:, None] * radii_m
+    return points
 
 
 @settings(max_examples=30, deadline=None)

@@ -151,11 +151,19 @@ def test_a_finished_grasp_stays_as_it_is(shard: Shard) -> None:
     assert again.attributes == {}
 
 
+def test_a_grasp_that_was_not_made_yet_has_its_object_cut_out_and_no_reading(shard: Shard) -> None:
+    whole = raw(scene(1))
+    made = cut(shard(whole))
+    planned = cut(shard({name: table for name, table in whole.items() if name != "biotac_sp"}))
+    assert set(planned.streams) == set(made.streams) - {"reading"}
+    assert planned.streams["cloud"].equals(made.streams["cloud"])
+    assert planned.attributes == {}
+    assert set(cut(shard(planned.streams)).streams) == set(planned.streams)
+
+
 def test_what_a_raw_grasp_lacks_is_told(shard: Shard) -> None:
     whole = raw(scene(1))
-    with pytest.raises(
-        TacpipeError, match="Recording trial has no scene and no biotac_sp; a grasp has the streams scene"
-    ):
+    with pytest.raises(TacpipeError, match="Recording trial has no scene; a grasp has the streams scene and grasp"):
         cut(shard({"grasp": whole["grasp"]}))
     with pytest.raises(TacpipeError, match="lacks 1 of 58 columns, as th_pdc"):
         cut(shard({**whole, "biotac_sp": whole["biotac_sp"].drop_columns("th_pdc")}))

@@ -121,7 +121,6 @@ def _member(config: Config, about: Mapping[str, Any], tensors: dict[str, Any], d
         )
         return members.ForestMember(targets, forests, about["coloured"], about["placed"], tuple(about["features"]))
     scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
-    params = {**config["params"], **about["params"]}
-    network = members.network(params, targets)
+    network = members.network(config["params"], targets)
     network.load_state_dict(under("network.", tensors))
-    return members.NetworkMember(targets, network.to(device).eval(), scale, params)
+    return members.NetworkMember(targets, network.to(device).eval(), scale, config["params"])

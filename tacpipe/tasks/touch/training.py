@@ -181,11 +181,9 @@ def _learn(
             "No recording has the role val, and select best and patience choose a network's epoch by these. Make a split "
             "with some, or train with --select last --patience 0."
         )
-    own = {"architecture": params["architecture"] if params["architecture"] == "pointnet" else "patches"}
-    read = {**params, **own}
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    learned = (members.sources(read, known), known)
-    followed = (members.sources(read, watched), watched) if watched else learned  # without any, what was learned
+    learned = (members.sources(params, known), known)
+    followed = (members.sources(params, watched), watched) if watched else learned  # without any, what was learned
     parameters = 0
     for group in [tuple(targets)] if params["together"] else [(target,) for target in targets]:
         scale = _scale(known, group, params["loss"])
@@ -193,11 +191,11 @@ def _learn(
         for number in range(params["networks"]):
             place = workspace / f"{'-'.join(group)}-{number}"
             schedule = _schedule(params, params["seed"] + 1000 * number)
-            build = functools.partial(_built, read, group, device)
+            build = functools.partial(_built, params, group, device)
             trained = loop.train(build, work, schedule, place, weight_decay=params["weight_decay"])
             kept = trained.weights if params["select"] == "best" else trained.last
-            parameters += _weights_learned(read, group)
-            about = {"kind": NETWORK, "targets": list(group), "params": own}
+            parameters += _weights_learned(params, group)
+            about = {"kind": NETWORK, "targets": list(group)}
             named = {f"network.{name}": value for name, value in kept.items()}
             named |= {
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
