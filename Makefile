@@ -30,7 +30,7 @@ demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with de
 	@$(BIN)/tacpipe demo -o demo
 
 test: $(VENV)/.dev ## run all tests
-	@$(BIN)/pytest -q -n auto
+	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto # a worker a core, a thread a worker
 
 lint: $(VENV)/.dev ## check style
 	@$(BIN)/ruff check .

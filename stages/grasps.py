@@ -39,7 +39,7 @@ class Params:
     settled_count: float = 3.0  # device counts by which pressure may vary in that time, and still is settled
 
 
-@stage(version=1)
+@stage(version=2)
 def grasps(params: Params, recording: Shard) -> Recording:
     """Find the grasped object in the camera's view, and what the fingers felt once they had closed on it.
 
@@ -55,7 +55,7 @@ def grasps(params: Params, recording: Shard) -> Recording:
     given = {name: recording.table(name) for name in recording.streams}
     if set(FINISHED) <= set(given) and "biotac_sp" not in given:
         return Recording(given)
-    missing = [name for name in ("scene", "grasp") if name not in given]
+    missing = [name for name in ("scene", "grasp") if name not in given and not (name == "scene" and "cloud" in given)]
     if missing:
         raise TacpipeError(
             f"Recording {recording.name} has no {' and no '.join(missing)}; a grasp has the streams scene and grasp, and "
@@ -75,15 +75,17 @@ def grasps(params: Params, recording: Shard) -> Recording:
     felt: dict[str, pa.Table] = {}
     told: dict[str, int] = {}
     try:
-        scene = Cloud.of(given.pop("scene"))
-        rows = object_rows(scene, Grasp.of(given["grasp"]), limits, params.seed)
+        if "scene" in given:
+            scene = Cloud.of(given.pop("scene"))
+            rows = object_rows(scene, Grasp.of(given["grasp"]), limits, params.seed)
+            colours = None if scene.colours is None else scene.colours[rows]
+            given["cloud"] = Cloud(scene.points_m[rows], colours).table()
         if "biotac_sp" in given:
             felt["reading"], told["contact_ns"] = _reading(params, given.pop("biotac_sp"))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
-    kept = {name: table for name, table in given.items() if table.num_rows == 1}
-    cloud = Cloud(scene.points_m[rows], None if scene.colours is None else scene.colours[rows])
-    return Recording({"cloud": cloud.table(), **felt, **kept}, told)
+    kept = {name: table for name, table in given.items() if table.num_rows == 1 or name == "cloud"}
+    return Recording({**kept, **felt}, told)
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
@@ -107,5 +109,13 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     pressure = np.column_stack([stream.column(name).to_numpy() for name in names]).astype(np.float64)  # (time, finger)
     contact = contact_row(pressure, t_ns, limits)
     rows = settled_rows(pressure, t_ns, contact, limits)
-    felt = [np.rint(np.median(stream.column(field.name).to_numpy()[rows], keepdims=True)) for field in fields]
+    felt = []
+    for field in fields:
+        values = stream.column(field.name).to_numpy()[rows].astype(np.float64)
+        if not np.isfinite(values).any():
+            raise TacpipeError(
+                f"The column {field.name} of biotac_sp holds no value in the {params.settle_s:g} s of the reading. Leave "
+                f"the grasp out."
+            )
+        felt.append(np.rint(np.nanmedian(values, keepdims=True)))
     return channels.stream(t_ns[rows.start : rows.start + 1], felt, fields), int(t_ns[contact])

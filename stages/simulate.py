@@ -92,7 +92,7 @@ class TouchParams:
     raw: bool = False  # the camera's whole view and the sensors over time, as before `segment grasps`
 
 
-@stage(version=1)
+@stage(version=2)
 def touch(params: TouchParams, trial: Trial) -> Recording:
     """Return one grasp of an object on a table: cloud, grasp, reading and, with ground truth, truth."""
     from tacpipe.simulation.grasp import simulate_trial

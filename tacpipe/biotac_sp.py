@@ -43,6 +43,16 @@ def electrode_positions_m() -> Floats:
     return np.concatenate([right, right * (1, 1, -1), _MIDDLE]) * INCH_M
 
 
+def unrolled_m() -> Floats:
+    """Return where electrodes lie on the core rolled out flat, metres (electrode, axis): along the finger, and around it.
+
+    Along it is x of `electrode_positions_m`; around it is the arc about the finger's axis from the midline of the pad,
+    at the electrode's own distance from that axis, positive where z is.
+    """
+    along, depth, across = electrode_positions_m().T
+    return np.column_stack([along, np.hypot(depth, across) * np.arctan2(across, -depth)])
+
+
 def width(target: str) -> int:
     """Return how many values a target has: 1 for a pressure, 24 for electrodes."""
     return ELECTRODES if target.startswith("e_") else 1
@@ -56,6 +66,16 @@ def columns(target: str) -> list[str]:
     """
     kind, finger = target.split("_")
     return [f"{finger}_pdc"] if kind == "pdc" else [f"{finger}_electrode{n:02d}" for n in range(1, ELECTRODES + 1)]
+
+
+def value_columns(target: str) -> list[str]:
+    """Return the columns that hold a target where values are told by target: in predictions, and the truth beside them.
+
+    >>> value_columns("pdc_th"), value_columns("e_mf")[:2]
+    (['pdc_th'], ['e_mf_01', 'e_mf_02'])
+    """
+    count = width(target)
+    return [target] if count == 1 else [f"{target}_{n:02d}" for n in range(1, count + 1)]
 
 
 def normalised(target: str, counts: Floats) -> Floats:

@@ -21,6 +21,16 @@ def test_electrodes_lie_on_the_pad_and_mirror_each_other() -> None:
     assert (np.linalg.norm(places, axis=1) < 0.012).all()
 
 
+def test_electrodes_are_unrolled_in_their_order_along_the_finger_and_mirrored_across_it() -> None:
+    flat = biotac_sp.unrolled_m()
+    np.testing.assert_array_equal(flat[:, 0], biotac_sp.electrode_positions_m()[:, 0])
+    np.testing.assert_allclose(flat[:10, 1], -flat[10:20, 1])
+    assert (flat[:10, 1] > biotac_sp.electrode_positions_m()[:10, 2]).all()  # an arc is longer than its shadow
+    assert flat[20, 1] == flat[23, 1] == 0
+    # electrode 1 lies 0.1090 and 0.1569 inch from the axis: 0.191049 inch at 55.211 degrees from the pad's midline
+    assert flat[0, 1] == pytest.approx(0.191049 * np.radians(55.211) * 0.0254, rel=1e-4)
+
+
 def test_columns_of_a_reading_stand_where_the_published_files_have_them() -> None:
     fields = biotac_sp.fields()
     names = ["", *(field.name for field in fields)]  # a file begins with an empty field
@@ -37,6 +47,13 @@ def test_the_four_targets_are_fifty_columns_of_a_reading() -> None:
     columns = [name for target in biotac_sp.TARGETS for name in biotac_sp.columns(target)]
     assert len(set(columns)) == len(columns) == sum(biotac_sp.width(target) for target in biotac_sp.TARGETS) == 50
     assert set(columns) <= {field.name for field in biotac_sp.fields()}
+
+
+def test_values_told_by_target_have_a_column_each_that_names_target_and_electrode() -> None:
+    columns = [name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target)]
+    assert columns[:4] == ["pdc_th", "pdc_mf", "e_th_01", "e_th_02"]
+    assert columns[24:28] == ["e_th_23", "e_th_24", "e_mf_01", "e_mf_02"]
+    assert len(columns) == 50 and columns[-1] == "e_mf_24"
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.frame import axes
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.clouds.normals import CAMERA_M, normals
 from tacpipe.errors import TacpipeError, UsageError
@@ -23,23 +24,17 @@ from tacpipe.errors import TacpipeError, UsageError
 Floats = NDArray[np.float64]
 
 COUNT = 10
-SHIFT = (
-    0.4  # share of the object's length: the published grasps lie up to 0.45 from the centroid, nine in ten within 0.33
-)
+SHIFT = 0.4  # share of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
 OPENING_M = (0.020, 0.130)  # of the published grasps 0.026 to 0.121
 FEWEST = 50  # points of a cloud that tells a shape; published ones have 814 and more
 MOST = 20_000  # points that are looked at: more add time and no shape
 FEWEST_CUT = 6  # points of a cut
-FLAT_M = (
-    0.003  # thickness below which a cloud is a plane with noise (1.5 mm at a metre); the thinnest published has 26 mm
-)
+FLAT_M = 0.003  # thickness below which a cloud is a plane with noise; the thinnest published one has 0.026
 HALF_CUT_M = 0.007  # half the thickness of a cut, as in GeoGrasp
 TRIM = 0.02  # share of a cut's points at either end that may be stray
 EDGE = 0.2  # share of a cut's width that is an edge
 TRIES = 3  # cuts for each candidate, of which the best stays
-UPRIGHT = (
-    0.9  # cosine to the view above which the first axis cannot be cut across: the object stands towards the camera
-)
+UPRIGHT = 0.9  # cosine to the view above which the object stands towards the camera and its axis is of no use
 OFF_PLANE = 0.4  # weight of the mean distance to the plane, against 1 for each cosine; chosen on the published grasps
 OFF_CENTRE = 0.5  # weight of the distance to the centroid: what is held far from it turns in the hand
 FIRST = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)  # g1 to g2 points right and down in the picture in all published grasps
@@ -78,9 +73,9 @@ def candidates(
 
     The cuts lie up to ``shift`` of the object's length from its centroid on either side, one in each of ``count`` equal
     stretches; a stretch where no pair is ``opening_m`` apart has none. Grasp points are points of the cloud. The wrist's
-    axes are approach (the way the camera looks, as far as it is at right angles to the closing axis), closing axis and
-    their cross product. Raises `TacpipeError` for a cloud too small or flat, for a camera within it, and where no cut is as
-    wide as the fingers open; `UsageError` for arguments that cannot be.
+    axes are approach (the line of sight to the middle of the pair, less its share along the closing axis), closing axis
+    and their cross product. Raises `TacpipeError` for a cloud too small or flat, for a camera within it, and where no cut
+    is as wide as the fingers open; `UsageError` for arguments that cannot be.
     """
     _require_possible(count, shift, opening_m)
     cloud = _thinned(cloud, seed)
@@ -176,6 +171,7 @@ class _Cuts:
         self._points = cloud.points_m.astype(np.float64)
         self._normals = normals(cloud, camera_m=camera_m)
         self._frame, self._opening_m = frame, opening_m
+        self._camera_m = np.asarray(camera_m, np.float64)
         inner = self._points - frame.centre_m
         self._along_m, self._across_m = inner @ frame.along, inner @ frame.across  # (point,)
         self.widths_m: list[float] = []
@@ -199,7 +195,7 @@ class _Cuts:
         left, right = np.unravel_index(int(np.argmax(scores)), scores.shape)
         if not np.isfinite(scores[left, right]):
             return None
-        grasp = _grasp(self._points[lefts[left]], self._points[rights[right]], self._frame.view)
+        grasp = _grasp(self._points[lefts[left]], self._points[rights[right]], self._camera_m)
         off_deg = float(np.degrees(np.arccos(np.clip(cosines[left, right], -1, 1))))
         score = float(scores[left, right] - OFF_CENTRE * abs(shift_m) / self._frame.length_m)
         return Candidate(grasp, score, off_deg, float(shift_m))
@@ -219,8 +215,7 @@ class _Cuts:
         return np.where(fits, cosines - askew - OFF_PLANE * off_plane, -np.inf), cosines
 
 
-def _grasp(left: Floats, right: Floats, view: Floats) -> Grasp:
-    closing = (right - left) / np.linalg.norm(right - left)
-    approach = view - (view @ closing) * closing
-    approach /= np.linalg.norm(approach)
-    return Grasp(left, right, np.column_stack([approach, closing, np.cross(approach, closing)]))
+def _grasp(left: Floats, right: Floats, camera_m: Floats) -> Grasp:
+    """Return the grasp of two points whose wrist comes along the line of sight, as `frame.estimated_wrist` has it."""
+    sight = (left + right) / 2 - camera_m
+    return Grasp(left, right, axes(sight / np.linalg.norm(sight), (right - left) / np.linalg.norm(right - left)))

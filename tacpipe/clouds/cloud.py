@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -46,7 +47,11 @@ class Cloud:
 
     @classmethod
     def of(cls, table: pa.Table) -> Cloud:
-        """Return the cloud that a table holds, one row a point, with colours if it has all three columns."""
+        """Return the cloud that a table holds, one row a point, with colours if it has all three columns.
+
+        Raises `TacpipeError` where a coordinate's column is missing.
+        """
+        require_columns(table, POSITION)
         points = np.column_stack([table.column(name).to_numpy() for name in POSITION]).astype(np.float32, copy=False)
         if not set(COLOUR) <= set(table.column_names):
             return cls(points)
@@ -67,3 +72,10 @@ class Cloud:
             pa.array(np.ascontiguousarray(column), field.type) for column, field in zip(values, fields, strict=True)
         ]
         return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def require_columns(table: pa.Table, names: Sequence[str]) -> None:
+    """Raise `TacpipeError` naming the first of ``names`` that is no column of the table."""
+    missing = [name for name in names if name not in table.column_names]
+    if missing:
+        raise TacpipeError(f"The column {missing[0]} is missing. Ingest or segment the recording again.")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.clouds.cloud import require_columns
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -75,7 +76,11 @@ class Grasp:
 
     @classmethod
     def of(cls, table: pa.Table) -> Grasp:
-        """Return the grasp that a table of one row holds. Raises `TacpipeError` if it has no or several rows."""
+        """Return the grasp that a table of one row holds.
+
+        Raises `TacpipeError` if it has no or several rows, or lacks a column of the points.
+        """
+        require_columns(table, POINTS)
         if table.num_rows != 1:
             raise TacpipeError(f"A grasp's table has {table.num_rows} rows; it must have one.")
         points = np.array([table.column(name)[0].as_py() for name in POINTS], float)

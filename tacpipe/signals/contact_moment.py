@@ -47,7 +47,9 @@ def contact_row(pressure: Floats, t_ns: Times, limits: Limits) -> int:
             f"{limits.on_count:g} or more above rest for {limits.settle_s:g} s. Leave the grasp out, or lower --on-count."
         )
     noise = rise[t_ns - t_ns[0] <= limits.rest_s * 1e9].std(axis=0)  # (finger,)
-    touching = rise > np.maximum(1.0, NOISES * noise)
+    touching = rise > np.clip(
+        NOISES * noise, 1.0, 0.99 * limits.on_count
+    )  # whatever moved at rest, pressing is touching
     since = [int(runs(finger[: held.argmax() + 1])[0][-1]) for finger in touching.T]
     return max(since)
 

@@ -57,19 +57,13 @@ def sensors(rng: np.random.Generator) -> Sensors:
     return Sensors(rest, noise, rng.uniform(0, 2 * np.pi, (len(DRIFT_DAYS), *rest.shape)))
 
 
-def unrolled_m() -> Floats:
-    """Return where electrodes lie on the unrolled core (electrode, axis): along the finger, and around it, metres."""
-    along, depth, across = biotac_sp.electrode_positions_m().T
-    return np.column_stack([along, np.hypot(depth, across) * np.arctan2(across, -depth)])
-
-
 def pressed(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
     """Return by how many counts a contact changes electrodes (..., electrode).
 
     ``contact_m`` is the contact's radius (...), ``skin_m`` by how much the skin gives way (...), ``centre_m`` the middle
     of the contact on the unrolled core (..., axis), all in metres.
     """
-    way2 = ((unrolled_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
+    way2 = ((biotac_sp.unrolled_m() - centre_m[..., None, :]) ** 2).sum(axis=-1)
     sigma2 = np.maximum(BREADTH * contact_m, 1e-9) ** 2
     near = np.exp(-way2 / (2 * sigma2[..., None]))
     fall = GAIN_COUNT * (1 - np.exp(-skin_m / FLUID_M))[..., None] * near
@@ -90,7 +84,7 @@ def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | NDArray[np.int6
     """
     rate = 2 * np.pi / np.array(DRIFT_DAYS)[:, None, None]  # rad a day
     size = rate_count_day / rate * np.sqrt(2 / len(DRIFT_DAYS))
-    days = np.asarray(t_ns % (400 * DAY_NS), np.float64)[..., None, None, None] / DAY_NS
+    days = np.asarray(t_ns, np.float64)[..., None, None, None] / DAY_NS
     return np.asarray((size * np.sin(rate * days + phases_rad)).sum(axis=-3))
 
 

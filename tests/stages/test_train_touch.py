@@ -81,7 +81,7 @@ def test_a_model_from_the_store_tells_the_touch_of_a_grasp_and_refuses_what_is_n
 def _refuses(lab: Lab) -> None:
     """Params off end with code 2 and a sentence, grasps off with code 1, and neither leaves a model."""
     for words, code, sentence in (
-        ("--architecture tree", 2, "There is no architecture tree"),
+        ("--architecture tree", 2, "architecture is 'tree'; it must be one of strong"),
         ("--targets thumb", 2, "targets is 'thumb'"),
         ("--leaf -1", 2, "leaf is -1"),
         (f"{TREES} --select best --architecture patches", 1, "No recording has the role val"),

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.report import plain
-from tacpipe.report.touch import clouds, overview, predictions
+from tacpipe.report.touch import clouds, overview
 from tacpipe.report.touch.methods import Run, grouped
+from tacpipe.touch_results import PREDICTIONS
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -24,7 +25,7 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
     A result without predictions of unseen grasps has nothing to compare and is told as its metrics name it. Nothing is
     drawn over time, so ``traces`` is of no effect.
     """
-    runs = [Run.read(one) for one in results if predictions.RECORDING in one.shards]
+    runs = [Run.read(one) for one in results if PREDICTIONS in one.shards]
     runs = [run for run in runs if len(run.predictions.recordings)]
     compared = {id(run.dataset) for run in runs}
     bare = [one for one in results if id(one) not in compared]

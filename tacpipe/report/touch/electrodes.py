@@ -12,7 +12,8 @@ from tacpipe.report import markup
 from tacpipe.report.touch import fingertip, scores, wording
 from tacpipe.report.touch.fingertip import Fingertip
 from tacpipe.report.touch.methods import Method, Run
-from tacpipe.report.touch.predictions import CONSTANT, MODEL, Predictions
+from tacpipe.report.touch.predictions import Predictions
+from tacpipe.touch_results import CONSTANT, MODEL
 
 FINGERS = ("e_th", "e_mf")
 PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # by error, of the grasps that are drawn

@@ -32,16 +32,6 @@ class Fingertip:
     texts: Sequence[str]  # in each electrode
 
 
-def rolled_out_mm() -> Floats:
-    """Return where electrodes lie on the skin rolled out flat, millimetres (electrode, across and along).
-
-    Along the finger it is x; across it is the arc about the finger's axis from the midline of the pad.
-    """
-    x, y, z = biotac_sp.electrode_positions_m().T * 1000
-    arc = np.hypot(y, z) * np.arctan2(z, -y)
-    return np.column_stack([arc, x])
-
-
 def draw(fingertips: Sequence[Fingertip], title: str) -> str:
     """Return fingertips side by side, their tips up, as seen on the pad."""
 
@@ -65,7 +55,7 @@ def _put(axes: Axes, one: Fingertip, at_mm: float) -> None:
     across = np.concatenate([[half], half * np.cos(angle), [-half]]) + at_mm
     along = np.concatenate([[begin], (end - 2) * np.sin(angle) + 2, [begin]])
     axes.plot(across, along, color=FAINT, linewidth=1)
-    places = rolled_out_mm() + np.array([at_mm, 0])
+    places = 1000 * biotac_sp.unrolled_m()[:, ::-1] + np.array([at_mm, 0])  # (electrode, across and along), mm
     strengths = [round(float(np.clip(part, -1, 1)), 2) for part in one.strength]
     inks = [to_rgba(COLOURS["model" if part >= 0 else "persistence"], 0.85 * abs(part)) for part in strengths]
     dot = [2 * DOT_MM]

@@ -22,7 +22,6 @@ class Form:
     setting: str
     names: Mapping[object, str]  # what a row is called, by the setting's value
     printed: Mapping[object, tuple[float, float]] = field(default_factory=dict)  # mean and sd of the RMSE
-    seconds: Mapping[object, float] = field(default_factory=dict)  # an epoch
     drawn: bool = False  # whether the paper has a figure and no table
     also: tuple[str, ...] = ()  # settings that only some of the values have
 
@@ -46,7 +45,6 @@ FORMS = (
         "points",
         {count: f"{count} points" for count in printed.POINTS},
         printed.POINTS,
-        printed.SECONDS,
     ),
     Form(
         "Figure 9 in the paper's form: what the network is told",
@@ -116,17 +114,13 @@ def _table(form: Form, methods: Sequence[Method]) -> str:
         return ""
     told = {value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names}
     least = min((one.each.mean, name) for value, name in form.names.items() if (one := told[value]))[1]
-    rows = [
-        [name, *tables.cells(told[value]), *_printed(form, value), *_seconds(form, value, found)]
-        for value, name in form.names.items()
-    ]
+    rows = [[name, *tables.cells(told[value]), *_printed(form, value)] for value, name in form.names.items()]
     kinds = {number: "best" for number, name in enumerate(form.names.values()) if name == least}
     baselines = tables.baseline_rows(list(found.values()), TARGET, True)
-    blank = [NONE] * (bool(form.printed) + 2 * bool(form.seconds))
+    blank = [NONE] * bool(form.printed)
     kinds |= dict.fromkeys(range(len(rows), len(rows) + len(baselines)), "quiet")
     rows += [[name, *tables.cells(one), *blank] for name, one in baselines]
     heads = ["", *tables.ROWS, *(["paper: RMSE"] if form.printed else [])]
-    heads += ["seconds an epoch", "paper: seconds"] if form.seconds else []
     simulated = any(one.simulated for one in found.values())
     title = f"{form.title}{' (simulated)' if simulated else ''}"
     notes = [wording.basis(list(found.values())), wording.caution(simulated), ORDER if form.drawn else ""]
@@ -138,15 +132,6 @@ def _table(form: Form, methods: Sequence[Method]) -> str:
 
 def _printed(form: Form, value: object) -> list[str]:
     return [markup.with_sd(*form.printed[value], digits=5)] if form.printed else []
-
-
-def _seconds(form: Form, value: object, found: Mapping[object, Method]) -> list[str]:
-    """Return how long an epoch took, where training told it, and how long the paper's did."""
-    if not form.seconds:
-        return []
-    runs = found[value].runs if value in found else ()
-    told = [float(line["seconds"]) for run in runs for line in run.history if line.get("seconds") is not None]
-    return [f"{sum(told) / len(told):.2g}" if told else NONE, f"{form.seconds[value]:g}"]
 
 
 def _figure(form: Form, told: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> str:

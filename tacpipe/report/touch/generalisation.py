@@ -65,7 +65,7 @@ def _table(known: Method, novel: Method) -> str:
     chosen = [known] if known is novel else [known, novel]
     counted = [max(one.grasps for one in told if one) for told in zip(*pairs, strict=True)]
     judged = f"Judged on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
-    note = f"{wording.basis(chosen)} {judged} {wording.caution(simulated)}"
+    note = f"{wording.basis(chosen)} {judged} {printed.FOUND_ON} {wording.caution(simulated)}"
     title = f"{TITLE}{' (simulated)' if simulated else ''}; {known.name}"
     return f"{markup.table(title, heads, rows, kinds)}{markup.note(note)}"
 

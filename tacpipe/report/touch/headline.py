@@ -9,7 +9,7 @@ from tacpipe.report import markup
 from tacpipe.report.markup import listed
 from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import DEFAULT, Group, Method
-from tacpipe.report.touch.predictions import OBJECT
+from tacpipe.touch_results import OBJECT_MEAN
 
 NO_EVIDENCE = "no evidence of generalisation"
 
@@ -51,17 +51,18 @@ def _known(group: Group, where: str) -> str:
 def _novel(group: Group, where: str) -> str:
     """Return skill on novel objects, and whether there is evidence of any."""
     skills = _skills(group.default, False)
-    judged = [target for target in wording.TARGETS if scores.best(group.methods, target, False)]
+    tried = [one for one in group.methods if any(scores.score(one.runs, target, False) for target in one.targets)]
+    judged = [target for target in wording.TARGETS if scores.best(tried, target, False)]
     if not judged:
         return ""
     told = f"Novel objects{where}: "
     if skills:
         told += f"{group.default.name} has a skill of {skills}, judged on {_counted(group.default, False)}. "
-    evident = {target: found for target in judged if (found := beating(group.methods, target, False))}
+    evident = {target: found for target in judged if (found := beating(tried, target, False))}
     if not evident:
-        several = f"None of {len(group.methods)} methods" if len(group.methods) > 1 else "It does not"
-        verb = "beats" if len(group.methods) > 1 else "beat"
-        return f"{told}{several} {verb} the constant with an interval above zero on any target: {NO_EVIDENCE}."
+        alone = "It" if skills else tried[0].name
+        none = f"None of {len(tried)} methods beats" if len(tried) > 1 else f"{alone} does not beat"
+        return f"{told}{none} the constant with an interval above zero on any target: {NO_EVIDENCE}."
     ahead = [f"{listed([one.name for one in found])} on {wording.TARGETS[target]}" for target, found in evident.items()]
     told += f"With an interval above zero, the constant is beaten by {'; by '.join(ahead)}."
     rest = [wording.TARGETS[target] for target in judged if target not in evident]
@@ -72,8 +73,8 @@ def _object_means(group: Group) -> str:
     """Return the skill of the mean of each known object, which knows nothing of a grasp; empty where none tells it."""
     found = {}
     for target, name in wording.TARGETS.items():
-        source = scores.reference(group.methods, target, OBJECT)
-        score = scores.score(source.runs, target, True, OBJECT) if source else None
+        source = scores.reference(group.methods, target, OBJECT_MEAN)
+        score = scores.score(source.runs, target, True, OBJECT_MEAN) if source else None
         if score and not math.isnan(score.skill.mean):
             found[name] = markup.decimals(score.skill.mean)
     means = listed([f"{skill} on {name}" for name, skill in found.items()])

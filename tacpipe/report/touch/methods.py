@@ -12,6 +12,7 @@ from tacpipe.report import contents, provenance
 from tacpipe.report.naming import told_apart
 from tacpipe.report.touch import predictions
 from tacpipe.report.touch.predictions import Predictions
+from tacpipe.touch_results import PREDICTIONS
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -20,7 +21,7 @@ Tree = Mapping[str, Any]
 
 PAPERS = "pointnet"  # the architecture of the paper
 DEFAULT = "strong"  # the one that is trained where none is named
-NAMES = {PAPERS: "PointNet", "trees": "trees on hand geometry"}
+NAMES = {PAPERS: "PointNet"}
 _NO_METHOD = ("seed", "setting", "baselines")  # runs of one method may differ in these; the setting is told as split
 
 
@@ -36,7 +37,7 @@ class Run:
     @classmethod
     def read(cls, dataset: Dataset) -> Run:
         """Return the run that a result holds."""
-        found = predictions.read(dataset.shards[predictions.RECORDING])
+        found = predictions.read(dataset.shards[PREDICTIONS])
         return cls(dataset, contents.tree(dataset, "config.json"), contents.history(dataset), found)
 
     @property
@@ -53,8 +54,7 @@ class Run:
     @property
     def split(self) -> str:
         """How grasps were parted into those of training and others, in words; empty where nobody said."""
-        told = self.config.get("split", "")
-        return str(told.get("scheme", "") if isinstance(told, Mapping) else told)
+        return str(self.config.get("split", ""))
 
     @property
     def trained(self) -> int | None:
@@ -122,9 +122,13 @@ class Group:
 
     @property
     def main(self) -> list[Method]:
-        """One method an architecture: that with most runs, of several the one with the shortest name."""
+        """One method an architecture: that with most runs, of several one that reads colour, then the shortest name."""
+
+        def place(one: Method) -> tuple[int, bool, int, str]:
+            return -len(one.runs), not one.settings.get("colour", True), len(one.name), one.name
+
         chosen: dict[str, Method] = {}
-        for one in sorted(self.methods, key=lambda one: (-len(one.runs), len(one.name), one.name)):
+        for one in sorted(self.methods, key=place):
             chosen.setdefault(one.architecture, one)
         return sorted(chosen.values(), key=lambda one: one.name)
 
@@ -132,8 +136,8 @@ class Group:
 def grouped(runs: Sequence[Run]) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
-    A method is all params but the seed, the split of its grasps, and whether these were simulated. Its name tells the
-    settings in which it differs from most methods of its architecture.
+    A method is all params but the seed, the split of its grasps, and whether these were simulated. Its name tells what it
+    does without, colour, and the settings in which it differs from most methods of its architecture.
     """
     found: dict[str, tuple[Tree, list[Run]]] = {}
     for run in runs:
@@ -142,10 +146,11 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     made = []
     for architecture in dict.fromkeys(str(settings["architecture"]) for settings, _ in found.values()):
         same = [one for one in found.values() if one[0]["architecture"] == architecture]
-        first = NAMES.get(architecture, architecture)
-        names = told_apart([(first, settings) for settings, _ in same], _usual(same))
-        pairs = zip(names, same, strict=True)
-        made += [Method(name, settings, tuple(runs)) for (name, _), (settings, runs) in pairs]
+        names = told_apart([(architecture, settings) for settings, _ in same], _usual(same))
+        made += [
+            Method(" · ".join([*_called(settings), *marks]), settings, tuple(held))
+            for (_, marks), (settings, held) in zip(names, same, strict=True)
+        ]
     return sorted(made, key=lambda method: method.name)
 
 
@@ -166,8 +171,18 @@ def groups(methods: Sequence[Method]) -> list[Group]:
     return sorted(made, key=place)
 
 
+def _called(settings: Tree) -> list[str]:
+    """Return what a kind of model is called by what it reads; marks that tell methods of a kind apart come behind."""
+    architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
+    if architecture == "trees":
+        return ["trees on geometry and colour" if coloured else "trees on geometry"]
+    return [NAMES.get(architecture, architecture), *([] if coloured else ["without colour"])]
+
+
 def _settings(run: Run) -> dict[str, Any]:
     params = {name: value for name, value in run.params.items() if name not in _NO_METHOD}
+    if run.architecture != PAPERS:  # the others take nothing more from it
+        params["colour"] = str(params.pop("inputs", "")).startswith("rgb")
     if not str(params.get("inputs", "")).endswith("pose") and params.get("normalisation") != "wrist":
         params.pop("wrist", None)  # nothing reads it
     if not params.get("together"):
@@ -178,13 +193,14 @@ def _settings(run: Run) -> dict[str, Any]:
 def _usual(alike: Sequence[tuple[Tree, Sequence[Run]]]) -> list[tuple[str, Any]]:
     """Return the setting that most methods have, or of several such that of most runs, by name.
 
-    All splits are usual, and so are simulated grasps: these have headings of their own.
+    All splits are usual, and so are simulated grasps: these have headings of their own. What is called by its colour has no
+    mark of it.
     """
     found = []
     for name in sorted({name for settings, _ in alike for name in settings}):
         values = [settings[name] for settings, _ in alike if name in settings]
         weights = [(values.count(one), _runs_with(alike, name, one)) for one in values]
-        kept = values if name in ("split", "simulated") else [values[weights.index(max(weights))]]
+        kept = values if name in ("split", "simulated", "colour") else [values[weights.index(max(weights))]]
         found += [(name, value) for value in kept]
     return found
 

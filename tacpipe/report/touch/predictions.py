@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe import biotac_sp
+from tacpipe.touch_results import GRASPS, MODEL, TRUE
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -19,11 +20,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
 
-RECORDING = "predictions"
-GRASPS, TRUE = "grasps", "true"
-MODEL, LAST = "model", "last_epoch"
 UNNAMED = "unnamed"  # an object of which no recording tells the name
-CONSTANT, OBJECT, TIME = "constant", "object_mean", "nearest_in_time"
 
 
 @dataclass(frozen=True)
@@ -66,20 +63,11 @@ def read(shard: Shard) -> Predictions:
     return found.rows(~np.array(grasps["seen"].to_pylist(), dtype=bool))
 
 
-def columns(target: str) -> list[str]:
-    """Return the columns of a target in the streams of a result.
-
-    >>> columns("pdc_th"), columns("e_mf")[:2]
-    (['pdc_th'], ['e_mf_01', 'e_mf_02'])
-    """
-    width = biotac_sp.width(target)
-    return [target] if width == 1 else [f"{target}_{number:02d}" for number in range(1, width + 1)]
-
-
 def _touch(table: pa.Table) -> Touch:
     """Return the targets that a stream holds in full."""
-    held = [target for target in biotac_sp.TARGETS if set(columns(target)) <= set(table.column_names)]
+    columns = {target: biotac_sp.value_columns(target) for target in biotac_sp.TARGETS}
     return {
-        target: np.column_stack([table[name].to_numpy() for name in columns(target)]).astype(np.float64)
-        for target in held
+        target: np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64)
+        for target, names in columns.items()
+        if set(names) <= set(table.column_names)
     }

@@ -13,7 +13,7 @@ from tacpipe import biotac_sp, regression
 from tacpipe.regression import Interval
 from tacpipe.report.spread import Spread, spread
 from tacpipe.report.touch.methods import Method, Run
-from tacpipe.report.touch.predictions import CONSTANT, LAST, MODEL
+from tacpipe.touch_results import CONSTANT, MODEL
 
 Floats = NDArray[np.floating[Any]]
 
@@ -91,9 +91,7 @@ def reference(methods: Sequence[Method], target: str, predictor: str) -> Method 
 
 def baselines(methods: Sequence[Method]) -> list[str]:
     """Return the predictors that are no model's own, in the order of their names."""
-    return sorted(
-        {name for one in methods for run in one.runs for name in run.predictions.said if name not in (MODEL, LAST)}
-    )
+    return sorted({name for one in methods for run in one.runs for name in run.predictions.said if name != MODEL})
 
 
 def best(methods: Sequence[Method], target: str, known: bool | None) -> Method | None:

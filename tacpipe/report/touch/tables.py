@@ -9,8 +9,8 @@ from tacpipe.report import markup
 from tacpipe.report.markup import NONE
 from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import Group, Method, Run
-from tacpipe.report.touch.predictions import LAST, MODEL, OBJECT
 from tacpipe.report.touch.scores import Score
+from tacpipe.touch_results import MODEL, OBJECT_MEAN
 
 HEADS = (
     "RMSE",
@@ -40,9 +40,7 @@ def every_run(methods: Sequence[Method]) -> str:
     """Return one row a run."""
     rows = []
     for method in methods:
-        for run in sorted(
-            method.runs, key=lambda run: (str(run.config.get("fold", "")), str(run.params.get("seed", "")))
-        ):
+        for run in sorted(method.runs, key=lambda run: str(run.params.get("seed", ""))):
             for known in (True, False):
                 told = [scores.score([run], target, known) for target in wording.TARGETS]
                 if not any(told):
@@ -79,14 +77,11 @@ def baseline_rows(methods: Sequence[Method], target: str, known: bool | None) ->
 
 
 def _errors(group: Group, target: str, known: bool) -> str:
-    told: list[tuple[str, Score | None]] = []
     first = scores.best(group.methods, target, known)
     if first is None:
         return ""
-    for method in group.methods:
-        told += [(method.name, scores.score(method.runs, target, known, MODEL))]
-        told += [(f"{method.name} · last epoch", scores.score(method.runs, target, known, LAST))]
-    told = [one for one in told if one[1]]
+    every = [(method.name, scores.score(method.runs, target, known)) for method in group.methods]
+    told = [one for one in every if one[1]]
     baselines = baseline_rows(group.methods, target, known)
     rows = [[name, *_cells(one)] for name, one in [*told, *baselines]]
     kinds = dict.fromkeys(range(len(told), len(rows)), "quiet")
@@ -138,7 +133,7 @@ def _short(found: Score | None) -> list[str]:
 
 def _of_object(runs: Sequence[Run], target: str, known: bool) -> list[str]:
     """Return the RMSE on an object, above that of its mean where there is one, and the skill over the constant."""
-    found, mean = (scores.score(runs, target, known, one) for one in (MODEL, OBJECT))
+    found, mean = (scores.score(runs, target, known, one) for one in (MODEL, OBJECT_MEAN))
     if found is None:
         return [NONE, NONE]
     below = f"<br><small>{wording.share(mean.rmse)}</small>" if mean and known else ""

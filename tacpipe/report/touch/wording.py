@@ -10,8 +10,8 @@ from tacpipe.report import markup
 from tacpipe.report.markup import NONE
 from tacpipe.report.touch import printed
 from tacpipe.report.touch.methods import PAPERS, Method, Run
-from tacpipe.report.touch.predictions import CONSTANT, OBJECT, TIME
 from tacpipe.report.touch.scores import Score
+from tacpipe.touch_results import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
 TARGETS = {
     "pdc_th": "PDC thumb",
@@ -22,8 +22,8 @@ TARGETS = {
 FINGERS = {"e_th": "thumb", "e_mf": "middle finger"}
 BASELINES = {  # rows that every table has
     CONSTANT: "constant: the mean of training",
-    OBJECT: "mean of the object",
-    TIME: "mean of the nearest in time",
+    OBJECT_MEAN: "mean of the object",
+    NEAREST_IN_TIME: "mean of the nearest in time",
 }
 OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
 SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor or about the paper's numbers."

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from tacpipe import biotac_sp
 from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.touch_results import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
 Floats = NDArray[np.float64]
 
-CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"
 NEAREST = 3  # training grasps whose mean is told
 
 

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe import biotac_sp
-from tacpipe.clouds.cloud import POSITION, Cloud
-from tacpipe.clouds.grasp import POINTS, Grasp
+from tacpipe.clouds.cloud import Cloud, require_columns
+from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from tacpipe.dataset import Dataset, Shard
 
 Floats = NDArray[np.float64]
@@ -111,9 +109,8 @@ def _geometry(shard: Shard) -> tuple[Cloud, Grasp, int]:
             f"`tacpipe ingest vision2tactile`; a camera's whole view goes through `tacpipe segment grasps` first."
         )
     table, points = shard.table("grasp"), shard.table("cloud")
-    _require(shard, table, ("t_ns", *POINTS))
-    _require(shard, points, POSITION)
     try:
+        require_columns(table, ["t_ns"])
         cloud, grasp = Cloud.of(points), Grasp.of(table)
     except TacpipeError as error:
         raise TacpipeError(f"Recording {shard.name}: {error}") from None
@@ -135,15 +132,12 @@ def _felt(shard: Shard) -> dict[str, Floats]:
     found = {}
     for target in biotac_sp.TARGETS:
         columns = biotac_sp.columns(target)
-        _require(shard, table, columns)
+        try:
+            require_columns(table, columns)
+        except TacpipeError as error:
+            raise TacpipeError(f"Recording {shard.name}: {error}") from None
         found[target] = np.array([table.column(name)[0].as_py() for name in columns], np.float64)  # null becomes NaN
         if not np.isfinite(found[target]).all():
             column = columns[int(np.argmin(np.isfinite(found[target])))]
             raise TacpipeError(f"Recording {shard.name} has no finite reading in the column {column}. Leave it out.")
     return found
-
-
-def _require(shard: Shard, table: pa.Table, columns: tuple[str, ...] | list[str]) -> None:
-    missing = [name for name in columns if name not in table.column_names]
-    if missing:
-        raise TacpipeError(f"Recording {shard.name} lacks the column {missing[0]}. Ingest or segment it again.")

@@ -17,17 +17,15 @@ from tacpipe.errors import TacpipeError
 from tacpipe.stage import Recording, Result
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import scorecard
-from tacpipe.tasks.touch.baselines import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
 from tacpipe.tasks.touch.scorecard import Told, Tree
+from tacpipe.touch_results import CONSTANT, GRASPS, MODEL, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS, TRUE
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
 Mask = NDArray[np.bool_]
-
-MODEL, TRUE, PREDICTIONS = "model", "true", "predictions"
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -52,31 +50,33 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     trained = set(predictor.config["trained_on"].values())
     seen = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.felt_before(grasps)
     known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
-    tree = _measures(grasps, told, ~seen)
+    tree = _measures(grasps, told, ~seen, known)
     for name, mask in (("known", known & ~seen), ("novel", ~known & ~seen), ("seen", seen)):
         if mask.any():
-            tree[name] = _measures(grasps, told, mask, by_cluster="object" if name == "novel" else "grasp")
+            tree[name] = _measures(grasps, told, mask, known)
     files = {
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "by_object.csv": _by_object_csv(tree),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.shards.values())
-    streams["grasps"] = _about(grasps, seen, known)
-    return Result({PREDICTIONS: Recording(streams, {"simulated": True} if simulated else {})}, files)
+    streams[GRASPS] = _about(grasps, seen, known)
+    return Result({PREDICTIONS: Recording(streams, simulated(recordings))}, files)
 
 
-def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, by_cluster: str = "grasp") -> Tree:
-    """Return the measures of every predictor on some grasps, over all of them and by object."""
+def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, known: Mask) -> Tree:
+    """Return the measures of every predictor on some grasps, over all of them and by object.
+
+    Where an object among them is not ``known``, intervals are over objects: what the next one will be like is the question.
+    """
     if not mask.any():
         return {"counts": {"grasps": 0}}
-    clusters = np.array(grasps.objects if by_cluster == "object" else grasps.names)
-    objects = np.array(grasps.objects)
+    names, objects = np.array(grasps.names), np.array(grasps.objects)
+    clusters = objects if (mask & ~known).any() else names
     tree: Tree = {"counts": {"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}}
     for name, one in told.items():
         tree[name] = _tree(grasps, one, told[CONSTANT], mask, clusters)
         tree[name]["by_object"] = {
-            other or "unnamed": _tree(grasps, one, told[CONSTANT], mask & (objects == other), clusters)
+            other or "unnamed": _tree(grasps, one, told[CONSTANT], mask & (objects == other), names)
             for other in sorted(set(objects[mask]))
         }
     felt, model = (scorecard.chosen(one, mask) for one in (grasps.felt, told[MODEL]))
@@ -117,14 +117,17 @@ def _about(grasps: Grasps, seen: Mask, known: Mask) -> pa.Table:
     )
 
 
+def simulated(recordings: Dataset) -> dict[str, bool]:
+    """Return the attribute that marks what simulated recordings led to; none where all are real."""
+    found = any(bool(shard.attributes.get("simulated")) for shard in recordings.shards.values())
+    return {"simulated": True} if found else {}
+
+
 def told_table(told: Told) -> pa.Table:
     """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, as far as told."""
     fields, arrays = [], []
     for target, values in told.items():
-        names = (
-            [target] if biotac_sp.width(target) == 1 else [f"{target}_{n:02d}" for n in range(1, values.shape[1] + 1)]
-        )
-        for name, column in zip(names, values.T, strict=True):
+        for name, column in zip(biotac_sp.value_columns(target), values.T, strict=True):
             fields.append(pa.field(name, pa.float32(), metadata={"unit": "count", "quantity": "prediction"}))
             arrays.append(pa.array(column.astype(np.float32)))
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

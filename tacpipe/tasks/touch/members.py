@@ -14,7 +14,7 @@ from tacpipe import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
-from tacpipe.models.patches import BACKBONES, PatchNetwork
+from tacpipe.models.patches import PatchNetwork
 from tacpipe.models.pointnet import HEADS, PointNet
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Inputs, Sources
@@ -91,17 +91,13 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
 
 
 def network(params: Params, targets: Sequence[str]) -> nn.Module:
-    """Return an untrained network for params and targets. Raises `TacpipeError` for a head or backbone there is not."""
+    """Return an untrained network for params and targets."""
     outputs = sum(biotac_sp.width(target) for target in targets)
     if params["architecture"] == "pointnet":
-        if params["head"] not in HEADS:
-            raise TacpipeError(f"head is {params['head']!r}; it must be one of {', '.join(HEADS)}.")
         read = inputs(params)
         return PointNet(
             read.channels, read.grasp_numbers, outputs, head=HEADS[params["head"]], transform=params["transform"]
         )
-    if params["backbone"] not in BACKBONES:
-        raise TacpipeError(f"backbone is {params['backbone']!r}; it must be {' or '.join(BACKBONES)}.")
     sizes = {"backbone": params["backbone"], "hidden": params["hidden"], "dropout": params["dropout"]}
     near = patches(params)
     return PatchNetwork(near.channels, near.grasp_numbers, outputs, **sizes)

@@ -10,8 +10,9 @@ import pyarrow as pa
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Recording, Result
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch.judging import PREDICTIONS, told_table
+from tacpipe.tasks.touch.judging import simulated, told_table
 from tacpipe.tasks.touch.predictor import Predictor
+from tacpipe.touch_results import PREDICTIONS
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -29,4 +30,4 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
         raise TacpipeError("There is no grasp to foretell. Give a dataset with recordings of the role asked for.")
     table = told_table(predictor.foretell(grasps))
     table = table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))
-    return Result({PREDICTIONS: Recording(table)})
+    return Result({PREDICTIONS: Recording(table, simulated(recordings))})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +18,17 @@ from torch import Tensor, nn
 
 from tacpipe import biotac_sp
 from tacpipe.clouds import geometry
+from tacpipe.clouds.normalisation import NORMALISATIONS
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models.forest import Forest
+from tacpipe.models.patches import BACKBONES
+from tacpipe.models.pointnet import HEADS
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.inputs import MODES
-from tacpipe.tasks.touch.learning import Drawn, Felt, TouchWork
+from tacpipe.tasks.touch.inputs import MODES, WRISTS
+from tacpipe.tasks.touch.learning import LOSSES, Drawn, Felt, TouchWork
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
 from tacpipe.training import loop
 from tacpipe.training.scaling import Affine
@@ -38,6 +41,16 @@ Params = Mapping[str, Any]
 Config = dict[str, Any]
 
 ARCHITECTURES = ("strong", "trees", "patches", "pointnet")
+WORDS: Mapping[str, Iterable[str]] = {  # that params may be
+    "architecture": ARCHITECTURES,
+    "inputs": MODES,
+    "normalisation": NORMALISATIONS,
+    "wrist": WRISTS,
+    "head": HEADS,
+    "backbone": BACKBONES,
+    "loss": LOSSES,
+    "select": ("best", "last"),
+}
 LEAVES = (2, 4, 8)  # rows of a leaf that are tried
 LIMITS = {  # least and most of params that nothing else checks
     **dict.fromkeys(("networks", "draws", "trees"), (1, math.inf)),
@@ -103,12 +116,9 @@ def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Gras
 
 def _check(params: Params) -> None:
     """Refuse params that cannot be, before anything is read."""
-    if params["architecture"] not in ARCHITECTURES:
-        raise UsageError(f"There is no architecture {params['architecture']}; there are {', '.join(ARCHITECTURES)}.")
-    if params["select"] not in ("best", "last"):
-        raise UsageError(f"select is {params['select']!r}; it must be best or last.")
-    if params["inputs"] not in MODES:
-        raise UsageError(f"inputs is {params['inputs']!r}; it must be one of {', '.join(MODES)}.")
+    for name, words in WORDS.items():
+        if params[name] not in words:
+            raise UsageError(f"{name} is {params[name]!r}; it must be one of {', '.join(words)}.")
     for name, (least, most) in LIMITS.items():
         if not least <= params[name] <= most:
             allowed = f"be {least} or more" if most == math.inf else f"lie between {least} and {most}"

@@ -35,18 +35,19 @@ def test_figures_are_drawn_in_the_pages_colours_and_carry_nothing_from_outside()
         assert "http" not in re.sub(r'xmlns(:xlink)?="[^"]+"', "", one)
 
 
-def test_electrodes_keep_their_distance_from_the_midline_and_do_not_cover_each_other() -> None:
-    places = fingertip.rolled_out_mm()
-    np.testing.assert_allclose(places[:10] * (-1, 1), places[10:20])  # mirrored across
-    np.testing.assert_allclose(places[[20, 23], 0], 0)
-    np.testing.assert_allclose(places[:, 1], biotac_sp.electrode_positions_m()[:, 0] * 1000)
+def test_electrodes_do_not_cover_each_other() -> None:
+    places = 1000 * biotac_sp.unrolled_m()
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)[~np.eye(24, dtype=bool)]
     assert apart.min() > 2 * fingertip.DOT_MM
 
 
-def test_an_arc_is_longer_than_its_chord() -> None:
-    z = biotac_sp.electrode_positions_m()[:, 2] * 1000
-    assert (np.abs(fingertip.rolled_out_mm()[:, 0]) >= np.abs(z) - 1e-9).all()
+def test_a_fingertip_lies_with_its_tip_up_and_its_electrodes_across_as_around_it() -> None:
+    drawn = fingertip.draw([Fingertip("thumb", np.zeros(24), [f"n{n}" for n in range(1, 25)])], "t")
+    pattern = r'x="(\S+)" y="(\S+)"[^>]*>(n\d+)</text>'
+    at = {name: (float(x), -float(y)) for x, y, name in re.findall(pattern, drawn)}
+    # 1 and 11 mirror each other, 10 lies nearer the palm than 1, 21 nearer the tip than 24 on the midline
+    assert at["n1"][0] > at["n11"][0] and at["n1"][1] == at["n11"][1]
+    assert at["n1"][1] > at["n10"][1] and at["n21"][1] > at["n24"][1]
 
 
 def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:

@@ -33,6 +33,16 @@ def test_where_nothing_beats_the_constant_on_novel_objects_it_says_so() -> None:
     )
 
 
+def test_methods_that_were_not_judged_on_novel_objects_are_not_counted_among_those_that_do_not_beat() -> None:
+    off = {**APART, "drill": 0.12, "shoe": 0.12}
+    given = [result(off=off, novel=NOVEL), result("trees", off=0.11, novel=NOVEL), result("pointnet")]
+    assert "None of 2 methods beats the constant" in told(*given)[1]
+    assert "It does not beat the constant" in told(given[0], given[2])[1]
+    assert told(result(), given[1])[1].startswith(
+        "Novel objects: trees on geometry and colour does not beat the constant"
+    )
+
+
 def test_a_gain_that_one_novel_object_alone_shows_is_no_evidence() -> None:
     said = told(result(off={**APART, "drill": 0.01, "shoe": 0.11}, novel=NOVEL))
     assert "+0." in said[1] and said[1].endswith("no evidence of generalisation.")
@@ -44,7 +54,9 @@ def test_where_the_constant_is_beaten_it_tells_by_what_and_where_not() -> None:
         result(off={**APART, "drill": 0.12, "shoe": 0.12}, novel=NOVEL),
         result("trees", off=0.05, novel=NOVEL, targets=("pdc_th",)),
     )
-    assert "With an interval above zero, the constant is beaten by trees on hand geometry on PDC thumb." in said[1]
+    assert (
+        "With an interval above zero, the constant is beaten by trees on geometry and colour on PDC thumb." in said[1]
+    )
     assert said[1].endswith(
         "On PDC middle finger, electrodes thumb and electrodes middle finger nothing does: no evidence of generalisation."
     )
@@ -56,7 +68,8 @@ def test_without_novel_objects_nothing_is_said_of_generalisation() -> None:
 
 def test_a_method_that_does_better_than_the_default_is_named() -> None:
     assert (
-        "Better there: trees on hand geometry on PDC thumb with +0.800" in told(result(), result("trees", off=0.02))[0]
+        "Better there: trees on geometry and colour on PDC thumb with +0.800"
+        in told(result(), result("trees", off=0.02))[0]
     )
     assert "Better there" not in told(result(), result("trees", off=0.07))[0]
 
@@ -72,7 +85,7 @@ def test_splits_are_named_and_those_of_variants_on_one_target_have_no_sentence()
 
 def test_novel_objects_of_a_split_of_their_own_are_told_whatever_the_method() -> None:
     said = told(result(split="random"), result("trees", known=(), novel=NOVEL, off=0.11, split="leave-one-out"))
-    assert said[1].startswith("Novel objects (leave one out): trees on hand geometry has a skill of −0.100")
+    assert said[1].startswith("Novel objects (leave one out): trees on geometry and colour has a skill of −0.100")
     assert said[1].endswith("no evidence of generalisation.")
 
 

@@ -36,8 +36,31 @@ def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -
         "PointNet · head fc1",
         "PointNet · no transform",
         "PointNet · points 250",
-        "trees on hand geometry",
+        "trees on geometry and colour",
     ]
+
+
+def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_do_not() -> None:
+    kinds = ("strong", "trees", "patches")
+    found = methods(*(result(kind, inputs=inputs) for kind in kinds for inputs in ("rgbcont", "xyzcont", "xyz")))
+    assert [(one.name, len(one.runs)) for one in found] == [
+        ("patches", 1),
+        ("patches · without colour", 2),  # contacts are read whatever the inputs
+        ("strong", 1),
+        ("strong · without colour", 2),
+        ("trees on geometry", 2),
+        ("trees on geometry and colour", 1),
+    ]
+    assert [one.name for one in methods(result(inputs="xyz"))] == ["strong · without colour"]  # alone, too
+    assert [one.name for one in methods(result("pointnet", inputs="xyz"), result("pointnet"), result("pointnet"))] == [
+        "PointNet",
+        "PointNet · inputs xyz",
+    ]
+
+
+def test_marks_of_other_settings_come_behind_the_colour() -> None:
+    found = methods(result(leaf=0), *(result(inputs="xyz", leaf=leaf) for leaf in (0, 4)))
+    assert [one.name for one in found] == ["strong", "strong · without colour", "strong · without colour · leaf 4"]
 
 
 def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
@@ -56,17 +79,23 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
         )
     )
     assert [(one.split, one.simulated) for one in found] == [("random", False), ("folds", False), ("random", True)]
-    assert [one.name for one in found[0].methods] == ["strong", "trees on hand geometry"]
-    assert {one.name for group in found for one in group.methods} == {"strong", "PointNet", "trees on hand geometry"}
+    assert [one.name for one in found[0].methods] == ["strong", "trees on geometry and colour"]
+    assert {one.name for group in found for one in group.methods} == {
+        "strong",
+        "PointNet",
+        "trees on geometry and colour",
+    }
 
 
 def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
     (both,) = groups(methods(result(), result("trees", seed=0), result("trees", seed=1)))
     assert both.default.name == "strong"
     (others,) = groups(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
-    assert others.default.name == "trees on hand geometry"
+    assert others.default.name == "trees on geometry and colour"
 
 
 def test_one_method_an_architecture_is_told_in_detail() -> None:
     (group,) = groups(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
     assert [one.name for one in group.main] == ["PointNet", "strong"]
+    (both,) = groups(methods(result("trees", inputs="xyzcont"), result("trees")))
+    assert [one.name for one in both.main] == ["trees on geometry and colour"]

@@ -93,7 +93,7 @@ def test_the_best_method_errs_least_and_baselines_come_from_most_runs() -> None:
     )
     best = scores.best(methods, "pdc_th", True)
     source = scores.reference(methods, "pdc_th", "object_mean")
-    assert best is not None and best.name == "trees on hand geometry"
+    assert best is not None and best.name == "trees on geometry and colour"
     assert source is not None and len(source.runs) == 2
     assert scores.best(methods, "pdc_th", False) is None
     assert scores.baselines(methods) == ["constant", "object_mean"]

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tacpipe import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.report.touch.predictions import columns
 from tests.report.stream_shard import StreamShard
 from tests.stages.learning_fakes import FakeDataset
 
@@ -60,12 +59,10 @@ def result(
     targets: Sequence[str] = biotac_sp.TARGETS,
     per_object: int = PER_OBJECT,
     baselines: Mapping[str, float] | None = None,
-    last: float | None = None,
     split: str = "random",
     epochs: int = 0,
     train: int = 100,
     first: int = 0,
-    seconds: float | None = None,
     simulated: bool = False,
     metrics: Mapping[str, Any] | None = None,
     seed: int = 0,
@@ -85,8 +82,6 @@ def result(
     true = shares["true"]
     shares["constant"] = {target: np.full_like(one, 0.5) for target, one in true.items()}
     said = {"model": offs, **{name: np.full(rows, value) for name, value in (baselines or {}).items()}}
-    if last is not None:
-        said["last_epoch"] = np.full(rows, last)
     shares |= {name: {one: values + (side * by)[:, None] for one, values in true.items()} for name, by in said.items()}
     grasps = {
         "recording": [*(f"{name}-{index:03d}" for name, index in zip(objects, number, strict=True)), "bleach-seen"],
@@ -115,18 +110,18 @@ def result(
         "metrics.json": json.dumps({"model": {"n": rows}, **(metrics or {})}).encode(),
     }
     if epochs:
-        lines = [json.dumps(line) for target in targets for line in history(target, epochs, seconds, seed)]
+        lines = [json.dumps(line) for target in targets for line in history(target, epochs, seed)]
         files["history.jsonl"] = "\n".join([*lines, ""]).encode()
     return FakeDataset({"predictions": shard}, files, MANIFEST)
 
 
-def history(target: str, epochs: int, seconds: float | None = None, seed: int = 0) -> list[dict[str, Any]]:
+def history(target: str, epochs: int, seed: int) -> list[dict[str, Any]]:
     """Return lines of ``history.jsonl`` of one network."""
     lines = []
     for epoch in range(1, epochs + 1):
         loss = 0.05 + 0.1 * float(np.exp(-4 * epoch / epochs)) + 0.005 * np.sin(epoch + seed)
-        line = {"epoch": epoch, "train_loss": loss, "val_loss": 1.2 * loss, "best": epoch == epochs, "target": target}
-        lines.append(line if seconds is None else {**line, "seconds": seconds})
+        told = {"epoch": epoch, "train_loss": loss, "val_loss": 1.2 * loss, "best": epoch == epochs, "target": target}
+        lines.append(told)
     return lines
 
 
@@ -149,5 +144,6 @@ def _table(touch: Mapping[str, NDArray[Any]]) -> pa.Table:
     found: dict[str, Any] = {}
     for target, shares in touch.items():
         counts = np.vstack([biotac_sp.counts(target, shares), np.full((1, shares.shape[1]), 1e6)])
-        found |= {name: counts[:, index].astype(np.float32) for index, name in enumerate(columns(target))}
+        names = biotac_sp.value_columns(target)
+        found |= {name: counts[:, index].astype(np.float32) for index, name in enumerate(names)}
     return pa.table(found)

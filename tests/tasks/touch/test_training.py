@@ -263,8 +263,8 @@ def test_networks_learn_what_they_are_shown_given_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"architecture": "forest"}, "There is no architecture forest; there are strong, trees"),
-        ({"select": "first"}, "select is 'first'; it must be best or last"),
+        ({"architecture": "forest"}, "architecture is 'forest'; it must be one of strong, trees"),
+        ({"select": "first"}, "select is 'first'; it must be one of best, last"),
         ({"targets": "pdc_th,thumb"}, "targets is 'pdc_th,thumb'; it must name some of pdc_th"),
         ({"targets": " , "}, "it must name some of"),
         ({"inputs": "grey"}, "inputs is 'grey'; it must be one of xyz, rgb"),
@@ -291,7 +291,7 @@ def test_params_that_cannot_be_are_refused_before_anything_is_read(
     ("changed", "sentence"),
     [
         ({**POINTNET, "head": "fc9"}, "head is 'fc9'; it must be one of fc1, fc2"),
-        ({**PATCHES, "backbone": "knots"}, "backbone is 'knots'; it must be points or edges"),
+        ({**PATCHES, "backbone": "knots"}, "backbone is 'knots'; it must be one of points, edges"),
         ({**PATCHES, "loss": "cubed"}, "loss is 'cubed'"),
         ({**PATCHES, "batch": 1}, "batch is 1; it must be 2 or more"),
         ({**PATCHES, "radius_mm": 0.0}, "radius_mm is 0; it must be above 0"),

@@ -1,0 +1,7 @@
+"""What a result of the task ``touch`` calls its parts: who judges writes them, and a report reads them without torch."""
+
+from __future__ import annotations
+
+PREDICTIONS = "predictions"  # the recording; each name below is a stream of it, with the same grasps as rows
+GRASPS, TRUE, MODEL = "grasps", "true", "model"
+CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # the baselines
