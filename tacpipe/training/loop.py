@@ -3,7 +3,7 @@
 What is learned comes as `Work`: its batches, its loss, and what is watched after each epoch. Batches are rows of tensors
 picked by index, so no loader stands between the data and the step. All randomness (first weights, dropout, shuffles)
 comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and resumed
-gives the same bits as one that was not.
+gives the same bits as one that was not, on a CPU; a GPU adds in another order each time.
 """
 
 from __future__ import annotations
