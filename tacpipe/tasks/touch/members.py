@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,7 +19,7 @@ from tacpipe.models.pointnet import HEADS, PointNet
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Inputs, Sources
 from tacpipe.tasks.touch.learning import Drawn, foretold
-from tacpipe.tasks.touch.patches import Patches, PatchSources
+from tacpipe.tasks.touch.patches import Patches, PatchSources, require_colours
 from tacpipe.training.scaling import Affine
 
 Floats = NDArray[np.float64]
@@ -50,15 +50,12 @@ class ForestMember:
     def foretell(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts."""
         if self.coloured:
-            require_colours(grasps)
+            require_colours(grasps.names, grasps.clouds)
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
             raise TacpipeError("The model was trained on other features than this version tells. Train it again.")
-        told: dict[str, list[Floats]] = {target: [] for target in self.targets}
-        for group, forest in self.forests:
-            for target, values in parted(forest.predict(rows), group).items():
-                told[target].append(values)
-        return np.concatenate([np.mean(told[target], axis=0) for target in self.targets], axis=1)
+        told = averaged((group, forest.predict(rows)) for group, forest in self.forests)
+        return np.concatenate([told[target] for target in self.targets], axis=1)
 
 
 @dataclass(frozen=True)
@@ -80,6 +77,15 @@ def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
     """Return values side by side (grasp, value) by target."""
     ends = np.cumsum([biotac_sp.width(target) for target in targets])[:-1]
     return dict(zip(targets, np.split(values, ends, axis=1), strict=True))
+
+
+def averaged(several: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
+    """Return by target (grasp, value) the mean of what several tell, each its targets' values side by side."""
+    told: dict[str, list[Floats]] = {}
+    for targets, values in several:
+        for target, own in parted(values, targets).items():
+            told.setdefault(target, []).append(own)
+    return {target: np.mean(values, axis=0) for target, values in told.items()}
 
 
 def units(values: Floats, targets: Sequence[str]) -> Floats:
@@ -125,12 +131,3 @@ def sources(params: Params, grasps: Grasps) -> Drawn:
     if params["architecture"] == "pointnet":
         return Sources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
     return PatchSources(patches(params), grasps.names, grasps.clouds, grasps.grasps)
-
-
-def require_colours(grasps: Grasps) -> None:
-    """Raise `TacpipeError` where a cloud has no colours."""
-    for name, cloud in zip(grasps.names, grasps.clouds, strict=True):
-        if cloud.colours is None:
-            raise TacpipeError(
-                f"{name} has a cloud without colours, and the model reads colours. Train with inputs of xyz."
-            )

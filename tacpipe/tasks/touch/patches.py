@@ -57,11 +57,9 @@ class PatchSources:
         self.patches = patches
         self.clouds: list[NDArray[np.float32]] = []  # of (point, channel)
         self.near: list[list[NDArray[np.intp]]] = []  # of points about g1 and about g2
-        for name, cloud, grasp in zip(names, clouds, grasps, strict=True):
-            if patches.coloured and cloud.colours is None:
-                raise TacpipeError(
-                    f"{name} has a cloud without colours, and the model reads colours. Train with inputs of xyz."
-                )
+        if patches.coloured:
+            require_colours(names, clouds)
+        for cloud, grasp in zip(clouds, grasps, strict=True):
             points = local_points(cloud.points_m, grasp)
             self.near.append([_about(points, sign * grasp.opening_m / 2, patches.radius_m) for sign in (-1, 1)])
             parts = [points / UNIT_M]
@@ -87,6 +85,15 @@ class PatchSources:
             for place, among in enumerate((*self.near[index], np.arange(len(cloud)))):
                 found[row, place] = cloud[among[_chosen(len(among), count, rng)]]
         return found, self.numbers[[index for index, _ in wanted]]
+
+
+def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
+    """Raise `TacpipeError` naming the first whose cloud has no colours."""
+    for name, cloud in zip(names, clouds, strict=True):
+        if cloud.colours is None:
+            raise TacpipeError(
+                f"{name} has a cloud without colours, and the model reads colours. Train with inputs of xyz."
+            )
 
 
 def _about(points: NDArray[np.float64], place_m: float, radius_m: float) -> NDArray[np.intp]:

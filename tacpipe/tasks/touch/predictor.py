@@ -79,11 +79,8 @@ class Predictor:
 
         Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
         """
-        told: dict[str, list[Floats]] = {target: [] for target in self.targets}
-        for member in self.members:
-            for target, values in members.parted(member.foretell(grasps), member.targets).items():
-                told[target].append(values)
-        return {target: np.mean(told[target], axis=0) for target in self.targets}
+        told = members.averaged((member.targets, member.foretell(grasps)) for member in self.members)
+        return {target: told[target] for target in self.targets}
 
     def predict(self, cloud: Cloud, grasp: Grasp) -> Touch:
         """Return the touch of one grasp.

@@ -29,6 +29,7 @@ from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
 from tacpipe.tasks.touch.learning import LOSSES, Drawn, Felt, TouchWork
+from tacpipe.tasks.touch.patches import require_colours
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
 from tacpipe.training import loop
 from tacpipe.training.scaling import Affine
@@ -148,7 +149,7 @@ def _grow(config: Config, tensors: dict[str, Tensor], known: Grasps, targets: Se
     params = config["params"]
     coloured = members.coloured(params)
     if coloured:
-        members.require_colours(known)
+        require_colours(known.names, known.clouds)
     rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params["place"])
     groups = [[target] for target in targets]
     if params["architecture"] == "strong" and len(targets) > 1:
