@@ -33,3 +33,9 @@ class LockedError(TacpipeError):
     """Another process holds what this one waited for."""
 
     exit_code = LOCKED
+
+
+class DeviceError(TacpipeError):
+    """A device is missing, busy, silent, lost, or speaks another protocol."""
+
+    exit_code = DEVICE

@@ -61,14 +61,35 @@ def check(stage: Stage, key: str, value: Any, where: str) -> Any:
 
     Raises `UsageError` otherwise.
     """
-    known = fields(stage)
+    return _checked(fields(stage), key, value, where, "param")
+
+
+def _checked(known: Mapping[str, Any], key: str, value: Any, where: str, noun: str) -> Any:
     if key not in known:
-        raise UsageError(f"{where}: there is no param {key}; there are {', '.join(known) or 'none'}.")
+        raise UsageError(f"{where}: there is no {noun} {key}; there are {', '.join(known) or 'none'}.")
     wanted = known[key]
-    fitted = _fit(value, wanted)
+    fitted = _fit(value, wanted, f"{where}, {key}")
     if fitted is _NO:
         raise UsageError(f"{where}: {key} is {value!r}, which is no {_name(wanted)}.")
     return fitted
+
+
+def filled(kind: type[Any], values: Mapping[str, Any], where: str, noun: str = "param") -> Any:
+    """Return the dataclass ``kind`` with ``values`` over its defaults, an int as a float where one is wanted.
+
+    Raises `UsageError` for an unknown name, a value of the wrong type, and one without a default that is missing.
+    """
+    hints = typing.get_type_hints(kind)
+    known = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+    fitting = {key: _checked(known, key, value, where, noun) for key, value in values.items()}
+    missing = [
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.default is field.default_factory is dataclasses.MISSING and field.name not in fitting
+    ]
+    if missing:
+        raise UsageError(f"{where}: {noun} {' and '.join(missing)} must be given.")
+    return kind(**fitting)
 
 
 def to_json(params: Any) -> dict[str, Any]:
@@ -97,17 +118,22 @@ def comments(stage: Stage) -> dict[str, str]:
 _NO = object()
 
 
-def _fit(value: Any, wanted: Any) -> Any:
+def _fit(value: Any, wanted: Any, where: str) -> Any:
+    """Return ``value`` as what is wanted, or `_NO`; a mapping fills a dataclass, which raises as `filled` does."""
     origin = get_origin(wanted)
     if origin in (typing.Union, types.UnionType):
-        return next((fit for kind in get_args(wanted) if (fit := _fit(value, kind)) is not _NO), _NO)
+        return next((fit for kind in get_args(wanted) if (fit := _fit(value, kind, where)) is not _NO), _NO)
     if origin is typing.Literal:
         return value if value in get_args(wanted) else _NO
     if origin is tuple:
         if not isinstance(value, list | tuple):
             return _NO
-        fits = [_fit(item, get_args(wanted)[0]) for item in value]
-        return _NO if _NO in fits else tuple(fits)
+        fits = [_fit(item, get_args(wanted)[0], f"{where} {row}") for row, item in enumerate(value, start=1)]
+        return _NO if any(fit is _NO for fit in fits) else tuple(fits)
+    if dataclasses.is_dataclass(wanted):
+        if isinstance(value, Mapping):
+            return filled(typing.cast(type, wanted), value, where, "key")
+        return value if isinstance(value, typing.cast(type, wanted)) else _NO
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if wanted is type(None):
@@ -119,6 +145,13 @@ def _fit(value: Any, wanted: Any) -> Any:
 def _name(wanted: Any) -> str:
     if get_origin(wanted) is typing.Literal:
         return "one of " + ", ".join(map(str, get_args(wanted)))
+    kinds = [kind for kind in get_args(wanted) if kind is not type(None)]
+    if get_origin(wanted) in (typing.Union, types.UnionType) and len(kinds) == 1:
+        return _name(kinds[0])
+    if get_origin(wanted) is tuple:
+        return f"list, each {_name(kinds[0])}"
+    if dataclasses.is_dataclass(wanted):
+        return f"table of {', '.join(field.name for field in dataclasses.fields(wanted))}"
     names = {float: "number", int: "whole number", str: "text", bool: "true or false"}
     return names.get(wanted, str(wanted))
 

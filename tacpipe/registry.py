@@ -1,4 +1,4 @@
-"""Names of stages, formats and tasks, found through entry points and loaded when asked for."""
+"""Names of stages, formats, tasks and sensors, found through entry points and loaded when asked for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.stage import Stage
 
-STAGES, FORMATS, TASKS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks"
+STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
 
 
 @functools.cache
@@ -24,7 +24,7 @@ def entry_points() -> dict[str, dict[str, str]]:
     Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
     takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
     """
-    found: dict[str, dict[str, str]] = {STAGES: {}, FORMATS: {}, TASKS: {}}
+    found: dict[str, dict[str, str]] = {STAGES: {}, FORMATS: {}, TASKS: {}, SENSORS: {}}
     for folder in dict.fromkeys(sys.path):
         for file in _entry_point_files(folder):
             try:
@@ -80,6 +80,22 @@ def load_task(name: str) -> Any:
     target = entry_points()[TASKS].get(name)
     if target is None:
         raise UsageError(f"There is no task {name}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
+    return _import(name, target)
+
+
+def sensors() -> dict[str, str]:
+    """Return the target of every sensor by name."""
+    return dict(sorted(entry_points()[SENSORS].items()))
+
+
+def load_sensor(name: str) -> Any:
+    """Return the class of the sensor of this name, a `tacpipe.sensors.sensor.Sensor`.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = sensors().get(name)
+    if target is None:
+        raise UsageError(f"There is no sensor {name}; there are {', '.join(sensors())}.")
     return _import(name, target)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from tacpipe import cli, registry
 from tacpipe.manifest import Manifest, parse
@@ -30,6 +31,9 @@ halves = toy_stages:halves
 [tacpipe.formats]
 numbers = toy_stages:read
 """
+
+settings.register_profile("tacpipe", deadline=None)  # nothing is timed in tests
+settings.load_profile("tacpipe")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: programs that the tests interrupt inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -98,3 +98,37 @@ def test_params_come_back_from_what_stands_in_a_key() -> None:
 
 def test_the_comment_behind_a_field_is_its_help() -> None:
     assert params_of.comments(STAGE)["rate_hz"] == "of the grid"
+
+
+@dataclass(frozen=True)
+class Part:
+    name: str  # of the part
+    size: float = 1.0  # in metres
+
+
+@dataclass(frozen=True)
+class Whole:
+    parts: tuple[Part, ...]  # in order
+    lid: Part | None = None  # on top
+
+
+def test_tables_fill_the_dataclasses_that_stand_for_them() -> None:
+    filled = params_of.filled(Whole, {"parts": [{"name": "a"}, {"name": "b", "size": 2}], "lid": {"name": "c"}}, "box")
+    assert filled == Whole((Part("a"), Part("b", 2.0)), Part("c"))
+    assert isinstance(filled.parts[1].size, float)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"parts": [{"name": "a"}, {"nam": "b"}]}, r"box, parts 2: there is no key nam; there are name, size\."),
+        ({"parts": [{"name": 1}]}, r"box, parts 1: name is 1, which is no text\."),
+        ({"parts": [{"size": 1}]}, r"box, parts 1: key name must be given\."),
+        ({"parts": ["a"]}, r"box: parts is \['a'\], which is no list, each table of name, size\."),
+        ({"parts": [], "lid": {"size": "big"}}, r"box, lid: size is 'big', which is no number\."),
+        ({"parts": [], "lid": 3}, r"box: lid is 3, which is no table of name, size\."),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_told_with_the_table(values: dict[str, object], sentence: str) -> None:
+    with pytest.raises(UsageError, match=sentence):
+        params_of.filled(Whole, values, "box")

@@ -45,7 +45,21 @@ def read(path: Path) -> Cloud:
     Raises `TacpipeError`, naming the file, where it is no PCD 0.7, has no x, y and z of floats or no points, is shorter
     than its header says or longer by more than padding, is compressed, or holds points that are not finite.
     """
-    content = _content(path)
+    xyz, colours = parsed(path, _content(path))
+    finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
+    if not finite.all():
+        raise TacpipeError(
+            f"{path} holds {np.count_nonzero(~finite)} of {len(finite)} points that are not finite (NaN), the first "
+            f"being point {int(np.argmin(finite))}; each must have been seen. Remove such points and save it again."
+        )
+    return Cloud(xyz, colours)
+
+
+def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
+
+    Raises `TacpipeError`, naming the file, as `read` does but for points that are not finite.
+    """
     header = read_header(path, content)
     if header.data == "binary_compressed":
         raise TacpipeError(
@@ -56,15 +70,9 @@ def read(path: Path) -> Cloud:
         raise TacpipeError(f"{path} holds no point (POINTS 0). Copy the file again or leave its recording out.")
     points = _of_bytes(path, content, header) if header.data == "binary" else _of_text(path, content, header)
     xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)  # (point, xyz)
-    finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
-    if not finite.all():
-        raise TacpipeError(
-            f"{path} holds {np.count_nonzero(~finite)} of {len(finite)} points that are not finite (NaN), the first "
-            f"being point {int(np.argmin(finite))}; each must have been seen. Remove such points and save it again."
-        )
     if header.colour is None:
-        return Cloud(xyz)
-    return Cloud(xyz, unpacked(np.ascontiguousarray(points[header.colour]).view("<u4")))
+        return xyz, None
+    return xyz, unpacked(np.ascontiguousarray(points[header.colour]).view("<u4"))
 
 
 def read_header(path: Path, content: bytes | None = None) -> Header:

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tacpipe.signals import rotations
 from tacpipe.signals.rotations import continuous, quaternions_of
 
 
@@ -28,3 +29,34 @@ def test_signs_follow_the_row_before_and_nan_stays_where_it_is() -> None:
     assert found[0].tolist() == found[1].tolist() == [0.0, 0.0, 0.0, -1.0]
     assert np.isnan(found[2]).all()
     np.testing.assert_allclose(np.linalg.norm(found[3]), 1.0)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_vectors_angles_and_matrices_of_a_quaternion_are_those_of_scipy(seed: int) -> None:
+    turned = Rotation.from_quat(np.random.default_rng(seed).normal(size=(20, 4)))
+    unit = turned.as_quat()
+
+    np.testing.assert_allclose(rotations.matrices_of(unit), turned.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotations.vectors_of(unit), turned.as_rotvec(), atol=1e-9)
+    np.testing.assert_allclose(rotations.angles_of(unit), turned.as_euler("ZYX"), atol=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_vector_or_three_angles_give_the_quaternion_that_scipy_gives(seed: int) -> None:
+    values = np.random.default_rng(seed).uniform(-3, 3, size=(20, 3))
+    values[0] = 0
+
+    for found, expected in (
+        (rotations.quaternions_of_vectors(values), Rotation.from_rotvec(values)),
+        (rotations.quaternions_of_angles(values), Rotation.from_euler("ZYX", values)),
+    ):
+        np.testing.assert_allclose(found * np.sign(found[:, 3:] + 1e-300), expected.as_quat(canonical=True), atol=1e-12)
+
+
+def test_angles_with_the_second_at_a_right_angle_still_give_the_rotation() -> None:
+    told = np.radians([[30.0, 90.0, 0.0], [30.0, -90.0, 20.0], [170.0, 90.0, -60.0]])
+    turned = rotations.quaternions_of_angles(told)
+
+    again = rotations.quaternions_of_angles(rotations.angles_of(turned))
+
+    np.testing.assert_allclose(np.abs((again * turned).sum(axis=1)), 1, atol=1e-12)

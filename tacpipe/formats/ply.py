@@ -1,0 +1,138 @@
+"""Clouds of points as PLY files, of bytes that are at hand: what a depth camera's program saves while it is recorded.
+
+Binary of either order of bytes, or text. The vertices must have x, y and z; red, green and blue are colours, other
+properties are skipped. Source: Greg Turk, "The PLY Polygon File Format" (1994).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.cloud import COLOUR
+from tacpipe.errors import TacpipeError
+
+LETTERS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+POSITION = ("x", "y", "z")
+LONGEST_HEADER = 65_536  # bytes
+
+
+@dataclass(frozen=True)
+class _Header:
+    form: str
+    vertex: np.dtype[np.void]
+    points: int
+    length: int  # bytes, the line end behind end_header included
+    alone: bool  # nothing but vertices follows
+
+
+def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
+
+    Raises `TacpipeError`, naming the file, where it is no PLY file, its vertices are not its first element or have no x, y
+    and z, colours are no bytes, or points are missing.
+    """
+    header = _header(path, content)
+    body = content[header.length :]
+    if header.form == "ascii":
+        points = _of_text(path, body, header)
+    else:
+        _require(path, header, len(body), header.vertex.itemsize, "bytes")
+        points = np.frombuffer(body, header.vertex, header.points)
+    xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)
+    if not set(COLOUR) <= set(header.vertex.names or ()):
+        return xyz, None
+    return xyz, np.column_stack([points[name] for name in COLOUR])
+
+
+def packed(points_m: NDArray[np.float32], colours: NDArray[np.uint8] | None) -> bytes:
+    """Return the binary PLY file of points (point, xyz) and colours (point, rgb)."""
+    vertex = np.dtype([(axis, "<f4") for axis in POSITION] + [(name, "u1") for name in COLOUR if colours is not None])
+    rows = np.zeros(len(points_m), vertex)
+    for axis, column in zip(POSITION, points_m.T, strict=True):
+        rows[axis] = column
+    for name, column in zip(COLOUR, () if colours is None else colours.T, strict=colours is not None):
+        rows[name] = column
+    kinds = [f"property {'float' if name in POSITION else 'uchar'} {name}" for name in vertex.names or ()]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *kinds, "end_header", ""]
+    return "\n".join(lines).encode() + rows.tobytes()
+
+
+def _header(path: Path, content: bytes) -> _Header:
+    end = content.find(b"end_header", 0, LONGEST_HEADER)
+    stop = content.find(b"\n", end) + 1
+    lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
+    if end < 0 or not stop or lines[0] != ["ply"]:
+        raise TacpipeError(f"{path} is no PLY file or was cut off: it must begin with ply and end its header.")
+    form = next((words[1] for words in lines if words[0] == "format" and len(words) == 3), "")
+    elements = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
+    first = lines[elements[0]] if elements else []
+    if form not in ORDERS or first[1:2] != ["vertex"] or len(first) != 3 or not first[2].isdecimal():
+        raise TacpipeError(
+            f"{path} has the format {form!r} and the first element {' '.join(first[1:])!r}; a cloud is of the format "
+            f"{', '.join(ORDERS)}, and its vertices come first."
+        )
+    rows = lines[elements[0] + 1 : elements[1] if len(elements) > 1 else None]
+    return _Header(
+        form,
+        _vertex(path, [row for row in rows if row[:1] == ["property"]], form),
+        int(first[2]),
+        stop,
+        len(elements) == 1,
+    )
+
+
+def _vertex(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.void]:
+    kinds: dict[str, str] = {}
+    for words in rows:
+        if len(words) != 3 or words[1] not in LETTERS or words[2] in kinds:
+            raise TacpipeError(
+                f"{path} has the vertices' {' '.join(words)!r}; it must be a type, one number, and a name."
+            )
+        kinds[words[2]] = LETTERS[words[1]]
+    floats = all(kinds.get(axis, "")[:1] == "f" for axis in POSITION)
+    coloured = all(kinds.get(name, "u1") == "u1" for name in COLOUR)
+    if not floats or not coloured:
+        raise TacpipeError(
+            f"{path} has vertices of {', '.join(kinds) or 'nothing'}; they must have x, y and z of floats, and colours, "
+            f"where there are any, of uchar."
+        )
+    return np.dtype([(name, ORDERS[form] + letters) for name, letters in kinds.items()])
+
+
+def _of_text(path: Path, body: bytes, header: _Header) -> NDArray[np.void]:
+    names = header.vertex.names or ()
+    words = body.split()
+    _require(path, header, len(words), len(names), "numbers")
+    words = words[: header.points * len(names)]
+    found: NDArray[np.void] = np.zeros(header.points, header.vertex)
+    try:
+        numbers: NDArray[Any] = np.array(words, dtype="S").astype(np.float64).reshape(header.points, len(names))
+    except ValueError as error:
+        raise TacpipeError(f"{path} has a word among its points that is no number ({error}). Copy it again.") from error
+    for name, column in zip(names, numbers.T, strict=True):
+        found[name] = column
+    return found
+
+
+def _require(path: Path, header: _Header, held: int, width: int, unit: str) -> None:
+    """Raise `TacpipeError` where too little follows the header for its points, or too much though nothing else may."""
+    needed = header.points * width
+    if held < needed or (header.alone and held > needed):
+        raise TacpipeError(
+            f"{path} tells of {header.points} points, which are {needed} {unit}, and {held} follow. Copy it again."
+        )

@@ -1,0 +1,110 @@
+"""AnySkin and ReSkin: magnetometers below a magnetic skin, behind a microcontroller.
+
+The board streams from power-up and takes no commands. Binary frames are four little-endian float32 a magnetometer,
+temperature in degrees and flux along x, y and z in microteslas, and then ``0D 0A``; in the ASCII mode of the firmware the
+same numbers stand in a line of text. There is neither counter nor sum, and ``0D 0A`` may stand among the numbers.
+Source: the packages anyskin 1.0.0 and reskin_sensor 2.0.2 (MIT).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.sensors import options, taxels
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing, LineFramer
+from tacpipe.sensors.sensor import Frames, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+TAIL = b"\r\n"
+CHANNELS = 4  # a magnetometer
+# A Melexis MLX90393 gives 16 bits of at least 0.15 µT each (datasheet, table of sensitivities); numbers out of this range
+# come from bytes that are no frame.
+LEAST, MOST = 2.0**-20, 2.0**20
+
+
+@dataclass(frozen=True)
+class AnySkin(Sensor):
+    """An AnySkin or a ReSkin."""
+
+    summary: ClassVar[str] = "AnySkin and ReSkin: magnetic skins, binary or ASCII, of any number of magnetometers."
+
+    magnetometers: int = 5  # on the board
+    mode: Literal["binary", "ascii"] = "binary"  # of the firmware: binary is what the vendor calls burst
+    rate_hz: float = 100.0  # frames a second
+    baud: int = 115_200  # of a port over USB, where any will do
+
+    def __post_init__(self) -> None:
+        options.within("anyskin", "magnetometers", self.magnetometers, 1, 200)
+        options.known("anyskin", "mode", self.mode, ("binary", "ascii"))
+        options.positive("anyskin", rate_hz=self.rate_hz, baud=self.baud)
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``taxel01_temperature``, ``taxel01_x``, … of each magnetometer: float32, degrees and microteslas."""
+        import pyarrow as pa
+
+        found = []
+        flux = taxels.fields(self.magnetometers, pa.float32(), "uT", axes="xyz")
+        for number, name in enumerate(taxels.numbered("taxel", self.magnetometers), start=1):
+            metadata = {"unit": "degC", "quantity": "temperature", "taxel": str(number)}
+            found.append(pa.field(f"{name}_temperature", pa.float32(), metadata=metadata))
+            found += flux[3 * number - 3 : 3 * number]
+        return found
+
+    def framer(self) -> Framer:
+        """Return a framer of frames of one size with their end, or of lines with as many numbers."""
+        if self.mode == "ascii":
+            return LineFramer(self._is_line)
+        size = 4 * CHANNELS * self.magnetometers + len(TAIL)
+        return ByteFramer(Framing(tail=TAIL, size=size, check=_can_be_read, lock=3, weak=True))
+
+    def _is_line(self, line: bytes) -> bool:
+        try:
+            numbers = list(map(float, line.split()))
+        except ValueError:
+            return False
+        if len(numbers) != CHANNELS * self.magnetometers:
+            return False
+        return isfinite(sum(numbers)) and min(numbers) >= -MOST and max(numbers) <= MOST
+
+    def decode(self, frames: Frames) -> Samples:
+        """Return temperature and flux (frame, channel)."""
+        if self.mode == "ascii":
+            return Samples((_numbers(b" ".join(frames)).reshape(-1, CHANNELS * self.magnetometers),))
+        return Samples((_floats(frames),))
+
+    def encode(self, samples: Samples) -> Frames:
+        """Return the frames of these samples; lines of text with their ends."""
+        (numbers,) = samples.values
+        if self.mode == "ascii":
+            return ["\t".join(map(str, row)).encode() + TAIL for row in numbers]
+        tails = np.broadcast_to(np.frombuffer(TAIL, np.uint8), (len(numbers), len(TAIL)))
+        return np.hstack([np.ascontiguousarray(numbers, dtype="<f4").view(np.uint8), tails])
+
+
+def _floats(frames: Bytes) -> NDArray[np.float32]:
+    floats: NDArray[np.float32] = (
+        np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
+    )
+    return floats
+
+
+def _numbers(text: bytes) -> NDArray[np.float32]:
+    return np.array(list(map(float, text.split())), dtype=np.float64).astype(np.float32)
+
+
+def _can_be_read(frames: Bytes) -> NDArray[np.bool_]:
+    """Return which frames (frame, byte) hold numbers that the chip can give."""
+    return np.asarray(_plausible(_floats(frames)).all(axis=1))
+
+
+def _plausible(numbers: NDArray[np.float32]) -> NDArray[np.bool_]:
+    size = np.abs(numbers)
+    possible: NDArray[np.bool_] = ((size >= LEAST) & (size <= MOST)) | (size == 0)
+    return possible

@@ -1,0 +1,130 @@
+"""SynTouch BioTac behind a microcontroller that reads its SPI bus and passes frames on over serial.
+
+The published part is the word and the frame. A word is two bytes, each of 7 bits and, lowest, the bit that makes their
+parity odd; the reading of 12 bits is ``(b0 >> 1) << 5 | b1 >> 3``. A frame is 44 words at 4400 a second: E1, PAC, E2,
+PAC, … E19, PAC, PDC, PAC, TAC, PAC, TDC, PAC. So everything but PAC comes at 100 Hz, PAC at 2200 Hz, 22 of them in a
+row.
+Source: SynTouch's C library for the Cheetah adapter (biotac.c, free for redistribution).
+
+The envelope is this project's, for there is no published bridge: ``42 54`` ("BT"), one byte that counts the fingers, a
+counter of frames (uint16, little-endian), then the 44 words, of each word one finger after another, and the 16-bit
+little-endian sum of all bytes before. A bridge that sends this can be read; firmware for one is a loop of SPI transfers
+and one write.
+
+One row is one frame. Its time is that of the frame; each field says with ``offset_ns`` how much later its word was
+sampled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.formats.channels import ELECTRODES, VIBRATIONS, biotac_fields
+from tacpipe.sensors.checks import sum16
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MARKER = b"BT"
+HEADER = 5  # marker, fingers, counter
+WORDS = 2 * VIBRATIONS  # of a frame: every second is PAC
+WORD_HZ = 4400
+HIGHEST = 0x0FFF  # of 12 bits
+MOST_FINGERS = 5  # on one adapter
+SLOTS = (  # word of the frame that each of `biotac_fields` is: tdc, tac, pdc, pac…, electrodes
+    *(2 * VIBRATIONS - 2, 2 * VIBRATIONS - 4, 2 * VIBRATIONS - 6),
+    *range(1, WORDS, 2),
+    *range(0, 2 * ELECTRODES, 2),
+)
+
+
+@dataclass(frozen=True)
+class BioTac(Sensor):
+    """One or more BioTacs behind a serial bridge."""
+
+    summary: ClassVar[str] = "SynTouch BioTac fingertips behind a serial bridge that passes on their SPI frames."
+    counter: ClassVar[int | None] = 1 << 16
+
+    fingers: int = 1  # BioTacs on the bridge, 1 to 5
+    rate_hz: float = 100.0  # frames a second: 4400 words by 44
+    baud: int = 921600  # of the bridge
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.fingers <= MOST_FINGERS:
+            raise UsageError(f"biotac: fingers is {self.fingers}; a bridge has 1 to {MOST_FINGERS}.")
+        if self.rate_hz != WORD_HZ / WORDS:
+            raise UsageError(f"biotac: rate_hz is {self.rate_hz:g}; 44 words at 4400 a second make 100 frames.")
+
+    @property
+    def size(self) -> int:
+        """How many bytes a frame has, envelope included."""
+        return HEADER + 2 * WORDS * self.fingers + 2
+
+    def fields(self) -> list[pa.Field]:
+        """Return the 44 fields of `biotac_fields` for each finger, with ``offset_ns`` from the frame's first word.
+
+        Names begin with ``finger1_``, … where there are more fingers than one.
+        """
+        fields = []
+        for finger in range(1, self.fingers + 1):
+            for field, slot in zip(biotac_fields(), SLOTS, strict=True):
+                offset = {b"offset_ns": str(round(slot * 1e9 / WORD_HZ)).encode()}
+                named = field.with_metadata({**field.metadata, **offset})
+                fields.append(named if self.fingers == 1 else named.with_name(f"finger{finger}_{field.name}"))
+        return fields
+
+    def framer(self) -> Framer:
+        """Return a framer of frames with their sum, and in which every byte has odd parity."""
+        marker = MARKER + bytes([self.fingers])
+        return ByteFramer(Framing(marker=marker, size=self.size, check=_is_whole))
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the readings (frame, 44 a finger), 12 bits each, and the bridge's counter."""
+        pairs = frames[:, HEADER:-2].reshape(len(frames), WORDS, self.fingers, 2).astype(np.uint16)
+        words = (pairs[..., 0] >> 1) << 5 | pairs[..., 1] >> 3  # (frame, word, finger)
+        readings = words[:, list(SLOTS)].transpose(0, 2, 1).reshape(len(frames), -1)
+        seq = np.ascontiguousarray(frames[:, 3:5]).view("<u2")[:, 0]
+        return Samples((readings,), seq=seq.astype(np.int64))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these samples; a reading above 4095 saturates."""
+        (readings,) = samples.values
+        assert samples.seq is not None
+        words = np.empty((len(readings), WORDS, self.fingers), dtype=np.uint16)
+        clipped = np.minimum(readings, HIGHEST)
+        words[:, list(SLOTS)] = clipped.reshape(len(readings), self.fingers, len(SLOTS)).transpose(0, 2, 1)
+        pairs = np.stack([with_parity(words >> 5), with_parity((words & 0x1F) << 2)], axis=-1)  # (…, finger, byte)
+        head = np.broadcast_to(np.frombuffer(MARKER + bytes([self.fingers]), np.uint8), (len(readings), 3))
+        counter = (samples.seq % (1 << 16)).astype("<u2")[:, None].view(np.uint8)
+        body = np.hstack([head, counter, pairs.reshape(len(readings), -1)])
+        return np.hstack([body, sum16(body).astype("<u2")[:, None].view(np.uint8)])
+
+
+def with_parity(bits: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+    """Return 7 bits each with the lowest bit that makes their parity odd, as bytes.
+
+    >>> [hex(byte) for byte in with_parity(np.array([0, 1, 0x7F], dtype=np.uint16))]
+    ['0x1', '0x2', '0xfe']
+    """
+    shifted = (bits << 1).astype(np.uint8)
+    return shifted | ~_is_odd(shifted)
+
+
+def _is_odd(data: Bytes) -> NDArray[np.bool_]:
+    folded = data ^ (data >> 4)
+    folded = folded ^ (folded >> 2)
+    odd: NDArray[np.bool_] = ((folded ^ (folded >> 1)) & 1).astype(bool)
+    return odd
+
+
+def _is_whole(frames: Bytes) -> NDArray[np.bool_]:
+    summed = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+    whole: NDArray[np.bool_] = summed & _is_odd(frames[:, HEADER:-2]).all(axis=1)
+    return whole

@@ -1,0 +1,235 @@
+"""Contactile PapillArray sensors behind their controller, which speaks PTS v2.0 over USB.
+
+Each sensor has pillars with force and displacement, and a force and torque as a whole; on demand the controller watches
+for slip. The frames' layout stands in `tacpipe.sensors.pts`. Commands are lines of text: ``f1000`` sets the rate, ``z``
+takes the load for zero, ``S`` and ``s`` switch the watch for slip on and off; none is answered.
+Source: the packages papillarray_hardware and contactile-papillarray-ros2, of which the facts were read.
+
+The controller keeps frames of its last session and sends them first; `FreshFramer` throws them away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.formats.channels import AXES
+from tacpipe.sensors import pts
+from tacpipe.sensors.checks import sum16
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.stale import FreshFramer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+RATES = (100, 250, 500, 1000)
+COUNTER = 1 << 32
+LARGEST = 8192  # bytes of a frame
+JUMP_S = 0.25  # a counter that leaps farther than this lasts is no loss: the session changed
+
+
+@dataclass(frozen=True)
+class Contactile(Sensor):
+    """PapillArray sensors behind one controller."""
+
+    summary: ClassVar[str] = "Contactile PapillArray sensors behind their controller (PTS v2.0)."
+    counter: ClassVar[int | None] = COUNTER
+
+    sensors: int = 2  # on the controller
+    pillars: int = 9  # of each sensor
+    slip: bool = False  # watch for slip: states and friction of pillars and sensors
+    rate_hz: float = 500.0  # 100, 250, 500 or 1000
+    baud: int = 115200  # over USB any
+
+    def __post_init__(self) -> None:
+        if self.rate_hz not in RATES:
+            raise UsageError(
+                f"contactile: rate_hz is {self.rate_hz:g}; it must be one of {', '.join(map(str, RATES))}."
+            )
+        if self.sensors < 1 or self.pillars < 1 or self.sensors * self.pillars > 200:
+            raise UsageError(
+                f"contactile: sensors is {self.sensors} and pillars {self.pillars}; "
+                f"both must be 1 or more, all pillars 200 at most."
+            )
+
+    def fields(self) -> list[pa.Field]:
+        """Return the fields block by block, sensor by sensor in each.
+
+        ``sensor1_pillar1_force_x_n`` and ``…_displacement_x_mm`` of all pillars, ``sensor1_force_x_n`` and
+        ``…_torque_x_n_mm``, float32. With slip also ``sensor1_pillar1_slip`` (int8), ``sensor1_pillar1_friction`` (float32),
+        ``sensor1_slip`` (uint8: 0 not watched, 1 watched, 2 and the reference pillar loaded), ``sensor1_friction`` and
+        ``sensor1_grip_force_n`` (float32).
+        """
+        import pyarrow as pa
+
+        sensors = [(f"sensor{s}", {"sensor": str(s)}) for s in range(1, self.sensors + 1)]
+        pillars = [
+            (f"{name}_pillar{pillar}", {**layout, "taxel": str(pillar)})
+            for name, layout in sensors
+            for pillar in range(1, self.pillars + 1)
+        ]
+        one, newton = {"unit": "1", "quantity": "status"}, {"unit": "N", "quantity": "force"}
+        friction = {"unit": "1", "quantity": "friction"}
+        fields = [
+            f for owner in pillars for f in (*_vector(*owner, "force", "N"), *_vector(*owner, "displacement", "mm"))
+        ]
+        fields += [f for owner in sensors for f in (*_vector(*owner, "force", "N"), *_vector(*owner, "torque", "N mm"))]
+        if self.slip:
+            fields += [pa.field(f"{name}_slip", pa.int8(), metadata=one | layout) for name, layout in pillars]
+            fields += [
+                pa.field(f"{name}_friction", pa.float32(), metadata=friction | layout) for name, layout in pillars
+            ]
+            fields += [pa.field(f"{name}_slip", pa.uint8(), metadata=one | layout) for name, layout in sensors]
+            for name, layout in sensors:
+                fields.append(pa.field(f"{name}_friction", pa.float32(), metadata=friction | layout))
+                fields.append(pa.field(f"{name}_grip_force_n", pa.float32(), metadata=newton | layout))
+        return fields
+
+    def framer(self) -> Framer:
+        """Return a framer of frames whose sum and tables hold, without those of the last session."""
+        framing = Framing(marker=pts.MARKER, tail=pts.TAIL, most=LARGEST, check=pts.are_whole)
+        return FreshFramer(ByteFramer(framing), self._counters, COUNTER, round(JUMP_S * self.rate_hz))
+
+    @staticmethod
+    def _counters(frames: Bytes) -> NDArray[np.int64]:
+        counters = np.zeros(len(frames), dtype=np.int64)
+        for rows, layout in pts.layouts(frames):
+            assert layout is not None  # the framer's check saw to it
+            counters[rows] = _gathered(frames[rows], layout.places(pts.HUB), 4).view("<u4")[:, 0, 0]
+        return counters
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the values of all blocks, with the hub's counter and time.
+
+        Frames without the blocks of slip, as they come before the watch began, are left out where ``slip`` is set.
+        Raises `DeviceError` where the controller has other sensors than the options say.
+        """
+        parts: list[tuple[NDArray[np.int64], tuple[NDArray[Any], ...], NDArray[np.uint8]]] = []
+        for rows, layout in pts.layouts(frames):
+            assert layout is not None  # the framer's check saw to it
+            if layout.counts != (self.pillars,) * self.sensors:
+                raise DeviceError(
+                    f"The controller has sensors of {', '.join(map(str, layout.counts)) or 'no'} pillars and the options "
+                    f"say {self.sensors} of {self.pillars}; set sensors and pillars."
+                )
+            if self.slip and not layout.slips:
+                continue
+            told = frames[rows]
+            parts.append((rows, self._values(told, layout), _gathered(told, layout.places(pts.HUB), 12)[:, 0]))
+        if not parts:
+            return self._nothing()
+        rows = np.concatenate([part[0] for part in parts])
+        order = np.argsort(rows, kind="stable")
+        hub = np.concatenate([part[2] for part in parts])[order]
+        values = tuple(np.concatenate(blocks)[order] for blocks in zip(*(part[1] for part in parts), strict=True))
+        seq = np.ascontiguousarray(hub[:, :4]).view("<u4")[:, 0].astype(np.int64)
+        t_us = np.ascontiguousarray(hub[:, 4:]).view("<u8")[:, 0].astype(np.int64)
+        return Samples(values, seq=seq, t_device_ns=t_us * 1000, rows=rows[order])
+
+    def _nothing(self) -> Samples:
+        none = np.zeros(0, dtype=np.int64)
+        layout = pts.parse(pts.template(self.sensors, self.pillars, slip=self.slip))
+        return Samples(
+            self._values(np.zeros((0, LARGEST), dtype=np.uint8), layout), seq=none, t_device_ns=none, rows=none
+        )
+
+    def _values(self, frames: Bytes, layout: pts.Layout) -> tuple[NDArray[Any], ...]:
+        forces = np.hstack(
+            [_floats(_gathered(frames, layout.places(block), 24)) for block in (pts.PILLARS, pts.SENSORS)]
+        )
+        if not self.slip:
+            return (forces,)
+        slips = _gathered(frames, layout.places(pts.PILLAR_SLIP), 5)
+        wholes = _gathered(frames, layout.places(pts.SENSOR_SLIP), 9)
+        return forces, slips[..., 0].view(np.int8), _floats(slips[..., 1:]), wholes[..., 0], _floats(wholes[..., 1:])
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these samples."""
+        assert samples.seq is not None and samples.t_device_ns is not None
+        frame = pts.template(self.sensors, self.pillars, slip=self.slip)
+        layout = pts.parse(frame)
+        count = len(samples.seq)
+        frames = np.tile(np.frombuffer(frame, np.uint8), (count, 1))
+        counter = (samples.seq % COUNTER).astype("<u4")[:, None].view(np.uint8)
+        t_us = (samples.t_device_ns // 1000).astype("<u8")[:, None].view(np.uint8)
+        _scatter(frames, layout.places(pts.HUB), np.hstack([counter, t_us])[:, None])
+        forces, *slip = samples.values
+        entries = _bytes(forces, 24)  # of all pillars, then of the sensors
+        _scatter(frames, layout.places(pts.PILLARS), entries[:, : -self.sensors])
+        _scatter(frames, layout.places(pts.SENSORS), entries[:, -self.sensors :])
+        if self.slip:
+            states, friction, watched, grips = slip
+            entries = np.concatenate([states.view(np.uint8)[..., None], _bytes(friction, 4)], axis=2)
+            _scatter(frames, layout.places(pts.PILLAR_SLIP), entries)
+            _scatter(
+                frames, layout.places(pts.SENSOR_SLIP), np.concatenate([watched[..., None], _bytes(grips, 8)], axis=2)
+            )
+        start, stop = len(pts.MARKER), -len(pts.TAIL)
+        frames[:, stop - 2 : stop] = sum16(frames[:, start : stop - 2]).astype("<u2")[:, None].view(np.uint8)
+        return frames
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Set the rate, and whether slip is watched for."""
+        yield Ask(f"f{self.rate_hz:.0f}\n".encode(), pause_s=0.1)
+        yield Ask(b"S\n" if self.slip else b"s\n")
+
+    def taring(self) -> Dialogue:
+        """Take the present load for zero: nothing may touch the pillars for the two seconds that it takes."""
+        yield Ask(b"z\n", pause_s=2.0)
+
+    def device(self) -> Device:
+        """Return a controller that streams from power-on at the rate that it was last told."""
+        return _Controller()
+
+
+class _Controller(Device):
+    """The controller's side: lines of text, none answered."""
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        while (stop := self.heard.find(b"\n")) >= 0:
+            line = bytes(self.heard[:stop])
+            del self.heard[: stop + 1]
+            if line[:1] == b"f" and line[1:].isdigit() and int(line[1:]) in RATES:
+                self.rate_hz = float(line[1:])
+        return []
+
+
+def _vector(owner: str, layout: Mapping[str, str], quantity: str, unit: str) -> list[pa.Field]:
+    import pyarrow as pa
+
+    ending = unit.replace(" ", "_").lower()
+    return [
+        pa.field(
+            f"{owner}_{quantity}_{axis}_{ending}",
+            pa.float32(),
+            metadata={"unit": unit, "quantity": quantity, **layout, "component": axis},
+        )
+        for axis in AXES
+    ]
+
+
+def _gathered(frames: Bytes, places: NDArray[np.int64], size: int) -> Bytes:
+    """Return ``size`` bytes from each place (frame, place, byte)."""
+    return np.ascontiguousarray(frames[:, places[:, None] + np.arange(size)])
+
+
+def _scatter(frames: Bytes, places: NDArray[np.int64], values: Bytes) -> None:
+    frames[:, places[:, None] + np.arange(values.shape[2])] = values
+
+
+def _floats(data: Bytes) -> NDArray[np.float32]:
+    """Return the floats of entries (frame, entry, byte) side by side (frame, float)."""
+    floats = np.ascontiguousarray(data).view("<f4").astype(np.float32)
+    return floats.reshape(len(data), floats.shape[1] * floats.shape[2])
+
+
+def _bytes(values: NDArray[Any], size: int) -> Bytes:
+    """Return values (frame, float) as entries (frame, entry, byte) of so many bytes."""
+    return np.ascontiguousarray(values, "<f4").view(np.uint8).reshape(len(values), -1, size)

@@ -1,0 +1,90 @@
+"""The counters that devices send along, unrolled, and what they say is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Integers = NDArray[np.int64]
+
+RESET_TIMES = 3.0  # a gap longer than so many times what the clock allows is a device that began anew
+RESET_SLACK = 32  # samples beyond that which a burst may bring
+LATE_NS = 250_000_000  # a link that reorders does so within this; a count that goes back later is a device's restart
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A batch of counters made sense of; all are (sample,)."""
+
+    seq: Integers  # unrolled: grows by one a sample, a lost one leaves a gap
+    missing: Integers  # samples that were lost right before
+    duplicate: NDArray[np.bool_]  # the same sample once more
+    late: NDArray[np.bool_]  # it was passed over before, and counted as lost
+    reset: NDArray[np.bool_]  # the device began to count anew; ``missing`` is then what the clock says, or 0
+
+
+class Counting:
+    """One counter through a recording: differences are taken modulo, those of over half its range are backward."""
+
+    def __init__(self, modulus: int, rate_hz: float, step: int = 1) -> None:
+        self.modulus, self.rate_hz, self.step = modulus, rate_hz, step
+        self._last: tuple[int, int, int] | None = None  # highest count as sent, unrolled, and its arrival
+
+    def feed(self, raw: Integers, t_ns: Integers) -> Counted:
+        """Return what counters (sample,) as sent say, with the arrival of each.
+
+        Where the samples come further apart than half the counter's range lasts, the arrival tells how often it went round.
+        """
+        if not len(raw):
+            nothing = np.zeros(0, dtype=bool)
+            return Counted(raw, raw, nothing, nothing, nothing)
+        first = self._last is None
+        last_raw, last_seq, last_ns = self._last or (int(raw[0]), int(raw[0]) // self.step, int(t_ns[0]))
+        delta = self._signed(np.diff(raw, prepend=last_raw))
+        elapsed_ns = np.diff(t_ns, prepend=last_ns)
+        slow = elapsed_ns * 1e-9 * self.rate_hz * self.step > self.modulus / 2  # never where no rate is known
+        if (delta[first:] == self.step).all() and not slow.any():  # nothing happened, as nearly always
+            seq = last_seq + np.arange(len(raw)) + (not first)
+            self._last = int(raw[-1]), int(seq[-1]), int(t_ns[-1])
+            nothing = np.zeros(len(raw), dtype=bool)
+            return Counted(seq, np.zeros(len(raw), dtype=np.int64), nothing, nothing, nothing)
+        return self._slowly(raw, t_ns, last_raw, last_seq, last_ns, first=first)
+
+    def _signed(self, delta: Integers) -> Integers:
+        half = self.modulus // 2
+        signed: Integers = (delta + half) % self.modulus - half
+        return signed
+
+    def _slowly(
+        self, raw: Integers, t_ns: Integers, last_raw: int, last_seq: int, last_ns: int, *, first: bool
+    ) -> Counted:
+        seq, missing = np.zeros(len(raw), dtype=np.int64), np.zeros(len(raw), dtype=np.int64)
+        duplicate, late, reset = (np.zeros(len(raw), dtype=bool) for _ in range(3))
+        half = self.modulus // 2
+        for row, (value, at_ns) in enumerate(zip(raw.tolist(), t_ns.tolist(), strict=True)):
+            steps, off = divmod((value - last_raw + half) % self.modulus - half, self.step)
+            expected = (at_ns - last_ns) * 1e-9 * self.rate_hz if self.rate_hz else max(0.0, steps)
+            rounds = self.modulus // self.step
+            if expected > rounds / 2:
+                steps += rounds * round((expected - steps) / rounds)
+            if first:
+                first, steps = False, 0
+            elif (
+                off
+                or steps > RESET_TIMES * expected + RESET_SLACK
+                or (steps < 0 and (steps < -RESET_SLACK or at_ns - last_ns > LATE_NS))
+            ):
+                steps = max(1, round(expected))
+                reset[row], missing[row] = True, steps - 1
+            elif steps > 0:
+                missing[row] = steps - 1
+            else:
+                duplicate[row], late[row] = steps == 0, steps < 0
+                seq[row] = last_seq + steps
+                continue
+            seq[row] = last_seq = last_seq + steps
+            last_raw, last_ns = value, at_ns
+        self._last = last_raw, last_seq, last_ns
+        return Counted(seq, missing, duplicate, late, reset)

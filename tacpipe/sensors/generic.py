@@ -1,0 +1,323 @@
+"""A lab's own board, described in the rig file and nowhere else: its frame, number by number, and what they are for.
+
+[stream.options]
+rate_hz = 500
+marker = "AA 55"
+numbers = [
+    { name = "count", type = "u16" },
+    { name = "micros", type = "u32" },
+    { name = "taxel", type = "u16", count = 16, unit = "count" },
+    { name = "check", type = "u8" },
+]
+sequence = { number = "count" }
+clock = { number = "micros", unit = "us" }
+sum = { kind = "sum8", number = "check", begin = 2 }
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.sensors import layout, options, taxels
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing, PacketFramer
+from tacpipe.sensors.layout import Clock, Length, Number, Order, Place, Sequence, Sum
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MOST = 4096  # bytes of a frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generic(Sensor):
+    """A board that the rig file describes."""
+
+    summary: ClassVar[str] = "A lab's own board: binary frames as the rig file describes them."
+    links: ClassVar[tuple[str, ...]] = ("serial", "tcp", "udp", "hid")
+
+    rate_hz: float  # frames a second
+    numbers: tuple[Number, ...]  # between marker and tail, in their order, without gaps
+    marker: str = ""  # bytes that each frame begins with, in hexadecimal: "AA 55"
+    tail: str = ""  # bytes that each frame ends with, in hexadecimal: "0D 0A"
+    order: Order = "little"  # of the bytes of a number: little or big, the end that comes first
+    sum: Sum | None = None  # how a frame is summed, and which number holds that
+    sequence: Sequence | None = None  # which number counts the frames
+    clock: Clock | None = None  # which number is the device's time
+    length: Length | None = None  # which number tells the size of a frame; none: all have the same
+    packets: bool = False  # each packet of the link is a frame (udp, hid), which then needs no marker
+    start: str = ""  # what has the board stream, in hexadecimal; none: it streams by itself
+    stop: str = ""  # what ends that, in hexadecimal
+    baud: int = 115_200  # of a serial port
+
+    def __post_init__(self) -> None:
+        options.positive("generic", rate_hz=self.rate_hz, baud=self.baud)
+        for name in ("marker", "tail", "start", "stop"):
+            _bytes(name, getattr(self, name))
+        if not (self.marker or self.tail or self.packets):
+            raise UsageError(
+                'generic: nothing tells where a frame begins; give marker or tail, such as marker = "AA 55", or '
+                "packets = true where each packet of the link is a frame."
+            )
+        if self.size > MOST:
+            raise UsageError(f"generic: a frame has {self.size} bytes; it must be {MOST} at most.")
+        if not self._channels:
+            raise UsageError("generic: no number is a channel; list in numbers what the board measures.")
+        self._check_names()
+        self._check_roles()
+
+    def _check_names(self) -> None:
+        names = [name for place in self._channels for name, _ in _names(place.number)]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise UsageError(f"generic: two channels are named {twice}; give the numbers other names.")
+
+    def _check_roles(self) -> None:
+        """Raise `UsageError` unless sum, sequence, clock and length each have a number of their own that can hold it."""
+        roles = [role for role in (self.sum, self.sequence, self.clock, self.length) if role is not None]
+        taken = [role.number for role in roles]
+        if twice := next((name for name in taken if taken.count(name) > 1), None):
+            raise UsageError(
+                f"generic: the number {twice} has two roles; each of sum, sequence, clock, length needs its own."
+            )
+        if self.sum is not None:
+            layout.summed(self.sum, layout.referred(self._places, "sum", self.sum.number), self.size)
+        if self.sequence is not None:
+            place = layout.referred(self._places, "sequence", self.sequence.number)
+            options.within("generic", "width of the sequence in bits", 8 * place.width, 8, 32)
+            if not (self.sequence.modulus == 0 or 2 <= self.sequence.modulus <= place.range):
+                raise UsageError(
+                    f"generic: the sequence has modulus = {self.sequence.modulus}; its number is {place.number.type}, so it "
+                    f"must be between 2 and {place.range}, or 0 for that."
+                )
+            options.within("generic", "step of the sequence", self.sequence.step, 1, self.counter_modulus - 1)
+        if self.clock is not None:
+            layout.referred(self._places, "clock", self.clock.number, "uif")
+        if self.length is not None:
+            place = layout.referred(self._places, "length", self.length.number)
+            if not 0 <= self.size - self.length.plus < place.range:
+                raise UsageError(
+                    f"generic: the length would be {self.size - self.length.plus} for a frame of {self.size} bytes, of "
+                    f"which it does not count {self.length.plus}, as plus says; it must be between 0 and {place.range - 1}."
+                )
+
+    @functools.cached_property
+    def _places(self) -> dict[str, Place]:
+        return layout.places(self.numbers, len(_bytes("marker", self.marker)), self.order)
+
+    @functools.cached_property
+    def size(self) -> int:
+        """How many bytes a frame with a sample has."""
+        last = max((place.stop for place in self._places.values()), default=len(_bytes("marker", self.marker)))
+        return last + len(_bytes("tail", self.tail))
+
+    @functools.cached_property
+    def _channels(self) -> list[Place]:
+        taken = {role.number for role in (self.sum, self.sequence, self.clock, self.length) if role is not None}
+        return [
+            place
+            for name, place in self._places.items()
+            if name not in taken and not place.number.skip and place.number.equals is None
+        ]
+
+    @property
+    def counter_modulus(self) -> int:
+        """At which the sequence begins anew; 0 where there is none."""
+        if self.sequence is None:
+            return 0
+        return self.sequence.modulus or self._places[self.sequence.number].range
+
+    @property
+    def counter(self) -> int | None:  # type: ignore[override]
+        """The modulus of ``seq``, or None where nothing counts."""
+        return self.counter_modulus or None
+
+    @property
+    def step(self) -> int:  # type: ignore[override]
+        """By which ``seq`` grows from a frame to the next."""
+        return 1 if self.sequence is None else self.sequence.step
+
+    def fields(self) -> list[pa.Field]:
+        """Return a field a channel, in the order of the numbers, with unit, quantity, taxel and axis."""
+        import pyarrow as pa
+
+        return [
+            pa.field(name, pa.from_numpy_dtype(place.kind), metadata=metadata)
+            for place in self._channels
+            for name, metadata in _names(place.number)
+        ]
+
+    def framer(self) -> Framer:
+        """Return a framer of frames with marker, tail, sum and what is always the same."""
+        fixed = [place for place in self._places.values() if place.number.equals is not None]
+        check = self._is_right if self.sum or fixed else None
+        if self.packets:
+            return PacketFramer([self.size], self._has_marks)
+        marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
+        weak = self.sum is None
+        confirm = int(layout.SUMS[self.sum.kind][1] == 1) if self.sum else int(bool(marker))
+        framing = Framing(marker, tail, check=check, lock=3 if weak else 2, confirm=confirm, most=MOST, weak=weak)
+        if self.length is None:
+            return ByteFramer(replace(framing, size=self.size))
+        header = max(self._places[self.length.number].stop, len(marker) + 1)
+        return ByteFramer(replace(framing, header=header, sizes=self._sizes))
+
+    def _sizes(self, heads: Bytes) -> NDArray[np.int64]:
+        assert self.length is not None
+        told = self._places[self.length.number].take(heads)[:, 0]
+        sizes: NDArray[np.int64] = np.minimum(told.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
+        return sizes
+
+    def _is_right(self, frames: Bytes) -> NDArray[np.bool_]:
+        """Return which frames (frame, byte) of one size have their sum, and what is always the same.
+
+        In a frame of another size than a sample's the sum is as far from the end, and nothing else is known.
+        """
+        good = np.ones(len(frames), dtype=bool)
+        longer = frames.shape[1] - self.size
+        for place in self._places.values():
+            if place.number.equals is not None and not longer:
+                good &= (place.take(frames) == place.number.equals).all(axis=1)
+        if self.sum is not None:
+            place = self._places[self.sum.number]
+            span = layout.summed(self.sum, place, self.size)
+            moved = Place(place.number, place.at + longer, place.order)
+            stop = span.stop + longer
+            if moved.at < 0 or stop <= span.start:
+                return np.zeros(len(frames), dtype=bool)
+            good &= layout.SUMS[self.sum.kind][0](frames[:, span.start : stop]) == moved.take(frames)[:, 0]
+        return good
+
+    def _has_marks(self, packets: Bytes) -> NDArray[np.bool_]:
+        """Return which packets (packet, byte) have marker and tail, and are right otherwise."""
+        good = self._is_right(packets)
+        marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
+        good &= (packets[:, : len(marker)] == np.frombuffer(marker, np.uint8)).all(axis=1)
+        good &= (packets[:, self.size - len(tail) :] == np.frombuffer(tail, np.uint8)).all(axis=1)
+        return good
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the channels (frame, channel), side by side by their type, with sequence and clock.
+
+        Frames of another size than the numbers have together hold no sample.
+        """
+        if frames.shape[1] != self.size:
+            frames, rows = np.zeros((0, self.size), dtype=np.uint8), np.zeros(0, dtype=np.int64)
+        else:
+            rows = None
+        values = tuple(
+            np.hstack([place.take(frames) for place in block]) if len(block) > 1 else block[0].take(frames)
+            for block in self._blocks
+        )
+        seq = t_device_ns = None
+        if self.sequence is not None:
+            seq = self._places[self.sequence.number].take(frames)[:, 0].astype(np.int64)
+        if self.clock is not None:
+            ticks = self._places[self.clock.number].take(frames)[:, 0]
+            unit_ns = layout.UNITS_NS[self.clock.unit]
+            whole = ticks.dtype.kind != "f"
+            t_device_ns = (
+                ticks.astype(np.int64) * unit_ns if whole else np.rint(ticks * float(unit_ns)).astype(np.int64)
+            )
+        return Samples(values, seq=seq, t_device_ns=t_device_ns, rows=rows)
+
+    @functools.cached_property
+    def _blocks(self) -> list[list[Place]]:
+        """Neighbouring channels of one type."""
+        blocks: list[list[Place]] = []
+        for place in self._channels:
+            if blocks and blocks[-1][0].kind == place.kind:
+                blocks[-1].append(place)
+            else:
+                blocks.append([place])
+        return blocks
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these samples, 0 in what is skipped."""
+        frames = np.zeros((len(samples), self.size), dtype=np.uint8)
+        marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
+        frames[:, : len(marker)] = np.frombuffer(marker, np.uint8)
+        frames[:, self.size - len(tail) :] = np.frombuffer(tail, np.uint8)
+        for block, values in zip(self._blocks, samples.values, strict=True):
+            first = 0
+            for place in block:
+                place.put(frames, values[:, first : first + place.many])
+                first += place.many
+        for place in self._places.values():
+            if place.number.equals is not None:
+                place.put(frames, np.full((len(frames), place.many), place.number.equals, dtype=place.kind))
+        if self.length is not None:
+            self._put(self.length.number, frames, np.full(len(frames), self.size - self.length.plus))
+        if self.sequence is not None and samples.seq is not None:
+            self._put(self.sequence.number, frames, samples.seq % self.counter_modulus)
+        if self.clock is not None and samples.t_device_ns is not None:
+            place, unit_ns = self._places[self.clock.number], layout.UNITS_NS[self.clock.unit]
+            ticks: NDArray[Any] = samples.t_device_ns / unit_ns
+            if place.kind.kind != "f":
+                ticks = (samples.t_device_ns + unit_ns // 2) // unit_ns
+                ticks = ticks % place.range if place.kind.kind == "u" and place.width < 8 else ticks
+            self._put(self.clock.number, frames, ticks)
+        if self.sum is not None:
+            span = layout.summed(self.sum, self._places[self.sum.number], self.size)
+            self._put(self.sum.number, frames, layout.SUMS[self.sum.kind][0](frames[:, span]))
+        return frames
+
+    def _put(self, name: str, frames: Bytes, numbers: NDArray[Any]) -> None:
+        place = self._places[name]
+        place.put(frames, numbers[:, None].astype(place.kind))
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Write ``start``."""
+        if self.start:
+            yield Ask(_bytes("start", self.start))
+
+    def closing(self) -> bytes:
+        """Return ``stop``."""
+        return _bytes("stop", self.stop)
+
+    def device(self) -> Device:
+        """Return a board that streams from the start, or from when it hears ``start`` until it hears ``stop``."""
+        start, stop = _bytes("start", self.start), _bytes("stop", self.stop)
+        return _Board(streaming=not start, start=start, stop=stop)
+
+
+@dataclass
+class _Board(Device):
+    """The board's side: streams after ``start`` and not after ``stop``, whichever was heard last."""
+
+    start: bytes = b""
+    stop: bytes = b""
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        started = self.heard.rfind(self.start) if self.start else -1
+        stopped = self.heard.rfind(self.stop) if self.stop else -1
+        if started != stopped:
+            self.streaming = started > stopped
+            del self.heard[: max(started + len(self.start), stopped + len(self.stop))]
+        return []
+
+
+def _names(number: Number) -> list[tuple[str, dict[str, str]]]:
+    """Return name and metadata of each channel that a number is."""
+    metadata = {"unit": number.unit, "quantity": number.quantity}
+    found = []
+    names = [number.name] if number.count == 1 else taxels.numbered(number.name, number.count)
+    for place, name in enumerate(names, start=1):
+        mine = metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(place)}
+        key = "axis" if number.quantity == "tactile" else "component"
+        found += [(f"{name}_{axis}", {**mine, key: axis}) for axis in number.axes] or [(name, mine)]
+    return found
+
+
+def _bytes(name: str, text: str) -> bytes:
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        raise UsageError(f'generic: {name} is {text!r}; it must be bytes in hexadecimal, such as "AA 55".') from None

@@ -1,0 +1,149 @@
+"""Boards that send JustFloat, the binary format of the plotter VOFA+; fulai tactile skins are some of them.
+
+A frame is any number of little-endian float32 and then ``00 00 80 7F``, which read as a float is infinite: no finite
+number holds it, though two together can. There is neither counter nor sum.
+Source: VOFA+'s description of its protocols; for fulai the wire of the package fulai-tactile 1.0.5.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.sensors import options, taxels
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Line, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+TAIL = b"\x00\x00\x80\x7f"
+NAME = re.compile(r"[a-z][a-z0-9_]*")
+FULAI = {"fulai-3.0": 415, "fulai-3.1": 401, "fulai-3.2": 615}  # floats in a frame, by hardware
+RESERVED = {"fulai-3.2": (*range(82, 90), *range(530, 537))}  # floats that mean nothing, counted from 0
+ON, OFF, INFO = b"vofa on\r\n", b"vofa off\r\n", b"bridge info get\r\n"
+MOST_CHANNELS = 1000
+
+
+@dataclass(frozen=True)
+class JustFloat(Sensor):
+    """A board that sends JustFloat."""
+
+    summary: ClassVar[str] = "Boards that send JustFloat, the format of VOFA+, among them fulai tactile skins."
+    line: ClassVar[Line] = Line(dtr=True, rts=False)
+
+    model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = "any"  # a fulai's hardware version, or any board
+    channels: int = 0  # floats in a frame, of any board; 0: as many as names
+    names: tuple[str, ...] = ()  # of the channels, of any board; none: taxel01, taxel02, …
+    unit: str = "1"  # of the channels, of any board
+    quantity: str = "tactile"  # of the channels, of any board
+    rate_hz: float = 100.0  # frames a second
+    baud: int = 2_000_000  # of the port
+
+    def __post_init__(self) -> None:
+        options.known("justfloat", "model", self.model, ("any", *FULAI))
+        options.positive("justfloat", rate_hz=self.rate_hz, baud=self.baud)
+        if self.model != "any":
+            if self.channels or self.names:
+                raise UsageError(f"justfloat: the channels of a {self.model} are known; leave out channels and names.")
+            return
+        for name in self.names:
+            if not NAME.fullmatch(name) or self.names.count(name) > 1:
+                raise UsageError(
+                    f"justfloat: {name!r} cannot name a channel; take small letters, digits and _, and each name once."
+                )
+        if self.names and self.channels not in (0, len(self.names)):
+            raise UsageError(
+                f"justfloat: there are {len(self.names)} names for {self.channels} channels; give one a channel."
+            )
+        if not self.names:
+            options.within("justfloat", "channels", self.channels, 1, MOST_CHANNELS)
+
+    @property
+    def floats(self) -> int:
+        """How many floats are in a frame."""
+        return FULAI.get(self.model, self.channels or len(self.names))
+
+    @functools.cached_property
+    def kept(self) -> NDArray[np.intp]:
+        """Which floats of a frame are channels (channel,)."""
+        return np.setdiff1d(np.arange(self.floats), RESERVED.get(self.model, ()))
+
+    def fields(self) -> list[pa.Field]:
+        """Return a float32 field a channel: as named, or ``taxel01`` to the last."""
+        import pyarrow as pa
+
+        metadata = {"unit": self.unit, "quantity": self.quantity}
+        if self.names:
+            return [pa.field(name, pa.float32(), metadata=metadata) for name in self.names]
+        return [
+            field.with_metadata({**field.metadata, b"quantity": self.quantity.encode()})
+            for field in taxels.fields(len(self.kept), pa.float32(), self.unit)
+        ]
+
+    def framer(self) -> Framer:
+        """Return a framer of finite floats with their end."""
+        return ByteFramer(Framing(tail=TAIL, size=4 * self.floats + len(TAIL), check=_is_finite, lock=3, weak=True))
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the floats (frame, channel)."""
+        floats = _floats(frames)
+        return Samples((floats[:, self.kept] if self.model in RESERVED else floats,))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these samples, with zeros for what is reserved."""
+        floats = np.zeros((len(samples), self.floats), dtype="<f4")
+        floats[:, self.kept] = samples.values[0]
+        tails = np.broadcast_to(np.frombuffer(TAIL, np.uint8), (len(floats), len(TAIL)))
+        return np.hstack([floats.view(np.uint8), tails])
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Have a fulai stream; any other board streams by itself."""
+        if self.model != "any":
+            yield Ask(ON)
+
+    def closing(self) -> bytes:
+        """Stop a fulai's stream."""
+        return OFF if self.model != "any" else b""
+
+    def device(self) -> Device:
+        """Return a board that streams from the start, or a fulai, which takes its three commands."""
+        return Device() if self.model == "any" else _Bridge(model=self.model, streaming=False)
+
+
+@dataclass
+class _Bridge(Device):
+    """A fulai's side: its commands are lines of text."""
+
+    model: str = ""
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        replies = []
+        while (stop := self.heard.find(b"\n")) >= 0:
+            told = bytes(self.heard[: stop + 1]).strip()
+            del self.heard[: stop + 1]
+            if told in (ON.strip(), OFF.strip()):
+                self.streaming = told == ON.strip()
+            elif told == INFO.strip():
+                hardware = self.model.removeprefix("fulai-")
+                replies.append(f"OK BRIDGE MODEL=FULAI FW=1.0 HW=V{hardware} PROTOCOL=VOFA HAND=LEFT\r\n".encode())
+        return replies
+
+
+def _floats(frames: Bytes) -> NDArray[np.float32]:
+    floats: NDArray[np.float32] = (
+        np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
+    )
+    return floats
+
+
+def _is_finite(frames: Bytes) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(_floats(frames)).all(axis=1))

@@ -1,0 +1,202 @@
+"""Synria tactile pressure modules: an array of taxels on Modbus RTU, asked for each frame.
+
+The function 0x42 has a reply with all taxels, uint16 and little-endian, unlike the big-endian registers of Modbus. A module
+can also send by itself, in a form that is not published: that is switched off.
+Source: the package tactile-pressure-sdk 2.0.0 (MIT); MODBUS over Serial Line V1.02 for what is standard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import DeviceError
+from tacpipe.sensors import options, taxels
+from tacpipe.sensors.checks import crc16_modbus
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+READ_REGISTERS, WRITE_REGISTER, INFO, PRESSURES = 0x03, 0x06, 0x41, 0x42  # functions
+REFUSED = 0x80  # bit of the function in a reply that means no
+ADDRESS, SENDING, SENDING_HZ, UNIT, COUNT, ZERO = 0x01, 0x0B, 0x0C, 0x0D, 0x0F, 0x12  # registers
+REFUSALS = {1: "it does not know the function", 2: "it has no such register", 3: "the value is out of its range"}
+BROADCAST, HEADER = 0, 4
+INFOS = {1: b"ST-00-01", 2: b"YF-e0-000001", 3: b"v1.2", 4: b"v1.0.1"}  # of the device that is emulated
+REGISTERS = {ADDRESS: 1, SENDING: 0, SENDING_HZ: 100, UNIT: 1, COUNT: 60, 0x0E: 20, 0x10: 250}  # after power-up
+
+
+@dataclass(frozen=True)
+class ModbusTactile(Sensor):
+    """A tactile pressure module of Synria."""
+
+    summary: ClassVar[str] = "Synria tactile pressure modules on Modbus RTU, asked for each frame."
+
+    address: int = 1  # of the module on its bus, 1 to 247
+    points: int = 60  # taxels of the module
+    unit: Literal["mN", "count"] = "mN"  # what the module sends: calibrated forces, or counts of its ADC
+    rate_hz: float = 200.0  # how often it is asked
+    baud: int = 4_000_000  # of the bus
+
+    def __post_init__(self) -> None:
+        options.within("modbus-tactile", "address", self.address, 1, 247)
+        options.within("modbus-tactile", "points", self.points, 1, 2000)
+        options.known("modbus-tactile", "unit", self.unit, ("mN", "count"))
+        options.positive("modbus-tactile", rate_hz=self.rate_hz, baud=self.baud)
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``taxel01`` to the last, uint16, millinewtons or counts."""
+        import pyarrow as pa
+
+        return taxels.fields(self.points, pa.uint16(), self.unit)
+
+    @property
+    def header(self) -> bytes:
+        """The four bytes that every frame begins with."""
+        return bytes([self.address, PRESSURES]) + (2 * self.points).to_bytes(2, "little")
+
+    def framer(self) -> Framer:
+        """Return a framer of replies with all taxels; other replies, with their own sums, are no frames."""
+        return ByteFramer(Framing(marker=self.header, size=HEADER + 2 * self.points + 2, check=_crc_is_right))
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the taxels (frame, taxel)."""
+        counts = np.ascontiguousarray(frames[:, HEADER:-2]).view("<u2").astype(np.uint16, copy=False)
+        return Samples((counts,))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the replies that hold these samples."""
+        (counts,) = samples.values
+        head = np.broadcast_to(np.frombuffer(self.header, np.uint8), (len(counts), HEADER))
+        body = np.hstack([head, np.ascontiguousarray(counts, dtype="<u2").view(np.uint8)])
+        return np.hstack([body, crc16_modbus(body).astype("<u2")[:, None].view(np.uint8)])
+
+    def request(self) -> bytes:
+        """Return what asks for all taxels."""
+        return with_crc(bytes([self.address, PRESSURES]))
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Have the module wait to be asked, see that it has so many taxels, and set their unit.
+
+        Raises `DeviceError` if it has more or fewer, or refuses.
+        """
+        yield self._writing(SENDING, 0, "that it waits to be asked")
+        told = yield self._asking(READ_REGISTERS, COUNT.to_bytes(2, "big") + b"\x00\x01", 7, "how many taxels it has")
+        points = int.from_bytes(told[-4:-2], "big")
+        if points != self.points:
+            raise DeviceError(
+                f"The module has {points} taxels, not {self.points}; write points = {points} in the rig file."
+            )
+        yield self._writing(UNIT, int(self.unit == "mN"), "in what unit it measures")
+
+    def taring(self) -> Dialogue:
+        """Take the present load for zero. Raises `DeviceError` if the module refuses."""
+        yield self._writing(ZERO, 1, "that it takes zero anew")
+
+    def _writing(self, register: int, value: int, what: str) -> Ask:
+        return self._asking(WRITE_REGISTER, register.to_bytes(2, "big") + value.to_bytes(2, "big"), 8, what)
+
+    def _asking(self, function: int, data: bytes, size: int, what: str) -> Ask:
+        """Return a request and what finds its reply of ``size`` bytes."""
+        return Ask(
+            with_crc(bytes([self.address, function]) + data), until=_reply(self.address, function, size), what=what
+        )
+
+    def device(self) -> Device:
+        """Return a module that waits to be asked."""
+        registers = {**REGISTERS, ADDRESS: self.address, COUNT: self.points}
+        return _Module(streaming=False, registers=registers)
+
+
+@dataclass
+class _Module(Device):
+    """The module's side: counts what it is asked for, reads and writes registers, tells what it is."""
+
+    registers: dict[int, int] = field(default_factory=dict)
+    asked: int = 0
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        replies = []
+        while len(self.heard) >= HEADER:
+            sizes = {READ_REGISTERS: 8, WRITE_REGISTER: 8, INFO: 5}
+            size = sizes.get(self.heard[1], HEADER)
+            if len(self.heard) < size:
+                break
+            told = bytes(self.heard[:size])
+            if with_crc(told[:-2]) != told:
+                del self.heard[:1]
+                continue
+            del self.heard[:size]
+            if told[0] not in (BROADCAST, self.registers[ADDRESS]):
+                continue
+            reply = self._answer(told[1], told[2:-2])
+            if reply is not None and told[0] != BROADCAST:
+                replies.append(with_crc(told[:1] + reply))
+        return replies
+
+    def _answer(self, function: int, data: bytes) -> bytes | None:
+        """Return function and data of a reply, or None for taxels, which `polled` counts."""
+        if function == PRESSURES:
+            self.asked += 1
+            return None
+        register, value = int.from_bytes(data[:2], "big"), int.from_bytes(data[2:4], "big")
+        if function == READ_REGISTERS:
+            wanted = range(register, register + value)
+            if any(number not in self.registers for number in wanted):
+                return bytes([function | REFUSED, 2])
+            held = b"".join(self.registers[number].to_bytes(2, "big") for number in wanted)
+            return bytes([function, len(held)]) + held
+        if function == WRITE_REGISTER:
+            if register == COUNT:
+                return bytes([function | REFUSED, 2])
+            if register in self.registers:
+                self.registers[register] = value
+            return bytes([function]) + data
+        if function == INFO and data[0] in INFOS:
+            return bytes([function, data[0], len(INFOS[data[0]])]) + INFOS[data[0]]
+        return bytes([function | REFUSED, 1])
+
+    def polled(self) -> int:
+        asked, self.asked = self.asked, 0
+        return asked
+
+
+def with_crc(body: bytes) -> bytes:
+    """Return a message with its CRC behind it, low byte first.
+
+    >>> with_crc(b"\\x01\\x42").hex(" ")
+    '01 42 80 11'
+    """
+    return body + int(crc16_modbus(np.frombuffer(body, np.uint8)[None])[0]).to_bytes(2, "little")
+
+
+def _reply(address: int, function: int, size: int) -> Callable[[bytes], int]:
+    """Return what finds a reply of ``size`` bytes, or a refusal of five, which raises `DeviceError`, among what came."""
+
+    def until(came: bytes) -> int:
+        for code, length in ((function, size), (function | REFUSED, 5)):
+            head = bytes([address, code])
+            start = came.find(head)
+            while start >= 0:
+                told = came[start : start + length]
+                if len(told) == length and with_crc(told[:-2]) == told:
+                    if code != function:
+                        why = REFUSALS.get(told[2], f"error {told[2]}")
+                        raise DeviceError(f"The module refused function {function:#04x}: {why}.")
+                    return start + length
+                start = came.find(head, start + 1)
+        return 0
+
+    return until
+
+
+def _crc_is_right(frames: Bytes) -> NDArray[np.bool_]:
+    right: NDArray[np.bool_] = crc16_modbus(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+    return right

@@ -1,0 +1,295 @@
+"""Paxini PX-6AX GEN3 tactile modules behind the high-speed board of a robot hand, which pushes their forces.
+
+What it pushes begins with ``AA 56 00``, the length of what follows but for the sum, and an error code; then for each module
+that is plugged in, in order, its whole force, six bytes of which every other one counts, and three bytes a point: x and y
+int8, z uint8, in tenths of a newton; then the sum. It neither counts its frames nor tells the time.
+Source: the package paxini-sdk 0.1.0 (MIT), which cites the vendor's manual and its programs.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.sensors import options, taxels
+from tacpipe.sensors.checks import lrc
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.paxini_board import (
+    ACTIVE,
+    CALIBRATE_FUNCTION,
+    CALIBRATION,
+    DATA_TYPE,
+    POINTS,
+    PUSH,
+    PUSH_HEADER,
+    PUSHING,
+    READ_FUNCTION,
+    REPLY,
+    REPLY_HEADER,
+    VERSION,
+    WRITE_FUNCTION,
+    Board,
+    message,
+    number,
+    read,
+    sums,
+    two,
+    write,
+)
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FINGERS, PHALANGES = ("thumb", "index", "middle", "ring", "little"), ("proximal", "middle", "tip", "nail")
+SLOTS = tuple(f"{finger}_{part}" for finger in FINGERS for part in PHALANGES) + tuple(f"palm{n}" for n in range(1, 9))
+VARIANTS = {  # product to its points, no two alike, which is how the board's count tells them apart
+    "MC-M2020-Elite": 9,
+    "IP-S1610-Elite": 25,
+    "DP-S1813-Elite": 31,
+    "DP-S1813-Core": 51,
+    "DP-S2015-Elite": 52,
+    "IP-M2324-Core": 68,
+    "CP-M3025-Core": 77,
+    "DP-S3013-Core": 96,
+    "DP-S2716-Core": 116,
+    "DP-M2826-Omega": 127,
+    "DP-L3530-Omega": 135,
+    "CP-L5325-Omega": 239,
+}
+DATA_TYPES = {"both": 3, "resultant": 1, "distributed": 2}
+UNIT = "dN"  # a count is a tenth of a newton
+STALE_S = 0.15  # in which what an earlier session left streaming comes to an end
+
+
+@dataclass(frozen=True)
+class Paxini(Sensor):
+    """PX-6AX GEN3 modules behind a high-speed board."""
+
+    summary: ClassVar[str] = "Paxini PX-6AX GEN3 tactile modules of a hand, behind their high-speed board."
+
+    modules: tuple[str, ...] = ("thumb_tip",)  # slots with a module: thumb_proximal … little_nail, palm1 … palm8
+    variants: tuple[str, ...] = (
+        "DP-S2015-Elite",
+    )  # which product sits in each of these slots, or the one in all of them
+    data: Literal["both", "resultant", "distributed"] = "both"  # a module's whole force, that of its points, or both
+    rate_hz: float = 91.0  # frames a second, as the board pushes them
+    baud: int = 921_600  # of the board
+
+    def __post_init__(self) -> None:
+        for module in self.modules:
+            options.known("paxini", "modules", module, SLOTS)
+        for variant in self.variants:
+            options.known("paxini", "variants", variant, VARIANTS)
+        options.known("paxini", "data", self.data, DATA_TYPES)
+        options.positive("paxini", rate_hz=self.rate_hz, baud=self.baud)
+        if not self.modules or list(self.modules) != [slot for slot in SLOTS if slot in self.modules]:
+            raise UsageError(
+                f"paxini: modules are {', '.join(self.modules) or 'none'}; name each once, in this order: "
+                f"{', '.join(SLOTS)}."
+            )
+        if len(self.variants) not in (1, len(self.modules)):
+            raise UsageError(
+                f"paxini: there are {len(self.variants)} variants for {len(self.modules)} modules; "
+                "give one each, or one for all."
+            )
+
+    @functools.cached_property
+    def points(self) -> dict[str, int]:
+        """How many points each module has."""
+        variants = self.variants * (len(self.modules) if len(self.variants) == 1 else 1)
+        return {module: VARIANTS[variant] for module, variant in zip(self.modules, variants, strict=True)}
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``status``, the board's error code, then all that is signed, and then all along z, module by module.
+
+        ``thumb_tip_force_x``, … and ``thumb_tip_taxel01_x``, … are int8, ``thumb_tip_force_z``, … uint8: tenths of a newton.
+        """
+        import pyarrow as pa
+
+        found = [pa.field("status", pa.uint8(), metadata={"unit": "1", "quantity": "status"})]
+        for axes, kind in (("xy", pa.int8()), ("z", pa.uint8())):
+            for module, count in self.points.items():
+                if self.data != "distributed":
+                    for axis in axes:
+                        metadata = {"unit": UNIT, "quantity": "force", "module": module, "component": axis}
+                        found.append(pa.field(f"{module}_force_{axis}", kind, metadata=metadata))
+                if self.data != "resultant":
+                    found += taxels.fields(count, kind, UNIT, axes=axes, prefix=f"{module}_", module=module)
+        return found
+
+    def framer(self) -> Framer:
+        """Return a framer of what is pushed for these modules; its sum is of 8 bits."""
+        size = PUSH_HEADER + self._payload + 1
+        return ByteFramer(
+            Framing(marker=PUSH + two(self._payload + 1), size=size, check=_sum_is_right, confirm=1, most=8192)
+        )
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return error code and forces (frame, channel)."""
+        signed, unsigned = self._places
+        return Samples((frames[:, 5:6], frames.take(signed, axis=1).view(np.int8), frames.take(unsigned, axis=1)))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these samples, 0 in the bytes that do not count."""
+        status, signed, unsigned = samples.values
+        frames = np.zeros((len(samples), PUSH_HEADER + self._payload + 1), dtype=np.uint8)
+        frames[:, :5] = np.frombuffer(PUSH + two(self._payload + 1), np.uint8)
+        frames[:, 5:6] = status
+        frames[:, self._places[0]] = signed.view(np.uint8)
+        frames[:, self._places[1]] = unsigned
+        frames[:, -1] = lrc(frames[:, :-1])
+        return frames
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Stop what an earlier session left, see that the modules are those of the rig file, and have the board push.
+
+        Raises `DeviceError` if others are plugged in.
+        """
+        yield Ask(write(PUSHING, b"\x00"), pause_s=STALE_S)
+        version = yield _reading(VERSION, 15, "its version")
+        active = yield _reading(ACTIVE, 4, "its active modules")
+        counts = yield _reading(POINTS, 2 * len(SLOTS), "its point counts")
+        there = _modules(_data(active), _data(counts))
+        if there != self.points:
+            raise DeviceError(
+                f"The board ({_text(_data(version))}) has {_told(there)}; the rig file says "
+                f"{_told(self.points)}. Correct modules and variants there: {_suggestion(there)}."
+            )
+        taken = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
+        if _data(taken)[:1] not in (b"", b"\x00"):
+            raise DeviceError(f'The board cannot push data = "{self.data}": error {_data(taken)[0]}. Choose another.')
+        yield Ask(write(PUSHING, b"\x01"), until=_pushed, what="the first frame")
+
+    def closing(self) -> bytes:
+        """Stop the stream."""
+        return write(PUSHING, b"\x00")
+
+    def taring(self) -> Dialogue:
+        """Take the present load for zero. Raises `DeviceError` if the board refuses."""
+        reply = yield Ask(
+            message(CALIBRATE_FUNCTION, CALIBRATION, b"\x01"),
+            until=_reply(CALIBRATE_FUNCTION, CALIBRATION),
+            what="that it is calibrated",
+        )
+        if _data(reply)[:1] not in (b"", b"\x00"):
+            raise DeviceError(
+                f"The board did not calibrate: error {_data(reply)[0]}. Take off what presses, and try again."
+            )
+
+    def device(self) -> Device:
+        """Return a board with these modules that waits to be told to push."""
+        counts = b"".join(two(self.points.get(slot, 0)) for slot in SLOTS)
+        bits = sum(1 << SLOTS.index(module) for module in self.modules)
+        memory = {VERSION: b"PX-HS V1.0.0".ljust(15, b"\x00"), ACTIVE: bits.to_bytes(4, "little"), POINTS: counts}
+        return Board(streaming=False, memory={**memory, DATA_TYPE: b"\x03"})
+
+    @functools.cached_property
+    def _payload(self) -> int:
+        """How many bytes a frame holds for its modules."""
+        resultant, distributed = self.data != "distributed", self.data != "resultant"
+        return sum(6 * resultant + 3 * count * distributed for count in self.points.values())
+
+    @functools.cached_property
+    def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Where in a frame the numbers along x and y are, and those along z, in the order of the fields."""
+        signed, unsigned, place = [], [], PUSH_HEADER
+        for count in self.points.values():
+            if self.data != "distributed":
+                signed += [place, place + 2]
+                unsigned.append(place + 4)
+                place += 6
+            if self.data != "resultant":
+                for point in range(place, place + 3 * count, 3):
+                    signed += [point, point + 1]
+                    unsigned.append(point + 2)
+                place += 3 * count
+        return np.array(signed), np.array(unsigned)
+
+
+def _reading(register: int, length: int, what: str) -> Ask:
+    return Ask(read(register, length), until=_reply(READ_FUNCTION, register), what=what)
+
+
+def _writing(register: int, data: bytes, what: str) -> Ask:
+    return Ask(write(register, data), until=_reply(WRITE_FUNCTION, register), what=f"that it took {what}")
+
+
+def _reply(function: int, register: int) -> Callable[[bytes], int]:
+    """Return what finds a reply among what came: an earlier stream may still run, and hold its first bytes by chance.
+
+    The reply to a write may lack the data of which it tells the length.
+    """
+
+    def until(came: bytes) -> int:
+        for code in (function, function | 0x80):
+            head = REPLY + bytes([code]) + two(register)
+            start = came.find(head)
+            while start >= 0:
+                told = number(came[start + 6 : start + 8]) if len(came) >= start + REPLY_HEADER else 0
+                for length in (told, 0) if function != READ_FUNCTION else (told,):
+                    stop = start + REPLY_HEADER + length + 1
+                    if stop <= len(came) and sums(came[start:stop]):
+                        if code != function:
+                            raise DeviceError(
+                                f"The board refused function {function:#04x} of register {register:#06x}."
+                            )
+                        return stop
+                start = came.find(head, start + 1)
+        return 0
+
+    return until
+
+
+def _pushed(came: bytes) -> int:
+    """Return how many bytes end with the first frame that was pushed; raises `DeviceError` if it tells of an error."""
+    start = came.find(PUSH)
+    while start >= 0:
+        length = number(came[start + 3 : start + 5])
+        stop = start + PUSH_HEADER + length
+        if length and stop <= len(came) and sums(came[start:stop]):
+            if length == 1 and came[start + 5]:
+                raise DeviceError(f"The board does not push its forces: error {came[start + 5]}. Switch it off and on.")
+            return stop
+        start = came.find(PUSH, start + 1)
+    return 0
+
+
+def _data(reply: bytes) -> bytes:
+    """Return the data of a reply that `_reply` found, which ends with it."""
+    start = reply.rfind(REPLY)
+    while start >= 0 and not sums(reply[start:]):
+        start = reply.rfind(REPLY, 0, start)
+    return reply[start + REPLY_HEADER : -1]
+
+
+def _modules(active: bytes, counts: bytes) -> dict[str, int]:
+    """Return the points of each module that is plugged in."""
+    bits = number(active)
+    return {slot: number(counts[2 * n : 2 * n + 2]) for n, slot in enumerate(SLOTS) if bits >> n & 1}
+
+
+def _told(modules: Mapping[str, int]) -> str:
+    return ", ".join(f"{slot} of {count} points" for slot, count in modules.items()) or "no module"
+
+
+def _suggestion(modules: Mapping[str, int]) -> str:
+    names = {count: name for name, count in VARIANTS.items()}
+    variants = [names.get(count, "?") for count in modules.values()]
+    return f"modules = {json.dumps(list(modules))}, variants = {json.dumps(variants)}"
+
+
+def _text(data: bytes) -> str:
+    return data.decode("ascii", "replace").strip("\x00 ") or "of unknown version"
+
+
+def _sum_is_right(frames: Bytes) -> NDArray[np.bool_]:
+    right: NDArray[np.bool_] = frames.sum(axis=1, dtype=np.uint8) == 0
+    return right

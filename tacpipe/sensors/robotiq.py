@@ -1,0 +1,281 @@
+"""Robotiq TSF-85: tactile fingertips of the grippers 2F-85 and 2F-140, with a motion sensor in each.
+
+A packet, either way, is ``9A``, a byte that nobody sums, a command, a length and so many bytes. A packet of data holds a
+field after the other: a byte with its kind in the upper half and the finger in bits 3 and 2, then big-endian numbers.
+Nothing but this structure tells a packet, so all of it is looked at: it must be made of known fields, to the last byte.
+Source: the package pyrobotiqtactile 0.1.2 (BSD-3-Clause).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.sensors import options, taxels
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+START, HEADER = 0x9A, 4
+READ, SYNCHRONOUS, ASYNCHRONOUS, VERSION = 0x61, 0x58, 0x59, 0xE3
+DATA = (READ, SYNCHRONOUS, ASYNCHRONOUS)  # commands of packets that hold data
+ROWS, COLUMNS = 7, 4  # taxels of a fingertip
+KINDS = {  # of fields: the byte's upper half and the numbers behind it
+    "static": (0x10, ">u2", ROWS * COLUMNS),
+    "dynamic": (0x20, ">i2", 1),
+    "acceleration": (0x30, ">i2", 3),
+    "angular_velocity": (0x40, ">i2", 3),
+    "magnetic_field": (0x50, ">i2", 3),
+    "temperature": (0x60, ">i2", 1),
+    "timestamp": (0x70, ">u8", 1),
+}
+SIZES = {code: np.dtype(kind).itemsize * count for code, kind, count in KINDS.values()}  # in bytes, after the kind
+PARTS = {code: part for part, (code, _, _) in KINDS.items()}
+TYPES = (np.dtype(">u2"), np.dtype(">i2"), np.dtype(">u8"))  # of the blocks of a sample
+SIGNED = ("dynamic", "acceleration", "angular_velocity", "magnetic_field", "temperature")
+KNOWN = np.isin(np.arange(256), (*DATA, VERSION))  # which commands a packet from the device may have
+Layout = dict[tuple[int, int], int]  # kind and finger to the place of the first number in a frame
+
+
+@dataclass(frozen=True)
+class Robotiq(Sensor):
+    """A pair of TSF-85 fingertips."""
+
+    summary: ClassVar[str] = "Robotiq TSF-85 tactile fingertips, with their motion sensors and clocks."
+    usb_ids: ClassVar[tuple[str, ...]] = ("16d0:14cc", "04b4:f232")  # the hub, and the bridge of older units
+
+    fingers: int = 2  # that are plugged in
+    parts: tuple[str, ...] = tuple(KINDS)  # of each finger that a sample must have; a packet that lacks one holds none
+    tick_us: float = 0.0  # of the fingertips' clock in microseconds, where known; 0: it is a channel and no time
+    rate_hz: float = 100.0  # packets a second; the period is a whole number of milliseconds up to 255
+    baud: int = 115_200  # of the port
+
+    def __post_init__(self) -> None:
+        options.within("robotiq", "fingers", self.fingers, 1, 2)
+        for part in self.parts:
+            options.known("robotiq", "parts", part, KINDS)
+        if not self.parts or len(set(self.parts)) < len(self.parts):
+            raise UsageError(f"robotiq: parts are {self.parts}; name one or more of {', '.join(KINDS)}, each once.")
+        options.within("robotiq", "rate_hz", self.rate_hz, 1000 / 255, 1000)
+        options.within("robotiq", "tick_us", self.tick_us, 0, 1e6)
+        if abs(self.period_ms - 1000 / self.rate_hz) > 1e-6:
+            raise UsageError(
+                f"robotiq: rate_hz is {self.rate_hz:g}, a period of {1000 / self.rate_hz:g} ms; it must be one of whole "
+                f"milliseconds, such as {1000 / self.period_ms:g} Hz."
+            )
+        options.positive("robotiq", baud=self.baud)
+
+    @property
+    def period_ms(self) -> int:
+        """The time from a packet to the next, as the device is told it."""
+        return round(1000 / self.rate_hz)
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``finger1_taxel01``, …, the motion sensors' axes and ``finger1_timestamp``: integers in counts.
+
+        Side by side by their type: first the taxels of both fingers, uint16, then what is int16, then the clocks, uint64.
+        """
+        return [
+            made
+            for parts in (("static",), SIGNED, ("timestamp",))
+            for finger in range(1, self.fingers + 1)
+            for part in parts
+            if part in self.parts
+            for made in _fields(part, finger)
+        ]
+
+    def framer(self) -> Framer:
+        """Return a framer of packets that are made of known fields, or are a reply."""
+        most = HEADER + 255
+        return ByteFramer(
+            Framing(marker=bytes([START]), header=HEADER, sizes=_sizes, most=most, check=_is_packet, lock=3, confirm=1)
+        )
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the numbers of those frames that hold all ``parts`` of all ``fingers``."""
+        rows, blocks = [], []
+        for at, layout in _alike(frames, np.arange(len(frames))):
+            if layout is None or any(key not in layout for key in self._keys):
+                continue
+            rows.append(at)
+            blocks.append(self._blocks(frames if len(at) == len(frames) else frames[at], layout))
+        if not blocks:
+            blocks, rows = [self._empty()], [np.zeros(0, dtype=np.int64)]
+        order = np.concatenate(rows)
+        values = tuple(np.concatenate(column) for column in zip(*blocks, strict=True))
+        if len(blocks) > 1:
+            sort = np.argsort(order)
+            order, values = order[sort], tuple(block[sort] for block in values)
+        every = len(order) == len(frames)
+        return Samples(values, t_device_ns=self._device_ns(values), rows=None if every else order)
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return packets of these samples, with the fields of ``parts`` in the order of the protocol, finger by finger."""
+        blocks = {key: block for keys, block in zip(self._groups.values(), samples.values, strict=True) for key in keys}
+        taken = dict.fromkeys(self._groups, 0)
+        pieces: list[Bytes] = []
+        for code, finger in self._keys:
+            _, name, count = KINDS[PARTS[code]]
+            kind, block = np.dtype(name), blocks[code, finger]
+            numbers = block[:, taken[kind] : taken[kind] + count].astype(kind)
+            taken[kind] += count
+            pieces.append(np.full((len(samples), 1), code | finger << 2, dtype=np.uint8))
+            pieces.append(np.ascontiguousarray(numbers).view(np.uint8))
+        body = np.hstack(pieces)
+        head = np.frombuffer(bytes([START, 0, SYNCHRONOUS, body.shape[1]]), np.uint8)
+        return np.hstack([np.broadcast_to(head, (len(body), HEADER)), body])
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Have both fingers send all they have at once, at ``rate_hz``."""
+        yield Ask(command(SYNCHRONOUS, bytes([self.period_ms])))
+
+    def device(self) -> Device:
+        """Return a pair of fingertips that wait to be told their period, or to be asked."""
+        return _Fingertips(streaming=False)
+
+    @functools.cached_property
+    def _keys(self) -> tuple[tuple[int, int], ...]:
+        """Kind and finger of each field of a sample, in the order of the protocol."""
+        codes = [KINDS[part][0] for part in KINDS if part in self.parts]
+        return tuple((code, finger) for finger in range(self.fingers) for code in codes)
+
+    @functools.cached_property
+    def _groups(self) -> dict[np.dtype[Any], tuple[tuple[int, int], ...]]:
+        """The keys of each block, by its type."""
+        groups: dict[np.dtype[Any], tuple[tuple[int, int], ...]] = {}
+        for kind in TYPES:
+            if keys := tuple(key for key in self._keys if np.dtype(KINDS[PARTS[key[0]]][1]) == kind):
+                groups[kind] = keys
+        return groups
+
+    def _blocks(self, frames: Bytes, layout: Layout) -> list[NDArray[Any]]:
+        """Return the blocks (frame, channel) of frames of one layout, one a type."""
+        return [
+            frames.take(_columns(tuple(layout[key] for key in keys), tuple(SIZES[code] for code, _ in keys)), axis=1)
+            .view(kind)
+            .astype(kind.newbyteorder("="))
+            for kind, keys in self._groups.items()
+        ]
+
+    def _empty(self) -> list[NDArray[Any]]:
+        """Return blocks of no sample."""
+        widths = [sum(KINDS[PARTS[code]][2] for code, _ in keys) for keys in self._groups.values()]
+        kinds = [kind.newbyteorder("=") for kind in self._groups]
+        return [np.zeros((0, width), dtype=kind) for width, kind in zip(widths, kinds, strict=True)]
+
+    def _device_ns(self, values: tuple[NDArray[Any], ...]) -> NDArray[np.int64] | None:
+        if not self.tick_us or "timestamp" not in self.parts:
+            return None
+        return np.rint(values[-1][:, 0] * (self.tick_us * 1e3)).astype(np.int64)
+
+
+@dataclass
+class _Fingertips(Device):
+    """The fingertips' side: they tell their version, send a packet when asked, or stream with a period."""
+
+    asked: int = 0
+    version: bytes = field(default=b"\x01\x00\x00")
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        replies = []
+        while (start := self.heard.find(START)) >= 0 and len(self.heard) >= start + HEADER:
+            size = HEADER + self.heard[start + 3]
+            if len(self.heard) < start + size:
+                break
+            told = bytes(self.heard[start : start + size])
+            del self.heard[: start + size]
+            if told[2] in (SYNCHRONOUS, ASYNCHRONOUS) and size == HEADER + 1:
+                self.streaming = told[4] > 0
+                self.rate_hz = 1000 / told[4] if told[4] else None
+            elif told[2] == READ:
+                self.asked += 1
+            elif told[2] == VERSION:
+                replies.append(command(VERSION, self.version))
+        return replies
+
+    def polled(self) -> int:
+        asked, self.asked = self.asked, 0
+        return asked
+
+
+def command(code: int, data: bytes = b"") -> bytes:
+    """Return a packet to the device, or a reply of it.
+
+    >>> command(SYNCHRONOUS, bytes([10])).hex(" ")
+    '9a 00 58 01 0a'
+    """
+    return bytes([START, 0, code, len(data)]) + data
+
+
+@functools.lru_cache(maxsize=64)
+def _columns(places: tuple[int, ...], sizes: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return the bytes of a frame that fields of these first bytes and sizes are."""
+    return np.concatenate([np.arange(place, place + size) for place, size in zip(places, sizes, strict=True)])
+
+
+def _fields(part: str, finger: int) -> list[pa.Field]:
+    """Return the fields of a part of a finger, counted from 1."""
+    import pyarrow as pa
+
+    prefix, number = f"finger{finger}_", str(finger)
+    if part == "static":
+        return taxels.grid(ROWS, COLUMNS, pa.uint16(), "count", prefix=prefix, finger=number)
+    if part == "timestamp":
+        metadata = {"unit": "1", "quantity": "time", "finger": number}
+        return [pa.field(f"{prefix}timestamp", pa.uint64(), metadata=metadata)]
+    metadata = {"unit": "count", "quantity": "vibration" if part == "dynamic" else part, "finger": number}
+    if KINDS[part][2] == 1:
+        return [pa.field(f"{prefix}{part}", pa.int16(), metadata=metadata)]
+    return [pa.field(f"{prefix}{part}_{axis}", pa.int16(), metadata={**metadata, "component": axis}) for axis in "xyz"]
+
+
+def _sizes(heads: Bytes) -> NDArray[np.int64]:
+    """Return the whole size of frames from their headers (frame, 4); 0 for a command that no packet has."""
+    sizes: NDArray[np.int64] = np.where(KNOWN[heads[:, 2]], HEADER + heads[:, 3].astype(np.int64), 0)
+    return sizes
+
+
+def _layout(frame: bytes) -> tuple[Layout | None, list[int]]:
+    """Return where the fields of a packet of data are, or None where it is not made of known ones; and what was looked at.
+
+    Packets of one size that have the same bytes in these places have the same layout.
+    """
+    found: Layout = {}
+    place, seen = HEADER, [2]
+    if frame[2] not in DATA:
+        return None, seen
+    while place < len(frame):
+        seen.append(place)
+        code, finger = frame[place] & 0xF0, frame[place] >> 2 & 3
+        if code not in SIZES or finger > 1 or (code, finger) in found:
+            return None, seen
+        found[code, finger] = place + 1
+        place += 1 + SIZES[code]
+    return found if place == len(frame) and found else None, seen
+
+
+def _alike(frames: Bytes, rows: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.intp], Layout | None]]:
+    """Yield those ``rows`` of frames of one size that have the same layout, and the layout."""
+    while len(rows):
+        layout, seen = _layout(frames[rows[0]].tobytes())
+        some = frames[:, seen] if len(rows) == len(frames) else frames[np.ix_(rows, np.array(seen))]
+        same = (some == some[0]).all(axis=1)
+        yield rows[same], layout
+        rows = rows[~same]
+
+
+def _is_packet(frames: Bytes) -> NDArray[np.bool_]:
+    """Return which frames (frame, byte) of one size are made of known fields, or are a version."""
+    good = (frames[:, 0] == START) & (_sizes(frames[:, :HEADER]) == frames.shape[1])
+    for rows, layout in _alike(frames, np.flatnonzero(good & (frames[:, 2] != VERSION))):
+        good[rows] = layout is not None
+    return np.asarray(good)

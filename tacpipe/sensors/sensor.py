@@ -1,0 +1,138 @@
+"""What a sensor is to tacpipe: bytes in, samples out, what it must be told, and the device's side of it for the emulator.
+
+A product is one file with one frozen dataclass, a `Sensor`. Its fields are the options of the rig file, each with a
+comment that is its help. Nothing here does input or output: a link carries the bytes, see `tacpipe.sensors.links`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.sensors.framing import Framer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Frames = Any  # NDArray[np.uint8] (frame, byte) of frames of one size, or list[bytes] where they are text
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What frames say. ``values`` are blocks (sample, channel), side by side in the order of the sensor's fields."""
+
+    values: tuple[NDArray[Any], ...]
+    seq: NDArray[np.int64] | None = (
+        None  # (sample,), the counter as the frame holds it; `Sensor.counter` is its modulus
+    )
+    t_device_ns: NDArray[np.int64] | None = None  # (sample,), when the device says that the sample was taken
+    device_seq: NDArray[np.int64] | None = None  # (sample,), a second counter, of samples taken rather than sent
+    rows: NDArray[np.int64] | None = None  # (sample,), the frame that each is of; None: one a frame, in order
+
+    def __len__(self) -> int:
+        return len(self.values[0]) if self.values else 0
+
+
+@dataclass(frozen=True)
+class Ask:
+    """What is written to a device while a stream is opened or tared, and the reply that is waited for.
+
+    ``until`` is given what came since and returns how many of these bytes the reply takes, 0 while it is not whole; without
+    it nothing is waited for but ``pause_s``. It may raise `TacpipeError` for a reply that means no.
+    """
+
+    send: bytes
+    until: Callable[[bytes], int] | None = None
+    timeout_s: float = 2.0
+    pause_s: float = 0.0
+    what: str = "a reply"  # for the sentence when none comes
+
+
+Dialogue = Generator[Ask, bytes, None]  # yields what is asked, is sent the reply
+
+
+@dataclass(frozen=True)
+class Line:
+    """How a serial port is set for a sensor; None leaves a control line as it is."""
+
+    dtr: bool | None = None
+    rts: bool | None = None
+    settle_s: float = 0.0  # of silence and boot text after opening, which is thrown away
+
+
+@dataclass
+class Device:
+    """The device's side of a protocol, as the emulator plays it: this one streams from the start and hears nothing."""
+
+    streaming: bool = True
+    rate_hz: float | None = None  # None: the sensor's own; a device that is told its rate sets it
+    heard: bytearray = field(default_factory=bytearray)
+
+    def hear(self, data: bytes) -> list[bytes]:
+        """Take what the host wrote and return the replies to it, in order."""
+        return []
+
+    def polled(self) -> int:
+        """Return how many frames the host has asked for since the last call; always 0 of a device that streams."""
+        return 0
+
+
+class Sensor:
+    """A product. Subclasses are frozen dataclasses, registered under the entry-point group ``tacpipe.sensors``."""
+
+    summary: ClassVar[str] = ""  # one sentence: what it is
+    product: ClassVar[str] = ""  # what recordings name it in their attribute ``sensor``; empty: the registered name
+    links: ClassVar[tuple[str, ...]] = ("serial",)  # schemes of addresses it can be reached by
+    line: ClassVar[Line] = Line()
+    counter: ClassVar[int | None] = None  # modulus of ``seq``; None: the device does not count
+    device_counter: ClassVar[int | None] = None  # modulus of ``device_seq``
+    step: ClassVar[int] = 1  # by which ``seq`` grows from a sample to the next
+    exclusive: ClassVar[str] = ""  # what else cannot use the device meanwhile; a sentence, empty: nothing
+    usb_ids: ClassVar[tuple[str, ...]] = ()  # "16d0:14cc": vendor and product, where the product has its own
+
+    rate_hz: float  # samples a second
+    baud: int  # of a serial port
+
+    def fields(self) -> list[pa.Field]:
+        """Return the arrow field of each channel: name, native type, unit, quantity and layout."""
+        raise NotImplementedError
+
+    def framer(self) -> Framer:
+        """Return a new framer, which cuts what a link gives into frames."""
+        raise NotImplementedError
+
+    def decode(self, frames: Frames) -> Samples:
+        """Return the samples of frames of one size; frames that hold none (replies, messages) are not in ``rows``."""
+        raise NotImplementedError
+
+    def encode(self, samples: Samples) -> Frames:
+        """Return the frames that hold these samples: the inverse of `decode`."""
+        raise NotImplementedError
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Say what the device must be told before it streams; ``local`` holds what the link knows (``port``)."""
+        yield from ()
+
+    def closing(self) -> bytes:
+        """Return what is written when a stream ends."""
+        return b""
+
+    def taring(self) -> Dialogue:
+        """Say what makes the device take its present reading for zero; nothing where it has no such command."""
+        yield from ()
+
+    def request(self) -> bytes:
+        """Return what is written to have one frame sent, of a device that must be asked for each; empty: it streams."""
+        return b""
+
+    def answer(self, chunk: bytes) -> bytes:
+        """Return what must be written at once in reply to a packet; empty: nothing."""
+        return b""
+
+    def device(self) -> Device:
+        """Return the device's side, for the emulator."""
+        return Device()

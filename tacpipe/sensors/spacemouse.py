@@ -1,0 +1,147 @@
+"""3Dconnexion SpaceMouse on HID: what its cap is pushed and turned by, and its buttons, a row an event.
+
+A report says a part of the state: number 1 translation and rotation, six little-endian int16, or, of older devices,
+translation alone and number 2 rotation; number 3 the buttons, a bit each; number 23 of wireless ones the battery. A
+push goes to about 350.
+Source: the reports as hidraw gives them, number first.
+
+An event tells one part and leaves the others as they were. `StateFramer` keeps that state and makes of every report a
+frame that says all of it, so that `SpaceMouse.decode` needs no memory. Until a part was told it is 0: the cap at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.formats.channels import AXES
+from tacpipe.sensors.framing import MALFORMED, Account, Bytes, Chunks, Framer, Loss, Run
+from tacpipe.sensors.sensor import Frames, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+TRANSLATION, ROTATION, BUTTONS, BATTERY = 1, 2, 3, 23
+SIZES = {TRANSLATION: (13, 7), ROTATION: (7,), BUTTONS: tuple(range(2, 8)), BATTERY: (2, 3)}  # bytes, number included
+PARTS = {TRANSLATION: slice(0, 6), ROTATION: slice(6, 12), BUTTONS: slice(12, 16)}  # bytes of the state
+FRAME = 17  # number of the report, 6 axes, 32 buttons
+LONGEST = 13
+
+
+@dataclass(frozen=True)
+class SpaceMouse(Sensor):
+    """A SpaceMouse, for teleoperation."""
+
+    summary: ClassVar[str] = "3Dconnexion SpaceMouse on HID: six axes and buttons, a row an event."
+    links: ClassVar[tuple[str, ...]] = ("hid",)
+    usb_ids: ClassVar[tuple[str, ...]] = ("256f:c635",)
+
+    rate_hz: float = 125.0  # events a second while the cap is moved; none come while it rests
+    split: bool = False  # rotation comes in a report of its own, as from older devices
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= 1000:
+            raise UsageError(f"spacemouse: rate_hz is {self.rate_hz:g}; it must be more than 0 and at most 1000.")
+
+    def fields(self) -> list[pa.Field]:
+        """Return six axes, ``translation_x`` to ``rotation_z`` (int16 counts), and ``buttons`` (uint32, a bit each)."""
+        import pyarrow as pa
+
+        axes = [
+            pa.field(
+                f"{kind}_{axis}", pa.int16(), metadata={"unit": "count", "quantity": "deflection", "component": axis}
+            )
+            for kind in ("translation", "rotation")
+            for axis in AXES
+        ]
+        return [*axes, pa.field("buttons", pa.uint32(), metadata={"unit": "1", "quantity": "status"})]
+
+    def framer(self) -> Framer:
+        """Return a framer that makes of each report a frame with the whole state."""
+        return StateFramer()
+
+    def decode(self, frames: Frames) -> Samples:
+        """Return axes and buttons of frames as `StateFramer` makes them; a battery's report has no sample.
+
+        Reports as `encode` gives them are taken as the first since the cap was at rest.
+        """
+        if isinstance(frames, list):
+            frames = merged(frames, np.zeros(FRAME, dtype=np.uint8))
+        rows = np.flatnonzero(frames[:, 0] != BATTERY)
+        axes = np.ascontiguousarray(frames[rows, 1:13]).view("<i2").astype(np.int16)
+        buttons = np.ascontiguousarray(frames[rows, 13:]).view("<u4").astype(np.uint32)
+        return Samples((axes, buttons), rows=rows)
+
+    def encode(self, samples: Samples) -> list[bytes]:
+        """Return a report a sample: of the part that differs from the sample before, at first from rest.
+
+        Where several parts differ, a report cannot say so: the buttons go first, then rotation where it is ``split``.
+        """
+        axes, buttons = samples.values
+        axes_bytes = np.ascontiguousarray(axes, "<i2").view(np.uint8)
+        state = np.hstack([axes_bytes, np.ascontiguousarray(buttons, "<u4").view(np.uint8)])  # (sample, byte)
+        differs = np.diff(state.astype(np.int16), axis=0, prepend=0) != 0
+        told = np.where(differs[:, 6:12].any(axis=1) & self.split, ROTATION, TRANSLATION)
+        told[differs[:, 12:].any(axis=1)] = BUTTONS
+        reports = []
+        for number, row in zip(told.tolist(), state, strict=True):
+            part = row[:12] if number == TRANSLATION and not self.split else row[PARTS[number]]
+            reports.append(bytes([number]) + part.tobytes())
+        return reports
+
+
+class StateFramer:
+    """Takes each packet for a report and gives out the state that it leads to: frames of 17 bytes.
+
+    The account counts the bytes of the reports.
+    """
+
+    def __init__(self) -> None:
+        self.account = Account()
+        self._state = np.zeros(FRAME, dtype=np.uint8)
+
+    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+        """Return a frame a report, and packets that are none as losses."""
+        self.account.received += len(chunks.data)
+        packets = chunks.packets()
+        good = np.array([len(packet) in SIZES.get(packet[0] if packet else 0, ()) for packet in packets], dtype=bool)
+        reports = [packet for packet, fine in zip(packets, good, strict=True) if fine]
+        losses = [Loss(int(chunks.t_ns[row]), MALFORMED, 1, len(packets[row])) for row in np.flatnonzero(~good)]
+        self.account.framed += sum(len(report) for report in reports)
+        self.account.lost += sum(loss.bytes for loss in losses)
+        if not reports:
+            return [], losses
+        frames = merged(reports, self._state)
+        self._state = frames[-1].copy()
+        return [Run(frames, chunks.t_ns[good])], losses
+
+    def flush(self) -> tuple[list[Run], list[Loss]]:
+        """Return nothing: a report is whole or it is none."""
+        return [], []
+
+
+def merged(reports: Sequence[bytes], state: Bytes) -> Bytes:
+    """Return the state (report, 17) after each of ``reports``, of which the first one changes ``state`` (17,)."""
+    sizes = np.array([len(report) for report in reports])
+    padded = np.frombuffer(b"".join(report.ljust(LONGEST, b"\0") for report in reports), np.uint8).reshape(-1, LONGEST)
+    number = padded[:, 0]
+    frames = np.vstack([state, np.zeros((len(reports), FRAME), dtype=np.uint8)])
+    frames[1:, 0] = number
+    both = (number == TRANSLATION) & (sizes == LONGEST)
+    _carry(frames[:, 1:], PARTS[TRANSLATION], number == TRANSLATION, padded[:, 1:7])
+    turned = np.where(both[:, None], padded[:, 7:13], padded[:, 1:7])
+    _carry(frames[:, 1:], PARTS[ROTATION], (number == ROTATION) | both, turned)
+    _carry(frames[:, 1:], PARTS[BUTTONS], number == BUTTONS, padded[:, 1:5])
+    return frames[1:]
+
+
+def _carry(frames: Bytes, place: slice, told: NDArray[np.bool_], said: Bytes) -> None:
+    """Write a part of the state into ``frames``, whose first row is that before: where it was told, and on from there."""
+    frames[1:, place][told] = said[told]
+    last = np.maximum.accumulate(np.where(told, np.arange(1, len(told) + 1), 0))
+    frames[1:, place] = frames[last, place]

@@ -1,0 +1,219 @@
+"""A tap: what a lab's own programs know, sent to the recording as lines of JSON by UDP.
+
+A line is one record, ``{"width_m": 0.031, "phase": "lift"}``; a packet holds one or several. The rig file tells which keys
+become columns of numbers; the whole record is kept as text beside them, so nothing that was sent is lost. Keys with a
+meaning: ``seq`` and ``t_ns`` where the options promise them, ``event`` (start, stop, label, or another word), and ``grasp``,
+``{"g1": [x, y, z], "g2": [x, y, z], "R": [[…], […], […]]}`` in metres, whose columns of R are the wrist's axes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.sensors.framing import Framer, TextFramer
+from tacpipe.sensors.sensor import Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Record = Mapping[str, Any]
+
+TOLD = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key, of a part as in pose.x or q.0, with its unit
+TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
+LARGEST = 1 << 62  # of counters and times
+
+
+@dataclass(frozen=True)
+class Tap(Sensor):
+    """Records of a program. A key that a record lacks is NaN in its column; text where a number was told is refused."""
+
+    summary: ClassVar[str] = "Records of your own programs, sent as lines of JSON by UDP."
+    links: ClassVar[tuple[str, ...]] = ("udp",)
+    listens: ClassVar[bool] = True
+
+    numbers: tuple[str, ...] = ()  # keys that become columns, with their units: "width_m:m", "pose.x", "q.0:rad"
+    grasp: Literal["", "points", "wrist"] = (
+        ""  # keep grasps alone: their points, or points and wrist; empty: any record
+    )
+    counted: bool = False  # each record has a key seq that grows by 1, so that lost ones are known
+    timed: bool = False  # each record has a key t_ns, ns on the program's own clock, when it is true
+    rate_hz: float = 0.0  # records a second; 0: they come when they come
+
+    def __post_init__(self) -> None:
+        columns = [_column(told) for told in self.numbers]
+        for told, column in zip(self.numbers, columns, strict=True):
+            if not TOLD.fullmatch(told) or column in TAKEN or columns.count(column) > 1 or not column[0].isalpha():
+                raise UsageError(
+                    f"tap: {told!r} among numbers makes no column; name each key once, with its unit behind a colon, as "
+                    f"width_m:m or pose.x, and none of {', '.join(TAKEN)}."
+                )
+        if self.grasp and self.numbers:
+            raise UsageError(f"tap: a stream of grasps has no other columns; leave numbers ({self.numbers[0]}) out.")
+        object.__setattr__(self, "counter", LARGEST if self.counted else None)
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``event`` and ``json``, text, and the numbers, float64; of grasps the columns of `Grasp.table`."""
+        import pyarrow as pa
+
+        from tacpipe.formats import channels
+
+        if self.grasp:
+            fields = [channels.float_field(name, "m", "position", name[3]) for name in POINTS]
+            turned = [channels.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
+            return fields + turned if self.grasp == "wrist" else fields
+        numbers = [channels.float_field(_column(told), _unit(told), "state") for told in self.numbers]
+        text = {"unit": "1", "quantity": "text"}
+        return [*(pa.field(name, pa.string(), metadata=text) for name in ("event", "json")), *numbers]
+
+    def framer(self) -> Framer:
+        """Return a framer that takes packets all of whose lines are records with what the options promise."""
+        return TextFramer(self._is_right)
+
+    def decode(self, frames: Sequence[bytes]) -> Samples:
+        """Return a sample for each record; of grasps, for each record that holds one."""
+        found = [(row, line, json.loads(line)) for row, frame in enumerate(frames) for line in _lines(frame)]
+        found = [one for one in found if not self.grasp or "grasp" in one[2]]
+        records = [record for _, _, record in found]
+        if self.grasp:
+            values: tuple[NDArray[Any], ...] = (self._grasps(records),)
+        else:
+            texts = [[str(record.get("event", "")), line.decode()] for _, line, record in found]
+            values = (np.array(texts, dtype=object).reshape(len(found), 2), self._numbers(records))
+        return Samples(
+            values,
+            seq=np.array([record["seq"] for record in records], dtype=np.int64) if self.counted else None,
+            t_device_ns=np.array([record["t_ns"] for record in records], dtype=np.int64) if self.timed else None,
+            rows=np.array([row for row, _, _ in found], dtype=np.int64),
+        )
+
+    def encode(self, samples: Samples) -> list[bytes]:
+        """Return a packet for each record: its text where there is one, or else a record of its numbers."""
+        records: list[dict[str, Any]] = [{} for _ in range(len(samples))]
+        for name, stamps in (("seq", samples.seq), ("t_ns", samples.t_device_ns)):
+            for record, stamp in zip(records, () if stamps is None else stamps.tolist(), strict=stamps is not None):
+                record[name] = stamp
+        if self.grasp:
+            for record, row in zip(records, samples.values[0].tolist(), strict=True):
+                record["grasp"] = {"g1": row[:3], "g2": row[3:6]}
+                if self.grasp == "wrist":
+                    record["grasp"]["R"] = np.reshape(row[6:], (3, 3)).T.tolist()
+            return [json.dumps(record).encode() for record in records]
+        texts, numbers = samples.values
+        for record, (event, _), row in zip(records, texts.tolist(), numbers.tolist(), strict=True):
+            record |= {"event": event} if event else {}
+            for told, number in zip(self.numbers, row, strict=True):
+                if not math.isnan(number):
+                    _put(record, _path(told), number)
+        return [
+            (text or json.dumps(record)).encode() for record, (_, text) in zip(records, texts.tolist(), strict=True)
+        ]
+
+    def _is_right(self, packet: bytes) -> bool:
+        try:
+            records = [json.loads(line.decode()) for line in _lines(packet)]
+            return bool(records) and all(self._holds(record) for record in records)
+        except (ValueError, RecursionError):  # no JSON, no UTF-8, or lists within lists without end
+            return False
+
+    def _holds(self, record: Any) -> bool:
+        """Return whether a line is a record, numbers are where numbers were told, and what is promised is there.
+
+        Raises `ValueError` for an event that is no text in UTF-8.
+        """
+        if not isinstance(record, dict) or not isinstance(record.get("event", ""), str):
+            return False
+        record.get("event", "").encode()
+        promised = [name for name, told in (("seq", self.counted), ("t_ns", self.timed)) if told]
+        if not all(type(record.get(name)) is int and 0 <= record[name] < LARGEST for name in promised):
+            return False
+        if self.grasp:
+            return "grasp" not in record or _is_grasp(record["grasp"], turned=self.grasp == "wrist")
+        found = [_at(record, _path(told)) for told in self.numbers]
+        return all(value is None or isinstance(value, float) or _is_whole(value) for value in found)
+
+    def _numbers(self, records: Sequence[Record]) -> NDArray[np.float64]:
+        """Return the numbers (sample, channel) of records, NaN where there is none."""
+        found = np.full((len(records), len(self.numbers)), np.nan)
+        for column, told in enumerate(self.numbers):
+            path = _path(told)
+            for row, record in enumerate(records):
+                value = _at(record, path)
+                if value is not None:
+                    found[row, column] = value
+        return found
+
+    def _grasps(self, records: Sequence[Record]) -> NDArray[np.float64]:
+        """Return points and wrist (sample, channel) of records, in the order of the columns."""
+        rows = [[*grasp["g1"], *grasp["g2"]] for grasp in (record["grasp"] for record in records)]
+        points = np.array(rows, dtype=np.float64).reshape(len(records), len(POINTS))
+        if self.grasp == "points":
+            return points
+        wrists = np.array([record["grasp"]["R"] for record in records], dtype=np.float64).reshape(-1, 3, 3)
+        return np.hstack([points, wrists.transpose(0, 2, 1).reshape(len(records), len(WRIST))])
+
+
+def _is_grasp(told: Any, *, turned: bool) -> bool:
+    """Return whether a record's grasp is one that a hand can make, with its wrist where that is wanted."""
+    try:
+        points = [np.array(told[name], dtype=np.float64) for name in ("g1", "g2")]
+        wrist = np.array(told["R"], dtype=np.float64) if turned else None
+        if any(point.shape != (3,) for point in points):
+            return False
+        Grasp(points[0], points[1], wrist)
+    except (TacpipeError, ValueError, TypeError, KeyError):
+        return False
+    return True
+
+
+def _is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number, true or false."""
+    return isinstance(value, int) and abs(value) < LARGEST
+
+
+def _lines(packet: bytes) -> list[bytes]:
+    return [line.strip() for line in packet.split(b"\n") if line.strip()]
+
+
+def _path(told: str) -> tuple[str, ...]:
+    return tuple(told.partition(":")[0].split("."))
+
+
+def _column(told: str) -> str:
+    """Return the name of a number's column.
+
+    >>> _column("pose.x:m")
+    'pose_x'
+    """
+    return "_".join(_path(told)).lower()
+
+
+def _unit(told: str) -> str:
+    return told.partition(":")[2] or "1"
+
+
+def _at(record: Any, path: Sequence[str]) -> Any:
+    """Return what a record holds at a path of keys and places in lists, None where nothing is there."""
+    for part in path:
+        if isinstance(record, Mapping):
+            record = record.get(part)
+        elif isinstance(record, list) and part.isdecimal() and int(part) < len(record):
+            record = record[int(part)]
+        else:
+            return None
+    return record
+
+
+def _put(record: dict[str, Any], path: Sequence[str], value: float) -> None:
+    for part in path[:-1]:
+        record = record.setdefault(part, {})
+    record[path[-1]] = value

@@ -1,0 +1,109 @@
+"""Terabee TeraRanger Evo 60m and its kin: one distance along a line of sight, over USB or a UART.
+
+Frames of 4 bytes in binary mode: ``54``, the distance in mm, big-endian, and the CRC-8 (polynomial 0x07) of what is
+before.
+Source: TeraRanger Evo user manual; the commands' last bytes are the CRC-8 of the others, which the tests recompute.
+
+Distances stay as they were sent, codes included: 0 is too near, 1 could not be measured, 65535 is too far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.sensors.checks import crc8
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MARKER = b"\x54"
+SIZE = 4
+BINARY = bytes.fromhex("00 11 02 4C")  # frames as here, rather than text
+START, STOP = bytes.fromhex("00 52 02 01 DF"), bytes.fromhex("00 52 02 00 D8")
+FASTEST_HZ = 240.0  # of the Evo 60m
+
+
+@dataclass(frozen=True)
+class TeraRanger(Sensor):
+    """A TeraRanger Evo in binary mode."""
+
+    summary: ClassVar[str] = "Terabee TeraRanger Evo distance sensors over USB or a UART, binary mode."
+
+    rate_hz: float = FASTEST_HZ  # as the sensor runs in its range mode, up to 240
+    baud: int = 115200  # over USB any
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= FASTEST_HZ:
+            raise UsageError(
+                f"teraranger: rate_hz is {self.rate_hz:g}; it must be the rate at which the sensor runs, up to 240."
+            )
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``distance``, uint16 mm."""
+        import pyarrow as pa
+
+        return [pa.field("distance", pa.uint16(), metadata={"unit": "mm", "quantity": "proximity"})]
+
+    def framer(self) -> Framer:
+        """Return a framer of frames with their CRC, each confirmed by the next: the CRC has 8 bits."""
+        return ByteFramer(Framing(marker=MARKER, size=SIZE, check=_crc_is_right, lock=3, confirm=1))
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the distance (frame, 1)."""
+        return Samples((np.ascontiguousarray(frames[:, 1:3]).view(">u2").astype(np.uint16),))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these distances."""
+        (distance,) = samples.values
+        marker = np.full((len(distance), 1), MARKER[0], dtype=np.uint8)
+        body = np.hstack([marker, np.ascontiguousarray(distance, ">u2").view(np.uint8)])
+        return np.hstack([body, crc8(body)[:, None]])
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Ask for binary frames and start the stream, which older firmware does by itself."""
+        yield Ask(BINARY, pause_s=0.1)
+        yield Ask(START)
+
+    def closing(self) -> bytes:
+        """Stop the stream."""
+        return STOP
+
+    def device(self) -> Device:
+        """Return a sensor that waits for the command to start."""
+        return _Evo(streaming=False)
+
+
+class _Evo(Device):
+    """The sensor's side. It gives frames in binary mode alone, so text mode is silence here."""
+
+    binary = False
+    started = False
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        while (start := self.heard.find(0x00)) >= 0 and len(self.heard) >= start + 4:
+            size = 4 if self.heard[start + 1] == BINARY[1] else 5
+            if len(self.heard) < start + size:
+                break
+            told = bytes(self.heard[start : start + size])
+            if told not in (BINARY, START, STOP):
+                del self.heard[: start + 1]
+                continue
+            del self.heard[: start + size]
+            self.binary = self.binary or told == BINARY
+            self.started = told == START if told != BINARY else self.started
+            self.streaming = self.binary and self.started
+        return []
+
+
+def _crc_is_right(frames: Bytes) -> NDArray[np.bool_]:
+    right: NDArray[np.bool_] = crc8(frames[:, :-1]) == frames[:, -1]
+    return right

@@ -1,0 +1,193 @@
+"""Benewake TFmini, TFmini-S and TFmini Plus: one distance along a line of sight, over a UART.
+
+Frames of 9 bytes: ``59 59``, little-endian distance and strength, two bytes that differ by model, and the 8-bit sum of
+all before. Commands to Plus and S are ``5A``, their length, a number, what they say and the 8-bit sum. The original has
+none here.
+Source: Benewake's manuals of TFmini (SJ-PM-TFmini-T-01), TFmini-S (SJ-PM-TFmini-S) and TFmini Plus
+(SJ-GU-TFmini-Plus-01).
+
+Distances stay as they were sent, codes included:
+
+======== =====================================================================================
+distance what it says
+======== =====================================================================================
+0        nothing was measured (Plus, S)
+65535    the signal is too weak to be trusted: strength below 100, of the original below 20
+65534    the signal saturates (S: strength reads 65535)
+65532    the ambient light saturates (S)
+1200     original, in cm: farther than 12 m
+======== =====================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.sensors.checks import sum8
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MARKER = b"\x59\x59"
+SIZE = 9
+BITS = 10 * SIZE  # of a frame on the line, start and stop bits included
+VERSION, RATE, UNIT, ENABLE, SAVE = 0x01, 0x03, 0x05, 0x07, 0x11  # numbers of commands
+UNITS = {"cm": 1, "mm": 6}
+MODELS = ("original", "s", "plus")
+
+
+@dataclass(frozen=True)
+class TfMini(Sensor):
+    """A TFmini, TFmini-S or TFmini Plus."""
+
+    summary: ClassVar[str] = "Benewake TFmini, TFmini-S and TFmini Plus distance sensors over a UART."
+
+    model: Literal["original", "s", "plus"] = "plus"  # which of the three; S and Plus can be told rate and unit
+    unit: Literal["cm", "mm"] = "cm"  # of the distance
+    rate_hz: float = 100.0  # 1000 divided by a whole number; the original's is 100
+    save: bool = True  # keep rate and unit in the sensor's flash, as the manual asks for
+    baud: int = 115200  # as the sensor is set
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS or self.unit not in UNITS:
+            raise UsageError(
+                f"tfmini: model {self.model!r} with unit {self.unit!r} is unknown; "
+                f"take one of {', '.join(MODELS)}, and cm or mm."
+            )
+        if self.model == "original" and (self.rate_hz != 100 or self.unit != "cm"):
+            raise UsageError(
+                f"tfmini: the original is asked for {self.rate_hz:g} Hz in {self.unit}; it gives 100 Hz in cm alone."
+            )
+        if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - round(1000 / self.rate_hz)) > 1e-6 * self.rate_hz:
+            raise UsageError(
+                f"tfmini: rate_hz is {self.rate_hz:g}; it must be 1000 divided by a whole number, as 1000, 500, 250 or 100."
+            )
+        if self.rate_hz * BITS > self.baud:
+            raise UsageError(
+                f"tfmini: {self.rate_hz:g} frames a second take {self.rate_hz * BITS:g} baud and the line has {self.baud}; "
+                f"lower rate_hz or set the sensor and baud to 460800."
+            )
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``distance`` and ``strength``, uint16, and what else the model sends.
+
+        Of Plus and S ``temperature`` (uint16; in °C it is the count / 8 - 256), of the original ``mode`` and ``spare``
+        (uint8).
+        """
+        import pyarrow as pa
+
+        fields = [
+            pa.field("distance", pa.uint16(), metadata={"unit": self.unit, "quantity": "proximity"}),
+            pa.field("strength", pa.uint16(), metadata={"unit": "count", "quantity": "signal_strength"}),
+        ]
+        if self.model == "original":
+            status = {"unit": "1", "quantity": "status"}
+            return [
+                *fields,
+                pa.field("mode", pa.uint8(), metadata=status),
+                pa.field("spare", pa.uint8(), metadata=status),
+            ]
+        return [*fields, pa.field("temperature", pa.uint16(), metadata={"unit": "count", "quantity": "temperature"})]
+
+    def framer(self) -> Framer:
+        """Return a framer of frames with their sum, each confirmed by the next: the sum has 8 bits."""
+        return ByteFramer(Framing(marker=MARKER, size=SIZE, check=_sum_is_right, confirm=1))
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return distance and strength, and what the model sends beside them."""
+        words = np.ascontiguousarray(frames[:, 2:8]).view("<u2").astype(np.uint16)  # (frame, word)
+        if self.model == "original":
+            return Samples((words[:, :2], np.ascontiguousarray(frames[:, 6:8])))
+        return Samples((words,))
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the frames of these samples."""
+        words, *rest = samples.values
+        marker = np.broadcast_to(np.frombuffer(MARKER, np.uint8), (len(words), 2))
+        body = np.hstack([marker, np.ascontiguousarray(words, "<u2").view(np.uint8), *rest])
+        return np.hstack([body, sum8(body)[:, None]])
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Set unit and rate and switch the stream on; the original streams by itself and is told nothing."""
+        if self.model == "original":
+            return
+        yield _asked(UNIT, bytes([UNITS[self.unit]]))
+        yield _asked(RATE, round(self.rate_hz).to_bytes(2, "little"))
+        if self.save:
+            yield _asked(SAVE)
+        yield _asked(ENABLE, b"\x01")
+
+    def device(self) -> Device:
+        """Return a sensor that streams from power-on and answers commands."""
+        return Device() if self.model == "original" else _TfMini()
+
+
+class _TfMini(Device):
+    """The sensor's side: every command is answered with itself, or with whether it was done."""
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        replies = []
+        while (start := self.heard.find(0x5A)) >= 0 and len(self.heard) >= start + 2:
+            size = self.heard[start + 1]
+            if len(self.heard) < start + size:
+                break
+            told = bytes(self.heard[start : start + size])
+            del self.heard[: start + max(size, 1)]
+            if size >= 4 and command(told[2], told[3:-1]) == told:
+                replies += self._done(told[2], told[3:-1])
+        return replies
+
+    def _done(self, number: int, said: bytes) -> list[bytes]:
+        if number == VERSION:
+            return [command(VERSION, b"\x01\x02\x03")]
+        if number == SAVE:
+            return [command(SAVE, b"\x00")]
+        if number == RATE:
+            self.rate_hz = float(int.from_bytes(said, "little")) or None
+        if number == ENABLE:
+            self.streaming = said == b"\x01"
+        return [command(number, said)] if number in (RATE, UNIT, ENABLE) else []
+
+
+def command(number: int, said: bytes = b"") -> bytes:
+    """Return a command to the sensor, or its reply.
+
+    >>> command(0x03, (100).to_bytes(2, "little")).hex(" ")
+    '5a 06 03 64 00 c7'
+    """
+    body = bytes([0x5A, len(said) + 4, number]) + said
+    return body + bytes([sum(body) & 0xFF])
+
+
+def _asked(number: int, said: bytes = b"") -> Ask:
+    return Ask(command(number, said), until=_reply(number, said), what=f"the reply to command {number:#04x}")
+
+
+def _reply(number: int, said: bytes) -> Callable[[bytes], int]:
+    """Return what tells how many bytes there are up to the end of the reply, frames before it included."""
+    size = 5 if number == SAVE else len(said) + 4
+    head = bytes([0x5A, size, number])
+
+    def until(data: bytes) -> int:
+        found = data.find(head)
+        if found < 0 or len(data) < found + size:
+            return 0
+        if number == SAVE and data[found + 3]:
+            raise DeviceError("The TFmini did not save its settings; set save = false to do without.")
+        return found + size
+
+    return until
+
+
+def _sum_is_right(frames: Bytes) -> NDArray[np.bool_]:
+    right: NDArray[np.bool_] = sum8(frames[:, :-1]) == frames[:, -1]
+    return right

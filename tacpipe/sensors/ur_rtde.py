@@ -1,0 +1,243 @@
+"""Universal Robots arms by RTDE, the real-time data exchange of their controllers, protocol version 2.
+
+Packages over TCP, big-endian: u16 size with this header, u8 type, payload. The host says which version it speaks, how often
+it wants which outputs (a recipe), and starts; a data package is then the recipe's number and the outputs one by one. Reading
+takes no right to move the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.ur_outputs import POSE, WIRE, fields_of, type_of
+from tacpipe.signals import rotations
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+HEADER = struct.Struct(">HB")
+PROTOCOL = 2
+VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvMUOISP"
+KINDS = (VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE)
+STAMP = "timestamp"  # seconds since the controller started
+EMULATED = (5, 11, 0, 0)  # controller's version: major, minor, bugfix, build
+MOST = 1e12  # no output of a controller is as large: metres, newtons, radians, seconds since its start
+LARGEST = 4096  # bytes of a package
+
+
+@dataclass(frozen=True)
+class UrRtde(Sensor):
+    """The arm of a UR controller. RTDE does not count; what the controller skips shows in its time."""
+
+    summary: ClassVar[str] = "Universal Robots arms by RTDE (CB3 from 3.4, e-Series)."
+    links: ClassVar[tuple[str, ...]] = ("tcp",)
+
+    outputs: tuple[str, ...] = (  # names of RTDE outputs; the time is always among them
+        "actual_q",
+        "actual_qd",
+        POSE,
+        "actual_TCP_speed",
+        "actual_TCP_force",
+    )
+    rate_hz: float = 500.0  # 500 at most of an e-Series, 125 of a CB3
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.outputs if type_of(name) is None or name == STAMP]
+        if unknown or not self.outputs or len(set(self.outputs)) < len(self.outputs):
+            named = f"{unknown[0]} among its outputs" if unknown else f"the outputs {', '.join(self.outputs) or 'none'}"
+            raise UsageError(
+                f"ur-rtde has {named}; name each output of the RTDE guide once, as actual_q or output_int_register_24. "
+                f"The time comes by itself."
+            )
+        if not 1 <= self.rate_hz <= 500:
+            raise UsageError(f"ur-rtde: rate_hz is {self.rate_hz:g}; a controller sends 1 to 500 a second.")
+
+    @property
+    def package(self) -> np.dtype[np.void]:
+        """A data package: header, recipe, the time, and the outputs."""
+        return np.dtype(
+            [("size", ">u2"), ("type", "u1"), ("recipe", "u1"), (STAMP, ">f8")]
+            + [(name, *WIRE[type_of(name) or ""]) for name in self.outputs]
+        )
+
+    def fields(self) -> list[pa.Field]:
+        """Return the fields of the outputs: joints, pose, speed and load named as those of other arms, others by name."""
+        return [field for name in self.outputs for field in fields_of(name)]
+
+    def framer(self) -> Framer:
+        """Return a framer of packages; one of data must be as long as the recipe says, and have another behind it.
+
+        There is no sum; a package that was cut would take its missing bytes from the next.
+        """
+        size = self.package.itemsize
+
+        def check(frames: Bytes) -> NDArray[np.bool_]:
+            kinds = frames[:, 2]
+            data = (kinds == DATA) & (frames.shape[1] == size)
+            if data.any():
+                data &= (frames[:, 3] > 0) & _are_numbers(
+                    np.ascontiguousarray(frames[:, :size]).view(self.package)[:, 0]
+                )
+            return np.asarray(data | (np.isin(kinds, KINDS) & (kinds != DATA)))
+
+        return ByteFramer(Framing(header=HEADER.size, sizes=_sizes, most=LARGEST, check=check, confirm=1))
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the samples of data packages, with the controller's time; other packages hold none."""
+        dtype = self.package
+        rows = np.flatnonzero(frames[:, 2] == DATA) if frames.shape[1] == dtype.itemsize else np.zeros(0, np.int64)
+        found = np.ascontiguousarray(frames[rows][:, : dtype.itemsize])
+        packages = found.view(dtype)[:, 0] if len(rows) else np.zeros(0, dtype)
+        return Samples(
+            tuple(_native(packages[name], name) for name in self.outputs),
+            t_device_ns=np.rint(packages[STAMP] * 1e9).astype(np.int64),
+            rows=rows.astype(np.int64),
+        )
+
+    def encode(self, samples: Samples) -> Bytes:
+        """Return the data packages that hold these samples."""
+        assert samples.t_device_ns is not None
+        packages = np.zeros(len(samples), self.package)
+        packages["size"], packages["type"], packages["recipe"] = self.package.itemsize, DATA, 1
+        packages[STAMP] = samples.t_device_ns / 1e9
+        for name, block in zip(self.outputs, samples.values, strict=True):
+            wire = np.hstack([block[:, :3], rotations.vectors_of(block[:, 3:])]) if name == POSE else block
+            packages[name] = wire[:, 0] if packages[name].ndim == 1 else wire
+        return packages.view(np.uint8).reshape(len(samples), self.package.itemsize)
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Agree on the version, ask for the outputs, start. Raises `DeviceError` where the controller refuses."""
+        reply = yield _ask(VERSION, PROTOCOL.to_bytes(2, "big"))
+        if _payload(reply) != b"\1":
+            raise DeviceError(
+                "The controller does not speak RTDE version 2. Update it to CB3 3.10, e-Series 5.4 or later."
+            )
+        names = (STAMP, *self.outputs)
+        reply = yield _ask(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(names).encode())
+        recipe, kinds = _payload(reply)[:1], _payload(reply)[1:].decode("latin-1").split(",")
+        for name, kind in zip(names, kinds, strict=False):
+            if kind != type_of(name):
+                raise DeviceError(
+                    f"The controller says {kind} to the output {name}, which should be {type_of(name)}. Leave it out of "
+                    f"the option outputs, or update the controller."
+                )
+        if len(kinds) != len(names) or recipe in (b"", b"\0"):
+            raise DeviceError(f"The controller refused the outputs {', '.join(names)}. Ask for fewer, or less often.")
+        reply = yield _ask(START, b"")
+        if _payload(reply) != b"\1":
+            raise DeviceError("The controller refused to start sending. Is another RTDE client using up its time?")
+
+    def closing(self) -> bytes:
+        """Pause the stream."""
+        return packed(PAUSE)
+
+    def device(self) -> Device:
+        """Return a controller that waits for a recipe, and serves this sensor's alone."""
+        return _Controller(self)
+
+
+class _Controller(Device):
+    """The controller's side. It finds no outputs but those that its frames hold, in their order."""
+
+    def __init__(self, sensor: UrRtde) -> None:
+        super().__init__(streaming=False)
+        self.known = (STAMP, *sensor.outputs)
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        replies = []
+        for kind, told in _taken(self.heard):
+            if kind == VERSION:
+                replies.append(packed(kind, bytes([told == PROTOCOL.to_bytes(2, "big")])))
+            elif kind == CONTROLLER:
+                replies.append(packed(kind, struct.pack(">4I", *EMULATED)))
+            elif kind == OUTPUTS:
+                replies.append(self._recipe(told))
+            elif kind == INPUTS:
+                kinds = ",".join(type_of(name) or "NOT_FOUND" for name in told.decode("latin-1").split(","))
+                replies.append(packed(kind, b"\1" + kinds.encode()))
+            elif kind in (START, PAUSE):
+                self.streaming = kind == START
+                replies.append(packed(kind, b"\1"))
+        return replies
+
+    def _recipe(self, told: bytes) -> bytes:
+        names = tuple(told[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
+        self.rate_hz = float(struct.unpack(">d", told[:8])[0])
+        kinds = ",".join(str(type_of(name)) if name in self.known else "NOT_FOUND" for name in names)
+        return packed(OUTPUTS, bytes([names == self.known]) + kinds.encode())
+
+
+def packed(kind: int, payload: bytes = b"") -> bytes:
+    """Return a package.
+
+    >>> packed(VERSION, b"\\0\\2").hex(" ")
+    '00 05 56 00 02'
+    """
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
+
+
+def _taken(data: bytearray) -> Iterator[tuple[int, bytes]]:
+    """Take whole packages off the front of ``data`` and yield type and payload of each."""
+    while len(data) >= HEADER.size:
+        size, kind = HEADER.unpack_from(data)
+        if len(data) < max(size, HEADER.size):
+            return
+        payload = bytes(data[HEADER.size : size])
+        del data[: max(size, HEADER.size)]
+        yield kind, payload
+
+
+def _ask(kind: int, payload: bytes) -> Ask:
+    """Return the question of a type, whose reply is of the same type; texts may come before it and are part of it."""
+
+    def until(data: bytes) -> int:
+        place = 0
+        while len(data) >= place + HEADER.size:
+            size, found = HEADER.unpack_from(data, place)
+            if found not in KINDS or size < HEADER.size:
+                raise DeviceError(
+                    f"Bytes {data[place : place + 8].hex(' ')} came, which are no RTDE. Is the port 30004?"
+                )
+            place += size
+            if found == kind:
+                return place if len(data) >= place else 0
+        return 0
+
+    return Ask(packed(kind, payload), until, what=f"the controller's reply to RTDE package {chr(kind)}")
+
+
+def _payload(reply: bytes) -> bytes:
+    """Return the payload of the last package of a reply."""
+    packages = list(_taken(bytearray(reply)))
+    return packages[-1][1] if packages else b""
+
+
+def _sizes(heads: Bytes) -> NDArray[np.integer[Any]]:
+    return heads[:, 0].astype(np.int64) * 256 + heads[:, 1]
+
+
+def _native(values: NDArray[Any], name: str) -> NDArray[Any]:
+    """Return an output's values (sample, channel) in this machine's order of bytes, a pose with its quaternion."""
+    block = values[:, None] if values.ndim == 1 else values
+    block = block.astype(bool if type_of(name) == "BOOL" else block.dtype.newbyteorder("="))
+    return np.hstack([block[:, :3], rotations.quaternions_of_vectors(block[:, 3:])]) if name == POSE else block
+
+
+def _are_numbers(packages: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return in which packages (package,) all floats are of a size that a robot's state may have."""
+    good = np.ones(len(packages), dtype=bool)
+    for name in packages.dtype.names or ():
+        values = packages[name].reshape(len(packages), -1)
+        if values.dtype.kind == "f":
+            good &= (np.abs(values) < MOST).all(axis=1)  # not so of NaN either
+    return good

@@ -1,0 +1,79 @@
+"""Options that a product may be set to, as far as its bytes tell: what to try where nobody wrote them down."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tacpipe.sensors.framing import Chunks
+
+Options = dict[str, Any]
+GRIDS = {
+    384: (12, 32),
+    256: (16, 16),
+    512: (16, 32),
+    1024: (32, 32),
+}  # taxels to rows and columns of boards that are known
+LEAST_TAXELS = 64  # of a board that is not known: many others mark their frames with the same two bytes
+MOST_TRIED = 3  # distances between marks, the commonest first
+
+
+def of(kind: str, data: Chunks) -> list[Options]:
+    """Return the options to try for a sensor of this registered name on these bytes, the likeliest first.
+
+    >>> of("justfloat", Chunks.of([(0, (bytes(12) + bytes.fromhex("0000807f")) * 5)]))
+    [{'channels': 3}, {'model': 'fulai-3.0'}, {'model': 'fulai-3.1'}, {'model': 'fulai-3.2'}]
+    >>> of("biotac", Chunks.of([]))
+    [{}]
+    """
+    return VARIANTS[kind](data.data) if kind in VARIANTS else [{}]
+
+
+def distances(data: bytes, mark: bytes) -> list[int]:
+    """Return how many bytes a mark mostly comes after the one before, the commonest first.
+
+    >>> distances(b"ab__ab__ab_ab__", b"ab")
+    [4, 3]
+    """
+    places, found = [], data.find(mark)
+    while found >= 0:
+        places.append(found)
+        found = data.find(mark, found + 1)
+    counted = Counter(after - before for before, after in itertools.pairwise(places))
+    return [distance for distance, _ in counted.most_common(MOST_TRIED)]
+
+
+def _flexitac(data: bytes) -> list[Options]:
+    taxels = [distance - 2 for distance in distances(data, b"\xaa\x55") if distance - 2 >= LEAST_TAXELS]
+    grids = [GRIDS.get(count, (1, count)) for count in taxels]
+    return [{"rows": rows, "columns": columns} for rows, columns in grids] or [{}]
+
+
+def _anyskin(data: bytes) -> list[Options]:
+    sizes = [distance - 2 for distance in distances(data, b"\r\n")]
+    binary = [{"magnetometers": size // 16} for size in sizes if size and size % 16 == 0]
+    words = {len(line.split()) for line in data.split(b"\n")[1:4]}
+    text = [{"mode": "ascii", "magnetometers": count // 4} for count in sorted(words) if count and count % 4 == 0]
+    return [*binary, *text] or [{}]
+
+
+def _justfloat(data: bytes) -> list[Options]:
+    sizes = [distance - 4 for distance in distances(data, bytes.fromhex("0000807f"))]
+    plain: list[Options] = [{"channels": size // 4} for size in sizes if size and size % 4 == 0]
+    return plain + [{"model": model} for model in ("fulai-3.0", "fulai-3.1", "fulai-3.2")]
+
+
+def _several(name: str, *values: object) -> Callable[[bytes], list[Options]]:
+    return lambda _: [{name: value} for value in values]
+
+
+VARIANTS: Mapping[str, Callable[[bytes], list[Options]]] = {
+    "anyskin": _anyskin,
+    "flexitac": _flexitac,
+    "justfloat": _justfloat,
+    "optoforce": _several("axes", 6, 3, 12),
+    "robotiq": _several("fingers", 2, 1),
+    "xela": _several("taxels", 16, 24, 30),
+}

@@ -1,0 +1,253 @@
+"""Weiss Robotics WTS tactile sensors: a matrix of pressure cells over USB.
+
+Every message, both ways, is ``AA AA AA``, a number, the size of what it says (uint16), that, and a check sum (uint16), all
+little-endian. The sum is taken over the whole message with `crc16_wts`, which no standard knows. Frames are messages of
+number 0: the time (uint32, 10 µs), flags, and the cells row by row, uint16 each. With flag bit 0 the cells are run-length
+coded: of each word the upper 4 bits say how many cells in a row have the value of the lower 12. A reply has the number of
+the command and begins with an error code (uint16, 0: done).
+
+Source: wts_driver (GPL-3) for messages, numbers and sum; its example ``AA AA AA 06 01 00 FF 2A 87`` is checked in the
+tests. The word of the run-length code, the reply of the matrix information and the byte of the tare have no public
+source that was at hand, and were checked against no device.
+
+The time goes round after 11.9 hours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.sensors import taxels
+from tacpipe.sensors.checks import crc16_wts
+from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MARKER = b"\xaa\xaa\xaa"
+HEADER = 6  # marker, number, size
+FRAME, START, STOP, TARE, MATRIX = 0x00, 0x21, 0x22, 0x23, 0x30
+TICK_NS = 10_000  # of the sensor's clock
+CELLS_AT = HEADER + 5  # behind time and flags
+RUN_LENGTH = 0x01  # flag
+LONGEST_RUN, HIGHEST = 15, 0x0FFF  # what 4 and 12 bits hold
+
+
+@dataclass(frozen=True)
+class WeissWts(Sensor):
+    """A WTS tactile sensor."""
+
+    summary: ClassVar[str] = "Weiss Robotics WTS tactile sensors over USB."
+
+    rows: int = 14  # of the matrix; that of a WTS 0614 is 14 by 6
+    columns: int = 6  # of the matrix
+    compress: bool = True  # ask for run-length coded frames
+    rate_hz: float = 100.0  # frames a second: 1000 divided by whole milliseconds
+    baud: int = 115200  # over USB any
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.columns < 1:
+            raise UsageError(
+                f"weiss-wts: {self.rows} rows of {self.columns} columns are no matrix; both must be 1 or more."
+            )
+        if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - self.delay_ms) > 0.01:
+            raise UsageError(
+                f"weiss-wts: rate_hz is {self.rate_hz:g}; it must be 1000 divided by whole milliseconds, as 100, 50 or 25."
+            )
+
+    @property
+    def cells(self) -> int:
+        """How many cells the matrix has."""
+        return self.rows * self.columns
+
+    @property
+    def delay_ms(self) -> int:
+        """How long the sensor waits from one frame to the next."""
+        return round(1000 / self.rate_hz)
+
+    def fields(self) -> list[pa.Field]:
+        """Return ``taxel01``, … row by row, uint16 counts."""
+        import pyarrow as pa
+
+        return taxels.grid(self.rows, self.columns, pa.uint16(), "count")
+
+    def framer(self) -> Framer:
+        """Return a framer of messages with their sum; those that are frames must have all cells of the matrix."""
+        most = max(CELLS_AT + 2 * self.cells + 2, 256)
+        return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, most=most, check=self._is_whole))
+
+    def _is_whole(self, frames: Bytes) -> NDArray[np.bool_]:
+        whole: NDArray[np.bool_] = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+        rows = np.flatnonzero(whole & (frames[:, 3] == FRAME))
+        if len(rows):
+            whole[rows] = self._cells_told(frames[rows]) == self.cells
+        return whole
+
+    def _cells_told(self, frames: Bytes) -> NDArray[np.int64]:
+        """Return how many cells each frame has; -1 where it is too short for any."""
+        size = frames.shape[1] - CELLS_AT - 2
+        if size < 2 or size % 2:
+            return np.full(len(frames), -1)
+        words = _words(frames)
+        runs = (words >> 12).sum(axis=1, dtype=np.int64)
+        cells: NDArray[np.int64] = np.where(frames[:, HEADER + 4] & RUN_LENGTH, runs, words.shape[1])
+        return cells
+
+    def decode(self, frames: Bytes) -> Samples:
+        """Return the cells (sample, cell) with the sensor's time; replies are left out."""
+        rows = np.flatnonzero(frames[:, 3] == FRAME)
+        cells = np.zeros((len(rows), self.cells), dtype=np.uint16)
+        if not len(rows):
+            return Samples((cells,), t_device_ns=rows, rows=rows)
+        frames = frames[rows]
+        ticks = np.ascontiguousarray(frames[:, HEADER : HEADER + 4]).view("<u4")[:, 0]
+        coded = (frames[:, HEADER + 4] & RUN_LENGTH).astype(bool)
+        words = _words(frames)
+        if not coded.all():
+            cells[~coded] = words[~coded]
+        packed = words[coded]
+        cells[coded] = np.repeat((packed & HIGHEST).ravel(), (packed >> 12).ravel()).reshape(-1, self.cells)
+        return Samples((cells,), t_device_ns=ticks.astype(np.int64) * TICK_NS, rows=rows)
+
+    def encode(self, samples: Samples) -> list[bytes]:
+        """Return the frames of these samples, run-length coded of several sizes; a cell above 4095 saturates."""
+        cells = np.minimum(samples.values[0], HIGHEST)
+        assert samples.t_device_ns is not None
+        ticks = (samples.t_device_ns // TICK_NS % (1 << 32)).tolist()
+        flag = bytes([RUN_LENGTH if self.compress else 0])
+        return [
+            message(
+                FRAME,
+                tick.to_bytes(4, "little")
+                + flag
+                + (run_lengths(row) if self.compress else row).astype("<u2").tobytes(),
+            )
+            for tick, row in zip(ticks, cells, strict=True)
+        ]
+
+    def opening(self, local: Mapping[str, Any]) -> Dialogue:
+        """Stop what still streams, compare the matrix with the options, start frames.
+
+        Raises `DeviceError` where the sensor has another matrix, or says no.
+        """
+        yield Ask(message(STOP), until=_reply(STOP, refusable=True), what="the reply to stop")
+        found = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
+        said = next(said for number, _, said in messages(found) if number == MATRIX)
+        columns, rows = (int.from_bytes(said[start : start + 2], "little") for start in (2, 4))
+        if (rows, columns) != (self.rows, self.columns):
+            raise DeviceError(
+                f"The WTS has {rows} rows of {columns} columns and the options say {self.rows} of {self.columns}; "
+                f"set rows = {rows} and columns = {columns}."
+            )
+        start = bytes([RUN_LENGTH if self.compress else 0]) + self.delay_ms.to_bytes(2, "little")
+        yield Ask(message(START, start), until=_reply(START), what="the reply to start")
+
+    def closing(self) -> bytes:
+        """Stop the frames."""
+        return message(STOP)
+
+    def taring(self) -> Dialogue:
+        """Take the present pressure for zero."""
+        yield Ask(message(TARE, b"\x01"), until=_reply(TARE), what="the reply to tare")
+
+    def device(self) -> Device:
+        """Return a sensor with this matrix that waits for the start."""
+        return _Wts(self)
+
+
+class _Wts(Device):
+    """The sensor's side: each command is answered with its number and an error code."""
+
+    def __init__(self, sensor: WeissWts) -> None:
+        super().__init__(streaming=False)
+        self.sensor = sensor
+
+    def hear(self, data: bytes) -> list[bytes]:
+        self.heard += data
+        replies, stop = [], 0
+        for number, stop, said in messages(bytes(self.heard)):  # noqa: B007
+            replies.append(message(number, self._done(number, said)))
+        del self.heard[:stop]
+        return replies
+
+    def _done(self, number: int, said: bytes) -> bytes:
+        done, unknown = b"\x00\x00", b"\x0e\x00"
+        if number == MATRIX:
+            sizes = (self.sensor.columns, self.sensor.rows, 340, 340, HIGHEST)  # cells are 3.4 mm wide, in 1/100 mm
+            return done + b"".join(size.to_bytes(2, "little") for size in sizes)
+        if number == START and len(said) == 3:
+            self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(said[1:], "little"))
+        elif number == STOP:
+            self.streaming = False
+        elif number != TARE:
+            return unknown
+        return done
+
+
+def message(number: int, said: bytes = b"") -> bytes:
+    """Return a message, to the sensor or from it.
+
+    >>> message(0x06, b"\\xff").hex(" ")
+    'aa aa aa 06 01 00 ff 2a 87'
+    """
+    body = MARKER + bytes([number]) + len(said).to_bytes(2, "little") + said
+    return body + int(crc16_wts(np.frombuffer(body, np.uint8)[None])[0]).to_bytes(2, "little")
+
+
+def messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Yield number, end and content of each whole message in ``data`` whose sum is right."""
+    start = data.find(MARKER)
+    while start >= 0 and len(data) >= start + HEADER:
+        size = int.from_bytes(data[start + 4 : start + 6], "little")
+        told = data[start : start + HEADER + size + 2]
+        if len(told) == HEADER + size + 2 and message(told[3], told[HEADER:-2]) == told:
+            yield told[3], start + len(told), told[HEADER:-2]
+            start += len(told) - 1
+        start = data.find(MARKER, start + 1)
+
+
+def run_lengths(cells: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Return cells (cell,) as words of run lengths: no run is longer than 15.
+
+    >>> [hex(word) for word in run_lengths(np.array([0] * 17 + [7], dtype=np.uint16))]
+    ['0xf000', '0x2000', '0x1007']
+    """
+    starts = np.flatnonzero(np.diff(cells, prepend=cells[0] ^ 1))
+    lengths = np.diff(starts, append=len(cells))
+    pieces = -(-lengths // LONGEST_RUN)  # words that each run takes
+    counts = np.full(pieces.sum(), LONGEST_RUN)
+    counts[np.cumsum(pieces) - 1] = lengths - LONGEST_RUN * (pieces - 1)
+    return (counts << 12 | np.repeat(cells[starts], pieces)).astype(np.uint16)
+
+
+def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int]:
+    """Return what tells how many bytes there are up to the end of the reply, frames before it included."""
+
+    def until(data: bytes) -> int:
+        for told, stop, said in messages(data):
+            if told == number:
+                code = int.from_bytes(said[:2], "little")
+                if code and not refusable:
+                    raise DeviceError(
+                        f"The WTS refused command {number:#04x} with error {code}; its manual lists the errors."
+                    )
+                return stop
+        return 0
+
+    return until
+
+
+def _words(frames: Bytes) -> NDArray[np.uint16]:
+    words: NDArray[np.uint16] = np.ascontiguousarray(frames[:, CELLS_AT:-2]).view("<u2")
+    return words
+
+
+def _sizes(head: Bytes) -> NDArray[np.int64]:
+    return np.ascontiguousarray(head[:, 4:6]).view("<u2")[:, 0].astype(np.int64) + HEADER + 2

@@ -1,0 +1,32 @@
+"""A host that opens a stream, and the device's side that it talks to, without a link between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tacpipe.sensors.sensor import Device, Dialogue, Sensor
+
+
+def carried_out(dialogue: Dialogue, device: Device, greeting: bytes = b"") -> bytes:
+    """Carry out a dialogue; ``greeting`` came before any reply. Return what came that was no reply."""
+    came, reply = greeting, None
+    while True:
+        try:
+            ask = dialogue.send(reply) if reply is not None else next(dialogue)
+        except StopIteration:
+            return came
+        came += b"".join(device.hear(ask.send))
+        if ask.until is None:
+            reply = b""
+            continue
+        taken = ask.until(came)
+        assert taken, f"no reply to {ask.send.hex(' ')}, only {came.hex(' ')}"
+        reply, came = came[:taken], came[taken:]
+
+
+def opened(sensor: Sensor, local: Mapping[str, Any] | None = None, greeting: bytes = b"") -> Device:
+    """Return the device of a sensor after the stream was opened."""
+    device = sensor.device()
+    assert carried_out(sensor.opening(local or {}), device, greeting) == b""
+    return device

@@ -1,0 +1,51 @@
+"""A scene and a grasp that came over the wire are cut down as those are that never left the computer."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.frame import estimated_wrist
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.formats import channels, ply
+from tacpipe.recording.reading import Reading
+from tacpipe.registry import load
+from tacpipe.sensors.clouds import Clouds
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.sensors.tap import Tap
+from tests.clouds.scene_fakes import scene
+from tests.stages.conftest import FakeShard
+
+
+def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
+    """Return the table of a stream of which one chunk came."""
+    reading = Reading(sensor)
+    batch = reading.feed(Chunks.of([(5, chunk)]))
+    assert not reading.account.lost
+    columns = [column for block in batch.values for column in block.T]
+    return channels.stream(batch.t_ns, columns, sensor.fields())
+
+
+@pytest.mark.parametrize("kind", ["points", "wrist"])
+def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
+    whole, stage = scene(), load("segment.grasps")
+    assert whole.cloud.colours is not None
+    wrist = estimated_wrist(whole.grasp)
+    grasp = Grasp(whole.grasp.g1_m, whole.grasp.g2_m, wrist if kind == "wrist" else None)
+    told = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
+
+    came = {
+        "scene": acquired(Clouds(), ply.packed(whole.cloud.points_m, whole.cloud.colours)),
+        "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": told}).encode()),
+    }
+
+    held = {"scene": whole.cloud.table(), "grasp": grasp.table(5)}
+    found, expected = (stage(stage.params(), FakeShard(streams)).streams for streams in (came, held))
+    np.testing.assert_array_equal(Cloud.of(found["cloud"]).points_m, Cloud.of(expected["cloud"]).points_m)
+    assert found["grasp"].equals(expected["grasp"])

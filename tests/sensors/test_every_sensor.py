@@ -1,0 +1,193 @@
+"""The same questions to every registered sensor: what it says of itself holds, and no fault makes a sample up."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe import registry
+from tacpipe.errors import UsageError
+from tacpipe.recording import rig
+from tacpipe.sensors.framing import LineFramer, Run, TextFramer
+from tacpipe.sensors.sensor import Frames, Samples, Sensor
+from tacpipe.sensors.spacemouse import StateFramer
+from tests.sensors import harm, made, told
+
+KINDS = list(registry.sensors())
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # settings that change a sensor's frames
+    "biotac of three fingers": ("biotac", {"fingers": 3}),
+    "contactile with slip": ("contactile", {"slip": True}),
+    "icub-skin of the older configuration": ("icub-skin", {"old": True, "triangles": [0, 3]}),
+    "optoforce of three axes": ("optoforce", {"axes": 3}),
+    "spacemouse that splits": ("spacemouse", {"split": True}),
+    "tfmini, the original": ("tfmini", {"model": "original"}),
+    "weiss-wts without run lengths": ("weiss-wts", {"compress": False}),
+}
+CASES = {kind: (kind, made.OPTIONS.get(kind, {})) for kind in KINDS} | VARIANTS
+COUNT = 2000  # frames that faults are thrown at
+FOUND_AGAIN = 3  # frames after a harmed one: two may pass until frames are found
+UNSEEN_AT_MOST = {  # faults of a hundred that sums do not see: none with 16 bits, a few may slip through 8
+    **dict.fromkeys(("biotac", "contactile", "generic", "modbus-tactile", "optoforce", "weiss-wts"), 0),
+    **dict.fromkeys(("paxini", "teraranger", "tfmini"), 2),
+}
+
+
+@dataclass(frozen=True)
+class Sent:
+    """Frames of a sensor as they left the device, and what each says."""
+
+    sensor: Sensor
+    samples: Samples
+    frames: Frames
+    pieces: list[bytes]
+    numbers: dict[bytes, int]  # the number of each sample by its `made.rows`
+
+
+def sent(case: str, count: int, seed: int = 0) -> Sent:
+    kind, options = CASES[case]
+    sensor = rig.make(kind, options, case)
+    samples = made.samples(kind, sensor, count, seed)
+    frames = sensor.encode(samples)
+    rows = made.rows(understood(sensor, frames))
+    numbers = {row: number for number, row in enumerate(rows)}
+    assert len(numbers) == len(rows) == count, "two samples are the same, and cannot be told apart"
+    return Sent(sensor, samples, frames, made.pieces(sensor, frames), numbers)
+
+
+def understood(sensor: Sensor, frames: Frames) -> Samples:
+    """Return what frames say as `Sensor.encode` gave them: binary ones of several sizes one by one."""
+    if isinstance(frames, np.ndarray) or isinstance(sensor.framer(), TextFramer | LineFramer | StateFramer):
+        return sensor.decode(frames)
+    runs = [Run(np.frombuffer(frame, np.uint8)[None], np.zeros(1, dtype=np.int64)) for frame in frames]
+    return made.decoded(sensor, runs)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sensor_needs_no_option_or_says_which(kind: str) -> None:
+    if kind not in made.OPTIONS:
+        assert isinstance(rig.make(kind, {}, "rig.toml"), Sensor)
+        return
+    with pytest.raises(UsageError) as error:
+        rig.make(kind, {}, "rig.toml")
+    assert any(option in str(error.value) for option in made.OPTIONS[kind])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_fields_have_names_of_their_own_units_and_quantities(case: str) -> None:
+    fields = rig.make(*CASES[case], case).fields()
+    names = [field.name for field in fields]
+    assert len(set(names)) == len(names) > 0
+    assert all(name == name.lower() and name.replace("_", "").isalnum() for name in names)
+    assert all(field.metadata[b"unit"] and field.metadata[b"quantity"] for field in fields)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_decoded_blocks_are_the_fields_side_by_side_in_their_types(case: str) -> None:
+    one = sent(case, 40)
+    values = understood(one.sensor, one.frames).values
+    kinds = [block.dtype for block in values for _ in range(block.shape[1])]
+    assert kinds == [np.dtype(field.type.to_pandas_dtype()) for field in one.sensor.fields()]
+    assert {len(block) for block in values} == {40}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_encoded_is_decoded(case: str, seed: int) -> None:
+    one = sent(case, 60, seed)
+    found = understood(one.sensor, one.frames)
+    assert made.same(found, one.samples) or (
+        CASES[case][0] in made.ROUNDED and made.near(one.sensor, found, one.samples)
+    )
+    assert (found.seq is None) == (one.sensor.counter is None)
+    assert (found.device_seq is None) == (one.sensor.device_counter is None)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_clean_frames_come_through_but_for_those_at_both_ends(case: str) -> None:
+    one = sent(case, 200)
+    chunks = harm.sent(one.sensor, one.pieces, [], np.random.default_rng(1))
+    framer = one.sensor.framer()
+
+    runs, losses = made.through(framer, chunks)
+
+    found = [one.numbers[row] for row in made.rows(made.decoded(one.sensor, runs))]
+    assert found == list(range(found[0], found[-1] + 1)) and len(found) >= 198
+    assert framer.account.lost == sum(loss.bytes for loss in losses)
+    assert framer.account.pending == 0
+    assert {loss.cause for loss in losses} <= {"start", "unconfirmed", "cut"}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_fault_gives_a_sample_that_nobody_sent_and_none_is_lost_unsaid(case: str) -> None:
+    one = sent(case, COUNT)
+    rng = np.random.default_rng(0)
+    faults = list(harm.harms(one.sensor, one.pieces, rng))
+    framer = one.sensor.framer()
+
+    runs, losses = made.through(framer, harm.sent(one.sensor, one.pieces, faults, rng))
+
+    outcomes = [harm.outcome(one.sensor, one.pieces, fault) for fault in faults]
+    rows = made.rows(made.decoded(one.sensor, runs))
+    found = [one.numbers[row] for row in rows if row in one.numbers]
+    unseen = Counter(fault.fault for fault, result in zip(faults, outcomes, strict=True) if result.other)
+    assert {row for row in rows if row not in one.numbers} <= {row for result in outcomes for row in result.other}
+    assert sum(unseen.values()) <= UNSEEN_AT_MOST.get(CASES[case][0], len(faults))
+    assert found == sorted(set(found))
+    assert framer.account.received == framer.account.framed + framer.account.lost
+    assert framer.account.lost == sum(loss.bytes for loss in losses)
+    silent = [
+        (fault.row, fault.fault)
+        for fault, result in zip(faults, outcomes, strict=True)
+        if result.missing and not result.other and not result.told and fault.fault != harm.LOST
+    ]
+    assert silent == []
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_frames_are_found_again_within_two(case: str) -> None:
+    one = sent(case, COUNT)
+    rng = np.random.default_rng(2)
+    faults = list(harm.harms(one.sensor, one.pieces, rng))
+
+    runs, _ = made.through(one.sensor.framer(), harm.sent(one.sensor, one.pieces, faults, rng))
+
+    found = {one.numbers.get(row) for row in made.rows(made.decoded(one.sensor, runs))}
+    ends = [*(fault.row for fault in faults[1:]), COUNT - 1]
+    late = [
+        (fault.row, fault.fault)
+        for fault, end in zip(faults, ends, strict=True)
+        if not found.issuperset(range(fault.row + FOUND_AGAIN, end - 1))
+        and not harm.outcome(one.sensor, one.pieces, fault).other  # one that no check sees may last, as a state does
+    ]
+    assert late == []
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_same_chunks_give_the_same_samples_however_they_are_batched(case: str) -> None:
+    one = sent(case, 300)
+    rng = np.random.default_rng(3)
+    chunks = harm.sent(one.sensor, one.pieces, list(harm.harms(one.sensor, one.pieces, rng)), rng)
+
+    results = [made.through(one.sensor.framer(), chunks, at_once=at_once)[0] for at_once in (1, 7, 1000)]
+
+    rows = [made.rows(made.decoded(one.sensor, runs)) for runs in results]
+    assert rows[0] == rows[1] == rows[2]
+    stamps = [np.concatenate([run.t_ns for run in runs]).tolist() for runs in results]
+    assert stamps[0] == stamps[1] == stamps[2]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_device_answers_what_the_host_says_and_then_gives_frames(case: str) -> None:
+    sensor = rig.make(*CASES[case], case)
+    device = sensor.device()
+
+    told.hold(sensor.opening({"port": 50_000}), device)
+    device.hear(sensor.request())
+
+    assert device.streaming or device.polled() > 0
+    told.hold(sensor.taring(), device)
+    device.hear(sensor.closing())

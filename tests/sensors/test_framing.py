@@ -1,0 +1,228 @@
+"""Frames are found again after anything that may happen to bytes, and every byte is accounted for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tacpipe.sensors import checks, framing
+from tacpipe.sensors.framing import ByteFramer, Chunks, Framing, LineFramer, Loss, PacketFramer, Run
+
+Right = NDArray[np.bool_]
+
+
+def sum_is_right(frames: framing.Bytes) -> Right:
+    return np.asarray(checks.sum8(frames[:, :-1]) == frames[:, -1])
+
+
+def sum16_is_right(frames: framing.Bytes) -> Right:
+    return np.asarray(checks.sum16(frames[:, :-2]) == frames[:, -2] + 256 * frames[:, -1].astype(int))
+
+
+def inner_sum_is_right(frames: framing.Bytes) -> Right:
+    body = frames[:, 4:-4]
+    if body.shape[1] < 3:
+        return np.zeros(len(frames), dtype=bool)
+    return np.asarray(checks.sum16(body[:, :-2]) == body[:, -2] + 256 * body[:, -1].astype(int))
+
+
+PLAIN = Framing(marker=b"\xaa\x55", size=34, lock=3, confirm=1)
+SUMMED = Framing(marker=b"\x59\x59", size=9, check=sum_is_right, confirm=1)
+STRONG = Framing(marker=b"\xaa\x07\x08", size=16, check=sum16_is_right)
+TAILED = Framing(tail=b"\r\n", size=42, lock=3)
+TOLD = Framing(
+    marker=b"\x9a\x00", header=5, sizes=lambda head: head[:, 2].astype(np.int64) + 3, most=40, check=sum16_is_right
+)
+ENCLOSED = Framing(marker=b"\x55\x66\x77\x88", tail=b"\xaa\xbb\xcc\xdd", most=200, check=inner_sum_is_right)
+KINDS = {"plain": PLAIN, "summed": SUMMED, "strong": STRONG, "tailed": TAILED, "told": TOLD, "enclosed": ENCLOSED}
+
+
+def made(kind: str, count: int, seed: int) -> list[bytes]:
+    """Return frames of random content, the number of each in its first free bytes."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for number in range(count):
+        body = bytes([number % 251, number // 251]) + rng.integers(0, 256, 40, dtype=np.uint8).tobytes()
+        if kind == "plain":
+            frames.append(b"\xaa\x55" + body[:32])
+        elif kind == "summed":
+            head = b"\x59\x59" + body[:6]
+            frames.append(head + bytes([sum(head) & 255]))
+        elif kind == "strong":
+            head = b"\xaa\x07\x08" + body[:11]
+            frames.append(head + sum(head).to_bytes(2, "little"))
+        elif kind == "tailed":
+            frames.append(body[:40] + b"\r\n")
+        elif kind == "told":
+            size = int(rng.integers(4, 30))
+            head = b"\x9a\x00" + bytes([size]) + body[: size - 2]
+            frames.append(head + sum(head).to_bytes(2, "little"))
+        else:
+            inner = body[:32] + sum(body[:32]).to_bytes(2, "little")
+            frames.append(b"\x55\x66\x77\x88" + inner + b"\xaa\xbb\xcc\xdd")
+    return frames
+
+
+def fed(framer: framing.Framer, data: bytes, sizes: list[int]) -> tuple[list[Run], list[Loss]]:
+    """Feed ``data`` in pieces of these sizes over and over, a nanosecond after one another."""
+    runs: list[Run] = []
+    losses: list[Loss] = []
+    place, step = 0, 0
+    while place < len(data):
+        piece = data[place : place + sizes[step % len(sizes)]]
+        found, lost = framer.feed(Chunks.of([(step, piece)]))
+        runs, losses = runs + found, losses + lost
+        place, step = place + len(piece), step + 1
+    found, lost = framer.flush()
+    return runs + found, losses + lost
+
+
+def frames_of(runs: list[Run]) -> list[bytes]:
+    return [bytes(frame) for run in runs for frame in run.frames]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(1, 300), min_size=1, max_size=5))
+def test_clean_bytes_are_given_out_whole_however_they_are_cut(kind: str, seed: int, sizes: list[int]) -> None:
+    sent = made(kind, 30, seed)
+    framer = ByteFramer(KINDS[kind])
+
+    runs, losses = fed(framer, b"".join(sent), sizes)
+
+    head = int(kind == "tailed")  # where it begins is only known behind a tail
+    last = KINDS[kind].confirm if KINDS[kind].check is None else 0
+    assert frames_of(runs) == sent[head : len(sent) - last]
+    assert framer.account.pending == 0
+    assert {loss.cause for loss in losses} <= {framing.START, framing.UNCONFIRMED}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(
+    seed=st.integers(0, 1000),
+    sizes=st.lists(st.integers(1, 300), min_size=1, max_size=5),
+    faults=st.lists(
+        st.tuples(st.integers(5, 90), st.sampled_from(["noise", "cut", "burst"]), st.integers(1, 60)), max_size=4
+    ),
+)
+def test_after_noise_cuts_and_bursts_no_frame_is_wrong_and_few_are_lost(
+    kind: str, seed: int, sizes: list[int], faults: list[tuple[int, str, int]]
+) -> None:
+    sent = made(kind, 100, seed)
+    rng = np.random.default_rng(seed)
+    pieces, harmed = list(sent), set()
+    for row, fault, size in faults:
+        noise = rng.integers(0, 256, size, dtype=np.uint8).tobytes()
+        if fault == "noise":
+            pieces[row] = noise + pieces[row]
+        elif fault == "cut":
+            pieces[row] = pieces[row][: max(1, len(pieces[row]) - size)]
+            harmed.add(row)
+        elif KINDS[kind].check is not None:
+            pieces[row] = bytes(len(pieces[row]))
+            harmed.add(row)
+    data = b"".join(pieces)
+    framer = ByteFramer(KINDS[kind])
+
+    runs, losses = fed(framer, data, sizes)
+
+    found = frames_of(runs)
+    assert set(found) <= set(sent)  # nothing that was not sent
+    assert [sent.index(frame) for frame in found] == sorted(sent.index(frame) for frame in found)
+    assert framer.account.framed + framer.account.lost == len(data) == framer.account.received
+    assert sum(loss.bytes for loss in losses) == framer.account.lost
+    assert len(found) >= len(sent) - 2 - len(harmed) - 4 * len(faults)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_first_two_frames_after_a_disturbance_are_given_out(kind: str) -> None:
+    sent = made(kind, 40, 3)
+    framer = ByteFramer(KINDS[kind])
+
+    runs, _ = fed(framer, b"".join(sent[:20]) + b"\x17" * 77 + b"".join(sent[20:]), [11])
+
+    found = frames_of(runs)
+    lag = int(kind == "tailed")  # its first frame begins behind bytes of which nobody knows that they end there
+    assert sent[20 + lag] in found and sent[21] in found
+
+
+def test_a_garbled_frame_is_told_from_noise_and_from_a_cut() -> None:
+    sent = made("strong", 30, 0)
+    flipped = sent[10][:8] + bytes([sent[10][8] ^ 4]) + sent[10][9:]
+    stream = b"".join([*sent[:10], flipped, *sent[11:15], b"\x01\x02\x03", *sent[15:20], sent[20][:9], *sent[21:]])
+
+    _, losses = fed(ByteFramer(STRONG), stream, [64])
+
+    assert [(loss.cause, loss.frames, loss.bytes) for loss in losses] == [
+        (framing.GARBLED, 1, 16),
+        (framing.NOISE, 0, 3),
+        (framing.CUT, 1, 9),
+    ]
+
+
+def test_a_frame_arrives_when_its_last_byte_does() -> None:
+    sent = made("strong", 3, 0)
+    data = b"".join(sent)
+
+    runs, _ = ByteFramer(STRONG).feed(
+        Chunks.of([(100, data[:15]), (200, data[15:17]), (300, data[17:40]), (400, data[40:])])
+    )
+
+    assert runs[0].t_ns.tolist() == [200, 300, 400]
+
+
+def test_marks_in_a_payload_that_holds_still_give_nothing_until_it_moves() -> None:
+    still = [b"\xaa\x55" + bytes([number]) + b"\xaa\x55" * 15 + b"\x00" for number in range(20)]
+    moving = made("plain", 30, 0)
+    framer = ByteFramer(PLAIN)
+
+    quiet, _ = framer.feed(Chunks.of([(0, still[0][7:] + b"".join(still[1:]))]))
+    runs, losses = fed(framer, b"".join(moving), [50])
+
+    assert not quiet
+    assert frames_of(runs) == still[1:] + moving[:-1]
+    assert [loss.cause for loss in losses] == [framing.START, framing.UNCONFIRMED]
+
+
+def test_garbage_without_end_is_thrown_away_and_not_kept() -> None:
+    rng = np.random.default_rng(0)
+    framer = ByteFramer(SUMMED)
+    for step in range(200):
+        framer.feed(Chunks.of([(step, rng.integers(0, 80, 1000, dtype=np.uint8).tobytes())]))
+
+    assert framer.account.pending <= SUMMED.most + 1000
+    assert framer.account.framed == 0
+
+
+def test_packets_of_another_size_or_sum_are_malformed() -> None:
+    good = made("strong", 4, 0)
+    framer = PacketFramer([16], sum16_is_right)
+    bad = good[1][:-1] + b"\x00"
+
+    runs, losses = framer.feed(Chunks.of([(1, good[0]), (2, bad), (3, b"xy"), (4, good[2]), (5, good[3])]))
+
+    assert frames_of(runs) == [good[0], good[2], good[3]]
+    assert [t_ns for run in runs for t_ns in run.t_ns] == [1, 4, 5]
+    assert [(loss.t_ns, loss.cause, loss.bytes) for loss in losses] == [(2, "malformed", 16), (3, "malformed", 2)]
+
+
+def test_a_line_that_is_none_is_lost_and_the_others_stay() -> None:
+    framer = LineFramer(lambda line: line.isdigit())
+
+    runs, losses = fed(framer, b"34\n12\n1x\r\n99\r\n7", [4])
+
+    assert frames_of(runs) == [b"12", b"99"] or frames_of(runs) == [b"34", b"12", b"99"]
+    assert (losses[-2].cause, losses[-1].cause) == (framing.GARBLED, framing.CUT)
+    assert framer.account.pending == 0
+
+
+def test_a_lock_needs_as_many_frames_as_the_framing_says() -> None:
+    sent = made("plain", 3, 0)
+    eager, careful = ByteFramer(replace(PLAIN, lock=2)), ByteFramer(replace(PLAIN, lock=4))
+
+    assert frames_of(eager.feed(Chunks.of([(0, b"".join(sent))]))[0]) == sent[:2]
+    assert frames_of(careful.feed(Chunks.of([(0, b"".join(sent))]))[0]) == []

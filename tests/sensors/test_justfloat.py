@@ -1,0 +1,115 @@
+"""JustFloat frames of any board and of a fulai."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from numpy.typing import NDArray
+
+from tacpipe.errors import UsageError
+from tacpipe.sensors.justfloat import JustFloat
+from tacpipe.sensors.sensor import Samples
+from tests.sensors.serial_lab import held, read, rows_of, stream, streams
+
+FLOATS = arrays.arrays(
+    np.float32,
+    st.tuples(st.integers(4, 20), st.just(3)),
+    elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
+)
+ANY = JustFloat(channels=3)
+
+
+def test_a_frame_by_hand_is_read() -> None:
+    frame = struct.pack("<3f", 1.0, -0.5, 1e-20) + bytes.fromhex("00 00 80 7F")
+    samples = JustFloat(names=("thumb", "index", "tilt"), unit="N", quantity="force")
+    assert samples.decode(np.frombuffer(frame, np.uint8)[None]).values[0].tolist() == [
+        [1.0, -0.5, float(np.float32(1e-20))]
+    ]
+    assert [field.name for field in samples.fields()] == ["thumb", "index", "tilt"]
+    assert samples.fields()[0].metadata == {b"unit": b"N", b"quantity": b"force"}
+
+
+@settings(deadline=None, max_examples=50)
+@given(FLOATS)
+def test_decode_undoes_encode(floats: NDArray[np.float32]) -> None:
+    assert np.array_equal(ANY.decode(ANY.encode(Samples((floats,)))).values[0], floats)
+
+
+@settings(deadline=None, max_examples=50)
+@given(seed=st.integers(0, 1000), sizes=st.lists(st.integers(1, 100), min_size=1, max_size=4))
+def test_what_was_encoded_is_read_but_for_the_first_of_which_nobody_knows_the_begin(
+    seed: int, sizes: list[int]
+) -> None:
+    floats = np.random.default_rng(seed).normal(0, 10, (20, 3)).astype(np.float32)
+    found, losses = read(ANY, stream(ANY.encode(Samples((floats,)))), sizes)
+    assert rows_of(found) == [row.tobytes() for row in floats[1:]]
+    assert [loss.cause for loss in losses] == ["start"]
+
+
+@settings(deadline=None, max_examples=50)
+@given(seed=st.integers(0, 1000), at=st.integers(2, 15), cut=st.integers(1, 15))
+def test_after_a_cut_no_number_is_read_that_was_not_sent(seed: int, at: int, cut: int) -> None:
+    floats = np.random.default_rng(seed).normal(0, 10, (20, 3)).astype(np.float32)
+    frames = [bytes(frame) for frame in ANY.encode(Samples((floats,)))]
+    frames[at] = frames[at][:-cut]
+    found, _ = read(ANY, b"".join(frames))
+    rows = rows_of(found)
+    assert set(rows) <= {row.tobytes() for row in floats} and len(rows) >= 14
+
+
+def test_a_frame_that_is_not_finite_is_lost() -> None:
+    floats = np.random.default_rng(0).normal(0, 10, (20, 3)).astype(np.float32)
+    floats[9, 1] = np.nan
+    found, losses = read(ANY, stream(ANY.encode(Samples((floats,)))))
+    assert len(rows_of(found)) == 18 and losses[-1].cause == "garbled"
+
+
+@pytest.mark.parametrize(
+    ("model", "floats", "channels"), [("fulai-3.0", 415, 415), ("fulai-3.1", 401, 401), ("fulai-3.2", 615, 600)]
+)
+def test_a_fulai_has_its_floats_and_leaves_out_what_is_reserved(model: str, floats: int, channels: int) -> None:
+    sensor = JustFloat(model=model)  # type: ignore[arg-type]
+    assert sensor.floats == floats and len(sensor.fields()) == channels
+    numbers = np.arange(4 * channels, dtype=np.float32).reshape(4, channels)
+    frames = sensor.encode(Samples((numbers,)))
+    assert frames.shape == (4, 4 * floats + 4)
+    assert np.array_equal(sensor.decode(frames).values[0], numbers)
+    if channels < floats:
+        assert not frames[:, 4 * 82 : 4 * 90].any() and not frames[:, 4 * 530 : 4 * 537].any()
+
+
+def test_a_fulai_is_switched_on_and_off_and_tells_what_it_is() -> None:
+    sensor = JustFloat(model="fulai-3.1")
+    device = sensor.device()
+    assert not streams(device)
+    assert held(sensor.opening({}), device) == [b"vofa on\r\n"]
+    assert streams(device)
+    (reply,) = device.hear(b"bridge in") + device.hear(b"fo get\r\n")
+    assert reply.startswith(b"OK BRIDGE MODEL=") and b" HW=V3.1 " in reply and reply.endswith(b"\r\n")
+    device.hear(sensor.closing())
+    assert not streams(device)
+
+
+def test_any_other_board_is_told_nothing() -> None:
+    assert not held(ANY.opening({}), ANY.device()) and not ANY.closing() and streams(ANY.device())
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({}, "channels is 0; it must be between 1 and 1000"),
+        ({"names": ("a", "a")}, "'a' cannot name a channel"),
+        ({"names": ("A b",)}, "'A b' cannot name a channel; take small letters"),
+        ({"names": ("a", "b"), "channels": 3}, "2 names for 3 channels; give one a channel"),
+        ({"model": "fulai-3.0", "channels": 3}, "channels of a fulai-3.0 are known"),
+        ({"model": "fulai-9"}, "model is 'fulai-9'; it must be one of any, fulai-3.0"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_a_sentence(options: dict[str, object], sentence: str) -> None:
+    with pytest.raises(UsageError, match=sentence):
+        JustFloat(**options)  # type: ignore[arg-type]

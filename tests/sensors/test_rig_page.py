@@ -1,0 +1,93 @@
+"""What docs/rig.md says of sensors is so, and its examples work as they stand."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from tacpipe import registry
+from tacpipe.recording import rig
+from tacpipe.recording.reading import Reading
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.tap import Tap
+
+PAGE = (Path(__file__).parents[2] / "docs" / "rig.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    found: list[str] = re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    return found
+
+
+def table() -> dict[str, list[str]]:
+    """Return the cells of the table of sensors, by name."""
+    lines = PAGE.split("\n## The sensors\n")[1].split("\n## ")[0].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
+    return {row[0].strip("`"): row[1:] for row in rows}
+
+
+def built_in() -> dict[str, Any]:
+    found = {name: target for name, target in registry.sensors().items() if target.startswith("tacpipe.sensors.")}
+    return {name: registry.load_sensor(name) for name in found}
+
+
+def test_the_table_has_every_sensor_once_in_order() -> None:
+    assert list(table()) == sorted(built_in())
+
+
+@pytest.mark.parametrize("name", sorted(built_in()))
+def test_the_table_says_of_a_sensor_what_its_class_does(name: str) -> None:
+    links, rate, counts, _, _, exclusive = table()[name]
+    kind = built_in()[name]
+
+    assert links.split(", ") == list(kind.links)
+    assert exclusive == ("yes" if kind.exclusive else "no")
+    if name not in ("generic", "tap"):
+        assert (counts != "no") == (kind.counter is not None)
+    if name != "generic":
+        assert float(rate or 0) == kind.rate_hz
+
+
+def test_the_rig_files_are_rigs() -> None:
+    told = [block for block in blocks("toml") if "[[stream]]" in block]
+
+    streams = {name: stream for block in told for name, stream in rig.parse(block).streams.items()}
+
+    assert [stream.kind for stream in streams.values()] == ["xela", "ati-netft", "tap", "generic"]
+
+
+def test_three_lines_of_python_send_what_a_tap_takes() -> None:
+    code = next(block for block in blocks("python") if "sendto" in block)
+    assert len(code.splitlines()) == 3
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5)
+        space: dict[str, Any] = {}
+        exec(code.replace("4010", str(listener.getsockname()[1])), space)
+        packet = listener.recv(4096)
+        space["tap"].close()
+
+    batch = Reading(Tap(numbers=("width_m:m",), counted=True)).feed(Chunks.of([(1, packet)]))
+
+    assert batch.values[1].tolist() == [[0.031]]
+    assert json.loads(batch.values[0][0, 1])["phase"] == "lift"
+
+
+def test_the_sensor_of_the_page_reads_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("ruler")
+    monkeypatch.setitem(sys.modules, "ruler", module)
+    exec(next(block for block in blocks("python") if "class Ruler" in block), module.__dict__)
+    frames = [b"\xaa\x55" + distance.to_bytes(2, "little") for distance in (300, 301, 302)]
+    data = b"".join(frame + bytes([sum(frame) & 255]) for frame in frames)
+    reading = Reading(module.Ruler())
+
+    batch, rest = reading.feed(Chunks.of([(1, data)])), reading.finish()
+
+    assert [*batch.values[0].tolist(), *rest.values[0].tolist()] == [[300], [301], [302]]
