@@ -9,6 +9,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
+MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
+VIRTUAL_MACHINE := qemu-system-x86 busybox-static
 OLD_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 
 # Install Debian packages $(1), or say the one command where there are no rights.
@@ -21,16 +23,25 @@ else \
 fi
 endef
 
-.PHONY: help demo test lint types bless bench clean
+.PHONY: help demo rig-demo test test-kernel lint types bless bench clean
 
 help: ## show the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 8
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
 demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with demo/report.html
 	@$(BIN)/tacpipe demo -o demo
 
+rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
+	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
+
 test: $(VENV)/.dev ## run all tests
 	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto # a worker a core, a thread a worker
+
+test-kernel: $(VENV)/.dev ## run the tests of HID on Debian's kernel in a virtual machine, which takes a minute
+	@if ! command -v qemu-system-x86_64 > /dev/null || ! dpkg -s busybox-static > /dev/null 2>&1; then \
+	    $(call debian,$(VIRTUAL_MACHINE)); \
+	fi
+	@OMP_NUM_THREADS=1 TACPIPE_TEST_KERNEL=1 $(BIN)/pytest -q -s tests/kernel
 
 lint: $(VENV)/.dev ## check style
 	@$(BIN)/ruff check .
@@ -46,7 +57,7 @@ bench: $(VENV)/.dev ## measure, beside what a user would do instead; writes benc
 	@$(BIN)/python benchmarks/run.py
 
 clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there
-	@rm -rf $(VENV) demo build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .cache demo rig-demo build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -not -path './.tacpipe/*' -prune -exec rm -rf {} +
 
 # A stamp in .venv says what is installed there, so a second call installs nothing.
@@ -74,5 +85,8 @@ $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 	@if ! $(BIN)/python -c 'import open3d' 2> /dev/null; then \
 	    $(call debian,$(OPEN3D_LIBRARIES)); \
 	    $(BIN)/python -c 'import open3d'; \
+	fi
+	@if ! command -v umockdev-wrapper > /dev/null; then \
+	    ($(call debian,$(MOCKED_DEVICES))) || echo "Until then the tests that need a HID device are skipped." >&2; \
 	fi
 	@touch $(VENV)/.learn $@

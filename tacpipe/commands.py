@@ -13,9 +13,11 @@ import typer
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
+    "acquire": "Record a rig: every stream that its rig file lists, without losing or inventing a sample.",
     "label": "Change labels of recordings, or exclude them, without touching a shard.",
     "show": "Show what is in a dataset: recordings, streams, rates, gaps, saturation, labels.",
     "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
+    "sensors": "Look after sensors: list those that are known, find out which one speaks on a port, emulate a rig.",
     "store": "Look after the store: status, verify, repair, gc, link, push, pull.",
     "candidates": "List grasps that two fingers could make on an object, and what a model says each would feel.",
     "demo": "Run the main job on the simulated rig, small, from recordings to a report.",
@@ -60,10 +62,15 @@ def _explain(program: typer.Typer) -> None:
 
 def _demo(program: typer.Typer) -> None:
     @program.command("demo", help=SUMMARIES["demo"] + "\n\nExample: tacpipe demo -o demo")
-    def demo(output: Annotated[Path, typer.Option("-o", "--output", help="Where to write.")] = Path("demo")) -> None:
+    def demo(
+        output: Annotated[Path, typer.Option("-o", "--output", help="Where to write.")] = Path("demo"),
+        rig: Annotated[
+            Path | None, typer.Option("--rig", help="Emulate this rig, record it live, and run the chain on that.")
+        ] = None,
+    ) -> None:
         from tacpipe import demonstration
 
-        print(demonstration.run(output))
+        print(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
 
 
 def _store(program: typer.Typer) -> None:
@@ -72,10 +79,22 @@ def _store(program: typer.Typer) -> None:
     store_command.add(program, SUMMARIES["store"])
 
 
+def _sensors(program: typer.Typer) -> None:
+    from tacpipe import sensors_command
+
+    sensors_command.add(program, SUMMARIES["sensors"])
+
+
 def _candidates(program: typer.Typer) -> None:
     from tacpipe import candidates_command
 
     candidates_command.add(program, SUMMARIES["candidates"])
+
+
+def _acquire(program: typer.Typer) -> None:
+    from tacpipe import acquire_command
+
+    acquire_command.add(program, SUMMARIES["acquire"])
 
 
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
@@ -84,9 +103,11 @@ def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options:
 
 
 NAMES: dict[str, Callable[[typer.Typer], None]] = {
+    "acquire": _acquire,
     "label": _label,
     "show": _show,
     "explain": _explain,
+    "sensors": _sensors,
     "store": _store,
     "candidates": _candidates,
     "demo": _demo,

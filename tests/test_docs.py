@@ -18,10 +18,12 @@ ROOT = Path(__file__).parents[1]
 BUILT_IN = sorted(
     name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))
 )
+SENSORS = ("list", "probe", "emulate")
 STORE = ("status", "verify", "repair", "gc", "link", "push", "pull")
 COMMANDS = [
     *(name.replace(".", " ") for name in BUILT_IN),
-    *(name for name in commands.NAMES if name != "store"),
+    *(name for name in commands.NAMES if name not in ("sensors", "store")),
+    *(f"sensors {name}" for name in SENSORS),
     *(f"store {name}" for name in STORE),
 ]
 

@@ -1,0 +1,89 @@
+"""Depth cameras: Intel RealSense, through Open3D; one image of depth and colour an entry."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from tacpipe.clouds.depth_frame import DepthFrame
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.links.opened import Arrived, Opened
+from tacpipe.sensors.sensor import Sensor
+
+PAUSE_S = 0.002  # between looks for a frame; at the fastest they are 11 ms apart
+
+
+def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
+    """Return the open camera of this number, or of this serial number.
+
+    Raises `DeviceError` where it is not connected, held by another program, or Open3D is not installed.
+    """
+    try:
+        import open3d
+    except ImportError:
+        raise DeviceError(f"{name}: cameras need Open3D: `pip install 'tacpipe[clouds]'` brings it.") from None
+    kind = getattr(open3d.t.io, "RealSenseSensor", None)
+    if kind is None:
+        raise DeviceError(f"{name}: this Open3D was built without RealSense; record clouds by folder:PATH instead.")
+    there = [str(device.serial) for device in kind.enumerate_devices()]
+    serial = _serial(place, there, name)
+    camera = kind()
+    try:
+        camera.init_sensor(open3d.t.io.RealSenseSensorConfig({"serial": serial}), 0)
+        camera.start_capture()
+    except RuntimeError as error:
+        raise DeviceError(
+            f"{name}: the RealSense {serial} does not start; end what else uses it, and put it on a USB 3 port."
+        ) from error
+    return CameraLink(name, camera)
+
+
+def _serial(place: str, there: list[str], name: str) -> str:
+    """Return the serial number of the camera that an address means."""
+    if place in there:
+        return place
+    if not place.isdigit():
+        raise UsageError(f"camera:{place} names no camera; it should read camera:0, or hold a serial number.")
+    if len(place) < 4 and int(place) < len(there):
+        return there[int(place)]
+    told = f"there are {', '.join(there)}" if there else "there is none at all"
+    raise DeviceError(f"{name}: no RealSense camera {place} is connected; {told}. Plug it in to a USB 3 port.")
+
+
+class CameraLink(Opened):
+    """An open RealSense camera."""
+
+    packets = True
+
+    def __init__(self, name: str, camera: Any) -> None:
+        super().__init__(name)
+        self.camera = camera
+        told = camera.get_metadata()
+        matrix = np.asarray(told.intrinsics.intrinsic_matrix)
+        self._focal = float(matrix[0, 0]), float(matrix[1, 1])
+        self._centre = float(matrix[0, 2]), float(matrix[1, 2])
+        self._unit_m = 1 / float(told.depth_scale)  # which RealSense tells in counts a metre
+
+    def _receive(self, timeout_s: float) -> Arrived:
+        until = time.monotonic() + timeout_s
+        while True:
+            try:
+                image = self.camera.capture_frame(wait=False, align_depth_to_color=True)
+            except RuntimeError as error:
+                raise self.lost("it was unplugged") from error
+            if not image.is_empty():
+                t_ns = time.monotonic_ns()
+                depth, colours = (
+                    np.asarray(image.depth.as_tensor().numpy()),
+                    np.asarray(image.color.as_tensor().numpy()),
+                )
+                frame = DepthFrame(depth[..., 0], self._focal, self._centre, self._unit_m, colours)
+                return [(t_ns, frame.to_bytes())]
+            if self._closed or time.monotonic() >= until:
+                return []
+            time.sleep(PAUSE_S)
+
+    def _release(self) -> None:
+        self.camera.stop_capture()

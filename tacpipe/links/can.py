@@ -1,0 +1,149 @@
+"""CAN buses through python-can: one frame an entry, 13 bytes each."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.links import ports, serial_port
+from tacpipe.links.arrival import Arrivals
+from tacpipe.links.opened import Arrived, Opened
+from tacpipe.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    import can
+
+KINDS = ("socketcan", "slcan", "virtual")
+FRAME = struct.Struct("<IB8s")  # identifier, how many data bytes, and those, filled up with zeros
+EXTENDED = 1 << 31  # in the identifier: it has 29 bits
+SEND_S = 1.0
+INTERFACES = Path("/sys/class/net")
+IS_CAN = "280"  # ARPHRD_CAN of <linux/if_arp.h>
+
+
+def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
+    """Return an open bus of ``KIND:CHANNEL`` or ``KIND:CHANNEL@BITRATE``.
+
+    Raises `UsageError` for an address that is none, `DeviceError` for an interface that is missing, down, or not permitted.
+    """
+    kind, channel, bitrate = parsed(place)
+    try:
+        import can
+    except ImportError:
+        raise DeviceError(
+            f"{name}: CAN needs the package python-can, which is not installed: {ports.INSTALL}."
+        ) from None
+    if kind == "slcan":
+        serial_port.refuse_missing(channel, name)
+    options: dict[str, Any] = {"bitrate": bitrate} if bitrate and kind == "slcan" else {}
+    try:
+        bus = can.Bus(interface=kind, channel=channel, ignore_config=True, **options)
+    except (can.CanError, OSError, ValueError) as error:
+        raise _refused(error, kind, channel, bitrate, name) from error
+    return CanLink(name, bus)
+
+
+def parsed(place: str) -> tuple[str, str, int | None]:
+    """Return kind, channel and bit rate of an address, None where it tells none.
+
+    >>> parsed("slcan:/dev/ttyACM0@1000000"), parsed("socketcan:can0")
+    (('slcan', '/dev/ttyACM0', 1000000), ('socketcan', 'can0', None))
+    """
+    kind, _, rest = place.partition(":")
+    channel, at, bitrate = rest.partition("@")
+    if kind not in KINDS or not channel or (at and not bitrate.isdigit()):
+        raise UsageError(
+            f"can:{place} is no CAN bus; it should read can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of the kinds "
+            f"{', '.join(KINDS)}."
+        )
+    return kind, channel, int(bitrate) if at else None
+
+
+def _refused(error: Exception, kind: str, channel: str, bitrate: int | None, name: str) -> DeviceError:
+    if kind == "slcan":
+        within = error if isinstance(error, OSError) else error.__cause__ or error.__context__
+        return serial_port.refused(within if isinstance(within, OSError) else OSError(str(error)), channel, name)
+    there = [path.name for path in INTERFACES.glob("*") if _type(path) == IS_CAN]
+    if kind == "socketcan" and channel not in there:
+        return DeviceError(
+            f"{name}: there is no CAN interface {channel}; there {'are' if len(there) > 1 else 'is'} "
+            f"{', '.join(there) or 'none'}. Plug the adapter in, or correct the transport."
+        )
+    return DeviceError(f"{name}: {channel} cannot be opened: {error}. {_bring_up(channel, bitrate)}")
+
+
+def _type(interface: Path) -> str:
+    try:
+        return (interface / "type").read_text().strip()
+    except OSError:
+        return ""
+
+
+def _bring_up(channel: str, bitrate: int | None) -> str:
+    return f"Run `sudo ip link set {channel} up type can bitrate {bitrate or 1_000_000}`."
+
+
+class CanLink(Opened):
+    """An open CAN bus."""
+
+    packets = True
+
+    def __init__(self, name: str, bus: can.BusABC) -> None:
+        super().__init__(name)
+        self.bus = bus
+        self._arrivals = Arrivals()
+
+    def _receive(self, timeout_s: float) -> Arrived:
+        import can
+
+        found: Arrived = []
+        try:
+            message = self.bus.recv(timeout_s)
+            while message is not None:
+                if not message.is_error_frame and not message.is_remote_frame and len(message.data) <= 8:
+                    self._arrivals.look()
+                    found.append((self._arrivals.of(int(message.timestamp * 1e9)), packed(message)))
+                message = self.bus.recv(0)
+        except (can.CanError, OSError, ValueError) as error:
+            if not found:
+                raise self.lost(str(error)) from error
+        return found
+
+    def _send(self, data: bytes) -> None:
+        import can
+
+        try:
+            for message in unpacked(data):
+                self.bus.send(message, timeout=SEND_S)
+        except (can.CanError, OSError, ValueError) as error:
+            raise self.lost(str(error)) from error
+
+    def _release(self) -> None:
+        import can
+
+        try:
+            self.bus.shutdown()
+        except (can.CanError, OSError):  # an adapter that is gone cannot be told to stop
+            port = getattr(self.bus, "serialPortOrig", None)  # of slcan, which stays open then
+            if port is not None:
+                port.close()
+
+
+def packed(message: can.Message) -> bytes:
+    """Return the 13 bytes of a frame."""
+    identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+    return FRAME.pack(identifier, len(message.data), bytes(message.data))
+
+
+def unpacked(data: bytes) -> list[can.Message]:
+    """Return the frames of 13 bytes each."""
+    import can
+
+    return [
+        can.Message(
+            arbitration_id=identifier & ~EXTENDED, is_extended_id=bool(identifier & EXTENDED), data=payload[:count]
+        )
+        for identifier, count, payload in FRAME.iter_unpack(data)
+    ]

@@ -1,0 +1,92 @@
+"""Carrying out what a sensor says to its device, and waiting for the replies."""
+
+from __future__ import annotations
+
+import time
+
+from tacpipe.errors import DeviceError
+from tacpipe.links.link import Link
+from tacpipe.links.opened import Arrived
+from tacpipe.sensors.sensor import Ask, Dialogue
+
+SHOWN = 16  # bytes of what came instead of a reply
+
+
+def hold(link: Link, dialogue: Dialogue, stream: str) -> Arrived:
+    """Carry out a dialogue; return what came that was no reply as (arrival, bytes), so that no sample is lost.
+
+    What is behind a reply counts for the next question only if nothing is sent for it. Raises `DeviceError` where no reply
+    comes in time, and what a question raises for a reply that means no.
+    """
+    other: Arrived = []
+    since: Arrived = []  # the last question
+    control: Link = getattr(link, "control", link)
+    try:
+        ask = next(dialogue)
+        while True:
+            if ask.send:
+                other, since = other + since, []
+                control.write(ask.send)
+            reply = b""
+            if ask.until is not None:
+                reply, before = _reply(control, ask, since, stream)
+                other += before
+            since += _pause(control, ask.pause_s)
+            ask = dialogue.send(reply)
+    except StopIteration:
+        return sorted(other + since, key=lambda entry: entry[0])
+
+
+def _reply(link: Link, ask: Ask, since: Arrived, stream: str) -> tuple[bytes, Arrived]:
+    """Return the reply and the packets before it, which are none; what is behind stays in ``since``."""
+    until = time.monotonic() + ask.timeout_s
+    seen = 0
+    while True:
+        found = _found(ask, since, seen, packets=bool(getattr(link, "packets", False)))
+        if found is not None:
+            return found
+        seen = len(since)
+        left_s = until - time.monotonic()
+        if left_s <= 0:
+            raise DeviceError(_silent(ask, since, stream))
+        since += link.read(left_s)
+
+
+def _found(ask: Ask, since: Arrived, seen: int, *, packets: bool) -> tuple[bytes, Arrived] | None:
+    """Return the reply as `_reply` does, taken out of ``since``: a packet by itself, else from the first byte on."""
+    assert ask.until is not None
+    for row in range(seen, len(since)) if packets else ():
+        size = ask.until(since[row][1])
+        if size:
+            before, (t_ns, data) = since[:row], since[row]
+            since[: row + 1] = [(t_ns, data[size:])] if size < len(data) else []
+            return data[:size], before
+    whole = b"".join(data for _, data in since)
+    size = ask.until(whole) if whole else 0
+    if not size:
+        return None
+    left = size
+    while left:
+        t_ns, data = since.pop(0)
+        if len(data) > left:
+            since.insert(0, (t_ns, data[left:]))
+        left -= min(left, len(data))
+    return whole[:size], []
+
+
+def _pause(link: Link, pause_s: float) -> Arrived:
+    """Return what comes during a pause: read it, because queues are short."""
+    until, came = time.monotonic() + pause_s, []
+    while (left_s := until - time.monotonic()) > 0:
+        came += link.read(left_s)
+    return came
+
+
+def _silent(ask: Ask, since: Arrived, stream: str) -> str:
+    count = sum(len(data) for _, data in since)
+    first = b"".join(data for _, data in since)[:SHOWN]
+    instead = f"{count} bytes came that are none, the first {first.hex(' ')}" if count else "nothing came at all"
+    return (
+        f"Stream {stream}: {ask.what} was awaited for {ask.timeout_s:g} s, but {instead}. Check that the device is switched "
+        f"on, and what it is with `tacpipe sensors probe`."
+    )

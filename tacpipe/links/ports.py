@@ -1,0 +1,92 @@
+"""Which serial ports and HID devices this computer has now, and what they say of themselves."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import DeviceError
+
+BY_ID = Path("/dev/serial/by-id")
+INSTALL = "`pip install 'tacpipe[devices]'` brings it"
+
+
+@dataclass(frozen=True)
+class Port:
+    """A port with something behind it."""
+
+    address: str  # as a rig file names it
+    usb_id: str = ""  # "16d0:14cc", empty for what is no USB device
+    what: str = ""  # what the device calls itself
+    lasting: str = ""  # a name of the same port that stays when cables are swapped
+
+    def __str__(self) -> str:
+        told = ", ".join(part for part in (self.usb_id, self.what) if part)
+        return f"{self.address} ({told})" if told else self.address
+
+
+def serial_ports() -> list[Port]:
+    """Return the serial ports that are there."""
+    from serial.tools import list_ports
+
+    lasting = {str(path.resolve()): str(path) for path in BY_ID.glob("*")} if BY_ID.is_dir() else {}
+    found = []
+    for port in sorted(list_ports.comports()):
+        usb_id = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""
+        what = port.product or ("" if port.description in (None, "n/a") else port.description)
+        found.append(Port(f"serial:{port.device}", usb_id, what, lasting.get(port.device, "")))
+    return found
+
+
+def hid_ports() -> list[Port]:
+    """Return the interfaces of HID devices that are there; none where hidapi is not installed."""
+    try:
+        found = hid_module().enumerate()
+    except DeviceError:
+        return []
+    return [
+        Port(f"hid:{told['path'].decode()}", f"{told['vendor_id']:04x}:{told['product_id']:04x}", _described(told))
+        for told in found
+    ]
+
+
+def _described(told: dict[str, Any]) -> str:
+    place = f"interface {told['interface_number']} usage page {told['usage_page']:04x}"
+    return f"{told['product_string'] or ''} {place}".strip()
+
+
+def listed(ports: list[Port]) -> str:
+    """Return the ports as the end of a sentence.
+
+    >>> listed([Port("serial:/dev/ttyACM0", "16d0:14cc", "TSF-85"), Port("serial:/dev/ttyS0")])
+    'there are serial:/dev/ttyACM0 (16d0:14cc, TSF-85) and serial:/dev/ttyS0'
+    >>> listed([])
+    'there is none at all'
+    """
+    if not ports:
+        return "there is none at all"
+    return f"there {'are' if len(ports) > 1 else 'is'} {' and '.join(str(port) for port in ports)}"
+
+
+def hid_module() -> Any:
+    """Return hidapi's module: ``hidraw`` on Linux, which leaves the kernel's driver in place, else ``hid``.
+
+    Raises `DeviceError` where it is not installed, or another package's module of the name is in its place.
+    """
+    name = "hidraw" if sys.platform == "linux" else "hid"
+    try:
+        found: Any = importlib.import_module(name)
+    except ImportError:
+        found = None
+    if hasattr(found, "device"):
+        return found
+    if found is None and importlib.util.find_spec("hid") is None:
+        raise DeviceError(f"HID devices need the package hidapi, which is not installed: {INSTALL}.")
+    raise DeviceError(
+        f"Another package has taken the place of hidapi's module {name}: `pip uninstall hid`, then "
+        f"`pip install --force-reinstall hidapi`."
+    )

@@ -1,0 +1,147 @@
+"""UDP: datagrams with the kernel's own arrival stamps and its count of those it had to drop."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from tacpipe.errors import DeviceError
+from tacpipe.links import holders, network
+from tacpipe.links.arrival import Arrivals
+from tacpipe.links.opened import Arrived, Descriptor
+from tacpipe.sensors.sensor import Sensor
+
+MOST = 1 << 16  # bytes of the largest datagram
+QUEUE = 8 << 20  # bytes that the kernel keeps until they are fetched, if it grants that many
+LINGER_S = 0.005  # after the first datagram, for more to be fetched with it: their stamps are the kernel's
+STAMPS, DROPS = 35, 40  # SO_TIMESTAMPNS and SO_RXQ_OVFL of <asm-generic/socket.h>, which Python does not name
+FORCED_QUEUE = 33  # SO_RCVBUFFORCE of the same
+ROOM = 128  # bytes for both ancillary messages
+
+
+def open_udp(place: str, sensor: Sensor, name: str) -> UdpLink:
+    """Return an open port: listening for ``:PORT`` and for sensors that are listened to, else talking to the host.
+
+    Raises `DeviceError` for a local port that is taken, and for a host that is unknown or unreachable.
+    """
+    host, port = network.place("udp", place)
+    if not host or getattr(sensor, "listens", False):
+        return UdpLink(name, bound(host, port, name), prompt=hurries(sensor))
+    made = None
+    try:
+        family, *_, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        made = socket.socket(family, socket.SOCK_DGRAM)
+        _prepare(made)
+        made.connect(target)
+    except OSError as error:
+        if made is not None:
+            made.close()
+        raise network.failed(error, host, port, name) from error
+    return UdpLink(name, made, prompt=hurries(sensor), talks=True)
+
+
+def bound(host: str, port: int, name: str) -> socket.socket:
+    """Return a socket that listens on a local port, 0 for a free one. Raises `DeviceError` if it is taken."""
+    made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+    _prepare(made)
+    try:
+        made.bind((host, port))
+    except OSError as error:
+        made.close()
+        if error.errno == errno.EADDRINUSE:
+            held = holders.told(holders.of_port("udp", port))
+            raise DeviceError(f"{name}: UDP port {port} is held by {held}; end it, or take another port.") from error
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise DeviceError(
+                f"{name}: {host} is no address of this computer; listen on one of its own, or on all with udp::{port}."
+            ) from error
+        raise network.failed(error, host, port, name) from error
+    return made
+
+
+def hurries(sensor: Sensor) -> bool:
+    """Whether packets must be read at once, because a sensor answers them, or asks for the next when it has one."""
+    return type(sensor).answer is not Sensor.answer or type(sensor).request is not Sensor.request
+
+
+def _prepare(made: socket.socket) -> None:
+    made.setblocking(False)
+    for option, value in ((socket.SO_RCVBUF, QUEUE), (FORCED_QUEUE, QUEUE), (STAMPS, 1), (DROPS, 1)):
+        try:
+            made.setsockopt(socket.SOL_SOCKET, option, value)
+        except OSError:  # not this kernel, or not this user's right: less comfort, the same bytes
+            continue
+
+
+class UdpLink(Descriptor):
+    """A UDP port; each entry that is read is one datagram."""
+
+    packets = True
+
+    def __init__(self, name: str, port: socket.socket, *, prompt: bool, talks: bool = False) -> None:
+        super().__init__(name, port.fileno())
+        self.socket = port
+        self._prompt, self._talks = prompt, talks
+        self._arrivals = Arrivals()
+        self._overruns = 0
+        self._sender: Any = None  # of the last datagram
+
+    @property
+    def local(self) -> Mapping[str, Any]:
+        """The ``host`` and ``port`` that datagrams are awaited on."""
+        host, port = self.socket.getsockname()[:2]
+        return {"host": host, "port": port}
+
+    @property
+    def overruns(self) -> int:
+        """How many datagrams the kernel dropped because its queue was full."""
+        return self._overruns
+
+    def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        if not self._prompt:
+            time.sleep(LINGER_S)
+        self._arrivals.look()
+        found: Arrived = []
+        while True:
+            try:
+                data, told, _, sender = self.socket.recvmsg(MOST, ROOM)
+            except BlockingIOError:
+                return found
+            except OSError as error:
+                refused = isinstance(error, ConnectionRefusedError)
+                why = "the host is there, but refuses the port" if refused else error.strerror or str(error)
+                raise self.lost(why) from error
+            found.append((self._arrival(told), data))
+            self._sender = sender
+
+    def _arrival(self, told: list[tuple[int, int, bytes]]) -> int:
+        """Return the arrival that the ancillary messages of a datagram tell, and take note of drops."""
+        wall_ns = None
+        for level, kind, data in told:
+            if level == socket.SOL_SOCKET and kind == STAMPS:
+                seconds, nanoseconds = struct.unpack("@ll", data[: struct.calcsize("@ll")])
+                wall_ns = seconds * 1_000_000_000 + nanoseconds
+            elif level == socket.SOL_SOCKET and kind == DROPS:
+                self._overruns = int.from_bytes(data[:4], "little")
+        return self._arrivals.of(time.time_ns() if wall_ns is None else wall_ns)
+
+    def _send(self, data: bytes) -> None:
+        if not self._talks and self._sender is None:
+            raise DeviceError(
+                f"{self.name}: nothing came there yet, so nobody can be answered; start the sender first."
+            )
+        try:
+            if self._talks:
+                self.socket.send(data)
+            else:
+                self.socket.sendto(data, self._sender)
+        except OSError as error:
+            raise self.lost(error.strerror or str(error)) from error
+
+    def _release(self) -> None:
+        self.socket.close()
+        super()._release()

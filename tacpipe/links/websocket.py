@@ -1,0 +1,86 @@
+"""Websockets: one message an entry, text as UTF-8."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import TYPE_CHECKING
+
+from tacpipe.errors import DeviceError
+from tacpipe.links import network
+from tacpipe.links.opened import Arrived, Opened
+from tacpipe.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+MOST = 1 << 24  # bytes of the largest message
+CLOSE_S = 1.0  # that the other end is given to say goodbye
+
+
+def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
+    """Return an open websocket of ``HOST:PORT`` or ``HOST:PORT/PATH``.
+
+    Raises `DeviceError` for a host that is unknown, unreachable, refuses, or speaks something else.
+    """
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import connect
+
+    where, _, path = place.partition("/")
+    host, port = network.place("ws", where)
+    wire = network.connect(host, port, name)  # ours, which goes by no proxy and fails in the same words as all
+    try:
+        connection = connect(
+            f"ws://{where}/{path}",
+            sock=wire,
+            compression=None,
+            max_size=MOST,
+            open_timeout=network.CONNECT_S,
+            close_timeout=CLOSE_S,
+        ).__enter__()
+    except (WebSocketException, TimeoutError, OSError, EOFError) as error:
+        wire.close()
+        raise DeviceError(
+            f"{name}: what answers at {host} port {port} is no websocket ({error or type(error).__name__}); check the port."
+        ) from error
+    return WebsocketLink(name, connection)
+
+
+class WebsocketLink(Opened):
+    """An open websocket."""
+
+    packets = True
+
+    def __init__(self, name: str, connection: ClientConnection) -> None:
+        super().__init__(name)
+        self.connection = connection
+
+    def _receive(self, timeout_s: float) -> Arrived:
+        from websockets.exceptions import ConnectionClosed
+
+        found: Arrived = []
+        try:
+            while True:
+                message = self.connection.recv(timeout=0 if found else timeout_s)
+                data = message.encode() if isinstance(message, str) else message
+                found.append((time.monotonic_ns(), data))
+        except TimeoutError:
+            return found
+        except ConnectionClosed as error:
+            if found or self._closed:
+                return found
+            raise self.lost(f"the other end closed the websocket ({error})") from error
+
+    def _send(self, data: bytes) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            self.connection.send(data.decode())  # servers of sensors take text
+        except UnicodeDecodeError:
+            self.connection.send(data)
+        except ConnectionClosed as error:
+            raise self.lost(f"the other end closed the websocket ({error})") from error
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):
+            self.connection.close()

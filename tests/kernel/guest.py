@@ -1,0 +1,135 @@
+"""What runs inside the virtual machine: a HID device made with the kernel's uhid, read through `open_link`.
+
+Prints one line, ``RESULT`` and JSON. Run as ``guest.py board`` it is the device: it reads commands as
+`tests/links/hid_board.py` does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from tests.links.raw_hid import DESCRIPTOR, report  # noqa: E402
+
+# of <linux/uhid.h>
+DESTROY, OUTPUT, CREATE, INPUT = 1, 6, 11, 12
+CREATE_LAYOUT, INPUT_LAYOUT, EVENT = struct.Struct("<I128s64s64sHHIIII4096s"), struct.Struct("<IH4096s"), 4380
+USB = 3  # BUS_USB of <linux/input.h>
+COUNT, RATE_HZ, FLOOD = 3000, 1000, 200
+
+
+def board() -> None:
+    """Be the device until ``unplug``."""
+    device = os.open("/dev/uhid", os.O_RDWR)
+    name = b"Teensyduino RawHID"
+    os.write(
+        device,
+        CREATE_LAYOUT.pack(CREATE, name, b"", b"12345", len(DESCRIPTOR), USB, 0x16C0, 0x0486, 0x0275, 0, DESCRIPTOR),
+    )
+    print("made", flush=True)
+    for line in sys.stdin:
+        words = line.split()
+        if words[0] == "send":
+            _send(device, int(words[1]), float(words[2]))
+            print("sent", flush=True)
+        elif words[0] == "heard":
+            print(_heard(device).hex(), flush=True)
+        else:
+            break
+    os.write(device, struct.pack("<I", DESTROY))
+    os.close(device)
+
+
+def _send(device: int, count: int, rate_hz: float) -> None:
+    due = time.monotonic()
+    for number in range(count):
+        if rate_hz:
+            time.sleep(max(0.0, due - time.monotonic()))
+            due += 1 / rate_hz
+        os.write(device, INPUT_LAYOUT.pack(INPUT, 64, report(number)))
+
+
+def _heard(device: int) -> bytes:
+    """Return the next report that was written to the device."""
+    while select.select([device], [], [], 10)[0]:
+        event = os.read(device, EVENT)
+        if int.from_bytes(event[:4], "little") == OUTPUT:
+            return event[4 : 4 + int.from_bytes(event[4100:4102], "little")]
+    return b""
+
+
+def reader() -> dict[str, Any]:
+    """Return what a reader of the device sees."""
+    from tacpipe.links import ports
+    from tacpipe.links.link import LinkLostError, parse
+    from tacpipe.links.opening import open_link
+    from tacpipe.sensors.rawhid import RawHid
+
+    with subprocess.Popen(
+        [sys.executable, "-B", __file__, "board"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as device:
+        assert device.stdin is not None and device.stdout is not None
+        ask, told = device.stdin, device.stdout
+
+        def order(text: str) -> None:
+            ask.write(f"{text}\n")
+            ask.flush()
+
+        assert told.readline() == "made\n"
+        _await_node()
+        found: dict[str, Any] = {"kernel": os.uname().release, "ports": [str(port) for port in ports.hid_ports()]}
+        link = open_link(parse("hid:16c0:0486"), RawHid(), "board")
+        link.write(bytes(range(64)))
+        order("heard")
+        found["heard"] = told.readline().strip()
+
+        order(f"send {COUNT} {RATE_HZ}")
+        came: list[tuple[int, bytes]] = []
+        busy, begun = time.process_time(), time.monotonic()
+        while len(came) < COUNT and time.monotonic() - begun < 60:
+            came += link.read(0.5)
+        found["busy_share"] = round((time.process_time() - busy) / (time.monotonic() - begun), 3)
+        found["rate_hz"] = round((len(came) - 1) * 1e9 / (came[-1][0] - came[0][0]), 1)
+        found["seq"] = _counters(came)
+        assert told.readline() == "sent\n"
+
+        order(f"send {FLOOD} 0")
+        assert told.readline() == "sent\n"
+        found["flood"] = _counters([entry for _ in range(10) for entry in link.read(0.1)])
+
+        order("unplug")
+        try:
+            for _ in range(100):
+                link.read(0.1)
+            found["lost"] = ""
+        except LinkLostError as error:
+            found["lost"] = str(error)
+        link.close()
+    return found
+
+
+def _await_node() -> None:
+    until = time.monotonic() + 30
+    while not list(Path("/dev").glob("hidraw*")) and time.monotonic() < until:
+        time.sleep(0.1)
+
+
+def _counters(came: list[tuple[int, bytes]]) -> list[int]:
+    return [int.from_bytes(data[-2:], "big") for _, data in came]
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["board"]:
+        board()
+    else:
+        print("RESULT", json.dumps(reader()), flush=True)

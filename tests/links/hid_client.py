@@ -1,0 +1,59 @@
+"""Reads a HID device through `open_link` and prints what came as JSON, for a test that prepares the surroundings.
+
+Arguments: how many reports to wait for, and then whether to wait for the device to go away. No test by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+from tacpipe.links import ports
+from tacpipe.links.link import LinkLostError, parse
+from tacpipe.links.opening import open_link
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.rawhid import RawHid
+
+
+def main(count: int, *, until_lost: bool) -> None:
+    """Print ``open`` once the device is open, and then what came."""
+    there = [str(port) for port in ports.hid_ports()]
+    sensor = RawHid()
+    link = open_link(parse("hid:16c0:0486"), sensor, "board")
+    link.write(bytes(range(64)))
+    print("open", flush=True)
+    found: list[tuple[int, bytes]] = []
+    lost = ""
+    begun, busy = time.monotonic(), time.process_time()
+    while len(found) < count and time.monotonic() - begun < 60:
+        found += link.read(0.5)
+    busy = time.process_time() - busy
+    waited = link.read(0.05)
+    try:
+        while until_lost and time.monotonic() - begun < 60:
+            print("waiting", flush=True)
+            link.read(2)
+    except LinkLostError as error:
+        lost = str(error)
+    link.close()
+    link.close()
+    samples = [sensor.decode(run.frames) for run in sensor.framer().feed(Chunks.of(found))[0]]
+    seq = [int(value) for sample in samples for value in (sample.seq if sample.seq is not None else [])]
+    first = [int(value) for sample in samples for value in sample.values[0][:, 0]]
+    stamps = [t_ns for t_ns, _ in found]
+    span_s = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
+    told = {
+        "ports": there,
+        "seq": seq,
+        "first": first,
+        "late": len(waited),
+        "lost": lost,
+        "monotone": stamps == sorted(stamps),
+        "busy_share": busy / max(1e-9, span_s),
+    }
+    print(json.dumps(told))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), until_lost="lost" in sys.argv[2:])

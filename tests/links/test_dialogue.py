@@ -1,0 +1,131 @@
+"""A dialogue is carried out, and what came meanwhile is not lost."""
+
+from __future__ import annotations
+
+import os
+import pty
+import threading
+import tty
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from tacpipe.errors import DeviceError
+from tacpipe.links.dialogue import hold
+from tacpipe.links.link import Link
+from tacpipe.sensors.sensor import Ask, Dialogue
+from tests.links import peers
+from tests.links.peers import Quiet, made
+
+Talk = Callable[[bytes, list[bytes]], None]
+
+
+@pytest.fixture
+def device() -> Iterator[tuple[Link, Talk]]:
+    """A link, and a way to have the device say something after it heard something."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = made(f"serial:{os.ttyname(slave)}", Quiet())
+    threads: list[threading.Thread] = []
+
+    def talk(after: bytes, replies: list[bytes]) -> None:
+        def run() -> None:
+            heard = b""
+            while not heard.endswith(after):
+                heard += os.read(master, 100)
+            for reply in replies:
+                os.write(master, reply)
+
+        threads.append(threading.Thread(target=run))
+        threads[-1].start()
+
+    yield link, talk
+    for thread in threads:
+        thread.join()
+    link.close()
+    os.close(slave)
+    os.close(master)
+
+
+def ends_with_newline(data: bytes) -> int:
+    return data.find(b"\n") + 1
+
+
+def test_replies_reach_the_sensor_and_the_stream_behind_them_is_kept(device: tuple[Link, Talk]) -> None:
+    link, talk = device
+    heard = []
+
+    def dialogue() -> Dialogue:
+        heard.append((yield Ask(b"version?", ends_with_newline)))
+        heard.append((yield Ask(b"", ends_with_newline)))  # a second line that nothing was asked for
+        yield Ask(b"start", pause_s=0.2)
+
+    talk(b"version?", [b"1.2\nserial 7\nfra", b"me"])
+    talk(b"start", [b"frame2"])
+    kept = hold(link, dialogue(), "probe")
+
+    assert heard == [b"1.2\n", b"serial 7\n"]
+    assert b"".join(data for _, data in kept) + b"".join(data for _, data in link.read(0.2)) == b"frameframe2"
+    assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
+
+
+def test_packets_before_and_after_a_reply_are_no_replies() -> None:
+    with peers.websocket() as peer:
+        for text in (b"data 1", b"reply 1", b"data 2"):
+            peer.send(text)
+
+        def dialogue() -> Dialogue:
+            told = yield Ask(b"hello", lambda data: len(data) if data.startswith(b"reply") else 0)
+            assert told == b"reply 1"
+
+        kept = hold(peer.link, dialogue(), "probe")
+        if len(kept) < 2:  # what is behind the reply may come late
+            kept += peer.came(6)
+
+    assert [data for _, data in kept] == [b"data 1", b"data 2"]
+
+
+def test_a_control_connection_carries_the_dialogue_and_data_wait() -> None:
+    with peers.both() as peer:
+        control = peer
+
+        def dialogue() -> Dialogue:
+            peer.send(b"datagram")
+            yield Ask(b"connect")
+            assert control.heard(7) == b"connect"
+
+        assert hold(peer.link, dialogue(), "probe") == []
+        assert peer.came(8)[0][1] == b"datagram"
+
+
+def test_silence_is_told_with_what_was_awaited(device: tuple[Link, Talk]) -> None:
+    def dialogue() -> Dialogue:
+        yield Ask(b"?", ends_with_newline, timeout_s=0.1, what="the version")
+
+    with pytest.raises(DeviceError, match=r"Stream pps: the version was awaited for 0\.1 s, but nothing came at all\."):
+        hold(device[0], dialogue(), "pps")
+
+
+def test_what_came_instead_of_a_reply_is_told(device: tuple[Link, Talk]) -> None:
+    link, talk = device
+
+    def dialogue() -> Dialogue:
+        yield Ask(b"?", ends_with_newline, timeout_s=0.3, what="the version")
+
+    talk(b"?", [b"\xaa\x55\x00"])
+    with pytest.raises(DeviceError, match="3 bytes came that are none, the first aa 55 00"):
+        hold(link, dialogue(), "pps")
+
+
+def test_a_reply_that_means_no_ends_the_dialogue(device: tuple[Link, Talk]) -> None:
+    link, talk = device
+
+    def refused(data: bytes) -> int:
+        raise DeviceError(f"The device says {data.decode()}.")
+
+    def dialogue() -> Dialogue:
+        yield Ask(b"start", refused)
+
+    talk(b"start", [b"no"])
+    with pytest.raises(DeviceError, match=r"The device says n"):
+        hold(link, dialogue(), "pps")

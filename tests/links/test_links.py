@@ -1,0 +1,117 @@
+"""The same questions for all kinds of links, each against a real other end."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import pytest
+
+from tacpipe.links.link import LinkLostError
+from tests.links import peers
+from tests.links.peers import Peer
+
+KINDS: dict[str, Callable[[], AbstractContextManager[Peer]]] = {
+    "serial": peers.serial,
+    "tcp": peers.tcp,
+    "udp": peers.udp_talking,
+    "tcp+udp": peers.both,
+    "ws": peers.websocket,
+    "virtual": peers.can_virtual,
+}
+EVERY = (*KINDS, "slcan", "folder")
+FRAMES = [number.to_bytes(4, "little") + b"\x03" + bytes([number, 1, 2]) + bytes(5) for number in range(20)]
+
+
+@pytest.fixture
+def peer(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
+    """An open link of the kind that the test asks for, with its other end."""
+    kind = request.param
+    manager: AbstractContextManager[Peer]
+    if kind == "folder":
+        manager = peers.folder(tmp_path / "watched")
+    elif kind == "slcan":
+        manager = peers.can_slcan(monkeypatch)
+    else:
+        manager = KINDS[kind]()
+    with manager as made:
+        if kind == "udp":  # a device that answers must have been spoken to
+            made.link.write(b"hello")
+            assert made.heard(5) == b"hello"
+        yield made
+
+
+@pytest.mark.parametrize("peer", EVERY, indirect=True)
+def test_all_bytes_come_in_order_with_stamps_that_never_go_back(peer: Peer) -> None:
+    begun = time.monotonic_ns()
+    for frame in FRAMES:
+        peer.send(frame)
+
+    found = peer.came(sum(map(len, FRAMES)))
+
+    stamps = [t_ns for t_ns, _ in found]
+    assert b"".join(data for _, data in found) == b"".join(FRAMES)
+    if peer.packets:
+        assert [data for _, data in found] == FRAMES
+    assert stamps == sorted(stamps)
+    tick = 10_000_000  # of the clock that stamps files
+    assert begun - tick <= stamps[0] and stamps[-1] <= time.monotonic_ns()
+
+
+@pytest.mark.parametrize("peer", EVERY, indirect=True)
+def test_while_nothing_comes_nothing_is_read(peer: Peer) -> None:
+    assert peer.link.read(0.01) == []
+    peer.send(FRAMES[7])
+    assert b"".join(data for _, data in peer.came(len(FRAMES[7]))) == FRAMES[7]
+    assert peer.link.read(0) == []
+    assert peer.link.overruns == 0
+
+
+@pytest.mark.parametrize("peer", [kind for kind in EVERY if kind != "folder"], indirect=True)
+def test_what_is_written_arrives(peer: Peer) -> None:
+    peer.link.write(FRAMES[5])
+
+    assert peer.heard(len(FRAMES[5])) == FRAMES[5]
+
+
+@pytest.mark.parametrize("peer", [kind for kind in EVERY if kind != "virtual"], indirect=True)
+def test_a_device_that_went_away_is_lost_and_the_error_names_the_stream(peer: Peer) -> None:
+    peer.send(FRAMES[0])
+    peer.came(len(FRAMES[0]))
+    peer.leave()
+
+    with pytest.raises(LinkLostError, match=r"^Stream probe \(.+\) is lost: .+ Check its cable and its power\.$"):
+        for _ in range(50):
+            peer.link.read(0.1)
+
+
+@pytest.mark.parametrize("peer", EVERY, indirect=True)
+def test_a_link_may_be_closed_twice_and_not_read_again(peer: Peer) -> None:
+    peer.link.close()
+    peer.link.close()
+
+    with pytest.raises(LinkLostError, match="was closed; open it again"):
+        peer.link.read(0.01)
+    with pytest.raises(LinkLostError, match="was closed; open it again"):
+        peer.link.write(b"late")
+
+
+@pytest.mark.parametrize("peer", ["serial", "tcp", "udp", "tcp+udp", "ws", "folder"], indirect=True)
+def test_a_reader_that_waits_returns_when_another_thread_closes_the_link(peer: Peer) -> None:
+    returned = threading.Event()
+
+    def read() -> None:
+        with contextlib.suppress(LinkLostError):  # it was closed before this thread came to read
+            peer.link.read(600)
+        returned.set()
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    peer.link.close()
+
+    assert returned.wait(peers.SOON_S)
+    reader.join()

@@ -1,0 +1,175 @@
+"""Serial ports open for one program alone, as the sensor wants them, and say in a sentence why they do not."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pty
+import stat
+import subprocess
+import sys
+import termios
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tacpipe.errors import DeviceError
+from tacpipe.links import holders, serial_port
+from tacpipe.sensors.sensor import Line, Sensor
+from tests.links.peers import Quiet, made
+
+HOLDER = """
+import serial, sys
+port = serial.Serial(sys.argv[1], exclusive=True)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, str]]:
+    """The master of a pseudo-terminal, and the path of its slave."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize("baud", [115_200, 123_456, 2_000_000, 4_000_000])
+def test_any_rate_of_baud_can_be_set(baud: int, terminal: tuple[int, str]) -> None:
+    master, path = terminal
+    sensor = Quiet()
+    sensor.baud = baud
+
+    link = made(f"serial:{path}", sensor)
+    os.write(master, b"abc")
+
+    assert link.read(5)[0][1] == b"abc"
+    standard = termios.__dict__.get(f"B{baud}")
+    if standard is not None:
+        assert termios.tcgetattr(master)[4] == standard
+    link.close()
+
+
+def test_control_lines_that_a_terminal_does_not_have_do_no_harm(terminal: tuple[int, str]) -> None:
+    class Wired(Quiet):
+        line = Line(dtr=True, rts=False)
+
+    link = made(f"serial:{terminal[1]}", Wired())
+    link.write(b"ok")
+    assert os.read(terminal[0], 2) == b"ok"
+    link.close()
+
+
+def test_what_comes_while_a_device_boots_is_thrown_away(
+    terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Booting(Quiet):
+        line = Line(settle_s=1.5)
+
+    slept = []
+
+    def boot(seconds: float) -> None:
+        slept.append(seconds)
+        os.write(terminal[0], b"Hello from the bootloader\r\n")
+
+    monkeypatch.setattr("tacpipe.links.serial_port.time.sleep", boot)
+    link = made(f"serial:{terminal[1]}", Booting())
+    os.write(terminal[0], b"frame")
+
+    assert slept == [1.5]
+    assert b"".join(data for _, data in link.read(1)) == b"frame"
+    link.close()
+
+
+def test_a_port_that_another_program_holds_is_busy_and_the_program_is_named(terminal: tuple[int, str]) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, terminal[1]], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout is not None and holder.stdin is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(DeviceError, match=rf"is held by .*\(process {holder.pid}\).*; end it") as refused:
+            made(f"serial:{terminal[1]}", Quiet())
+        holder.stdin.close()
+
+    assert refused.value.exit_code == 5
+    made(f"serial:{terminal[1]}", Quiet()).close()  # and is free again
+
+
+def test_a_port_that_another_program_reads_without_locking_it_is_busy_too(
+    terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "PSEUDO", "/nowhere")  # as if it were a cable
+    with subprocess.Popen([sys.executable, "-c", HOLDER.replace("exclusive=True", ""), terminal[1]],
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:  # fmt: skip
+        assert holder.stdout is not None and holder.stdin is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(DeviceError, match=rf"\(process {holder.pid}\).*; end it, because two readers"):
+            made(f"serial:{terminal[1]}", Quiet())
+        holder.stdin.close()
+
+
+def test_a_missing_port_lists_those_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    from serial.tools import list_ports
+    from serial.tools.list_ports_common import ListPortInfo
+
+    there = ListPortInfo("/dev/ttyACM7")
+    there.vid, there.pid, there.product = 0x16D0, 0x14CC, "TSF-85"
+    monkeypatch.setattr(list_ports, "comports", lambda: [there])
+
+    with pytest.raises(DeviceError) as missing:
+        made("serial:/dev/ttyACM0", Quiet())
+
+    assert str(missing.value) == (
+        "Stream probe (serial:/dev/ttyACM0): there is no port /dev/ttyACM0; there is serial:/dev/ttyACM7 (16d0:14cc, "
+        "TSF-85). Plug the device in, or correct the transport."
+    )
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.EACCES, r"you may not open .+; it belongs to the group \w+: run `sudo usermod -aG \w+ \$USER`"),
+        (errno.EBUSY, r"is held by a process of another user; end it"),
+        (errno.EIO, r"cannot be opened: Input/output error\. Unplug it and plug it in again"),
+    ],
+)
+def test_what_the_system_answers_becomes_a_sentence(
+    number: int, told: str, terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(holders, "of_file", lambda _: [])
+    monkeypatch.setattr("serial.serialposix.os.open", refuse)
+
+    with pytest.raises(DeviceError, match=told):
+        made(f"serial:{terminal[1]}", Quiet())
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_port_without_the_right_to_it_says_how_to_get_it(terminal: tuple[int, str]) -> None:
+    Path(terminal[1]).chmod(0)
+    with pytest.raises(DeviceError, match="usermod -aG"):
+        made(f"serial:{terminal[1]}", Quiet())
+    Path(terminal[1]).chmod(stat.S_IRUSR | stat.S_IWUSR)
+
+
+def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("none")
+    with pytest.raises(DeviceError, match=r"notes\.txt is no serial port; there "):
+        made(f"serial:{tmp_path / 'notes.txt'}", Quiet())
+
+
+def test_a_device_that_takes_no_byte_is_lost_after_a_while(
+    terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tacpipe.links.opened.WRITE_S", 0.2)
+    sensor: Sensor = Quiet()
+    link = made(f"serial:{terminal[1]}", sensor)
+    with pytest.raises(DeviceError, match=r"it took no byte for 0\.2 s"):
+        link.write(bytes(1 << 20))
+    link.close()
