@@ -149,7 +149,7 @@ def touch(scene: Scene, finger: int, true_ns: NDArray[np.int64], *, creep: float
     """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis)."""
     contact = scene.contact
     rows = np.minimum(np.searchsorted(scene.path.t_ns, true_ns), len(scene.path.t_ns) - 1)
-    at = _at(scene, true_ns)
+    at = interpolation(scene, true_ns)
     displacement, torque = at(contact.displacement_m), at(contact.torque_nm)
     pressures = [
         at(contact.normal_n[:, j])[:, None] * taxels.shares(one, displacement, torque)
@@ -169,9 +169,9 @@ def _measured(
 ) -> tuple[NDArray[Any], list[Any]]:
     """Return what a device logs of samples taken at ``true_ns`` (time, channel), and its fields."""
     if name == "robot":
-        return _robot(scene, true_ns), [channels.float_field("finger_m", "m", "finger_width"), *channels.pose_fields()]
+        return arm(scene, true_ns), [channels.float_field("finger_m", "m", "finger_width"), *channels.pose_fields()]
     if name == "proximity":
-        up_m = _at(scene, true_ns)(scene.contact.displacement_m[:, 1])
+        up_m = interpolation(scene, true_ns)(scene.contact.displacement_m[:, 1])
         field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
         return proximity.readings(up_m, rig.noise_scale, rng)[:, None], [field]
     finger = ("xela1", "xela2").index(name)
@@ -214,7 +214,7 @@ def _loss_row(load_n: Floats, grasp: mechanics.Grasp, rise_m: Floats, loss: floa
     return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
 
 
-def _at(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
+def interpolation(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
     """Return a function that interpolates values at 1 kHz (time,) or (time, axis) to ``true_ns``."""
     rows = np.clip(np.searchsorted(scene.path.t_ns, true_ns, side="right"), 1, len(scene.path.t_ns) - 1)
     before_ns = scene.path.t_ns[rows - 1]
@@ -228,9 +228,9 @@ def _at(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
     return at
 
 
-def _robot(scene: Scene, true_ns: NDArray[np.int64]) -> Floats:
+def arm(scene: Scene, true_ns: NDArray[np.int64]) -> Floats:
     """Return finger width, position and quaternion (time, 8) at ``true_ns``: the gripper points down and yaws."""
-    at = _at(scene, true_ns)
+    at = interpolation(scene, true_ns)
     half = at(scene.path.yaw_rad) / 2
     zero = np.zeros_like(half)
     return np.column_stack([at(scene.finger_m), at(scene.path.position_m), np.cos(half), np.sin(half), zero, zero])

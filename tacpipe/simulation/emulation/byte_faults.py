@@ -1,0 +1,222 @@
+"""What harms a stream on its way: bytes that are changed, added or lost, frames that are, moments in which nothing comes.
+
+`Harm` takes the frames of a stream, with the times at which they are due, and gives what goes out instead. It knows
+nothing of links: whatever it does to a stream is the same for the same seed, however the stream is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from tacpipe import params
+from tacpipe.errors import UsageError
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.simulation.emulation import disguise
+from tacpipe.simulation.emulation.happening import Happening
+
+SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRUN, BAUD, STALL, GONE = (
+    "", "noise", "cut", "flip", "burst", "drop", "duplicate", "reorder", "unplug", "replug", "overrun", "baud", "stall",
+    "gone",
+)  # fmt: skip
+CAUSES = (SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRUN, BAUD, STALL, GONE)
+CHANGED = (CUT, FLIP, BURST)  # faults whose frame goes out with other bytes
+LONGEST_NOISE, LONGEST_BURST = 40, 60  # bytes
+SEPARATION_NS = 1_000  # from a frame to what is put before or behind it
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong, and how often. Rates are times a second, probabilities are a frame's."""
+
+    noise: float = 0.0  # a second: some bytes between two frames, or a packet of nonsense
+    cut: float = 0.0  # a second: a frame of which the beginning or the end is missing
+    flip: float = 0.0  # a second: a bit that is inverted
+    burst: float = 0.0  # a second: up to 60 bytes in a row that are random
+    drop: float = 0.0  # probability: the frame does not go out
+    duplicate: float = 0.0  # probability: the packet goes out twice; nothing on links of bytes
+    reorder: float = 0.0  # probability: the packet goes out behind the next; nothing on links of bytes
+    stall: float = 0.0  # a second: nothing comes for a while, and then all of it
+    stall_s: float = 0.2  # for which it stalls
+    unplug: float = 0.0  # a second: the device goes away
+    unplug_s: float = 1.0  # after which it comes back
+    clock_step: float = 0.0  # a second: the device's clock is set
+    clock_step_ms: float = 50.0  # by so much, forward or back
+    wrap_s: float | None = None  # counters go round so long after the start
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "cut", "flip", "burst", "stall", "stall_s", "unplug", "unplug_s", "clock_step"):
+            if getattr(self, name) < 0:
+                raise UsageError(f"faults: {name} is {getattr(self, name):g}; it cannot be below 0.")
+        for name in ("drop", "duplicate", "reorder"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"faults: {name} is {getattr(self, name):g}; a probability is 0 to 1.")
+
+
+def parse(text: str) -> Faults:
+    """Return the faults that a command line names. Raises `UsageError` for an unknown one and for what is no number.
+
+    >>> parse("noise=0.5,drop=0.01").drop
+    0.01
+    """
+    values: dict[str, float] = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        try:
+            values[name.strip()] = float(value)
+        except ValueError:
+            raise UsageError(f"--faults: {part!r} is no fault; each reads like noise=0.5, with a number.") from None
+    found: Faults = params.filled(Faults, values, "--faults", "fault")
+    return found
+
+
+class Item(NamedTuple):
+    """What goes out at a moment: a frame or what became of it, noise, or that the device is unplugged or back."""
+
+    due_ns: int
+    data: bytes  # empty: nothing goes out
+    number: int  # of the sample, -1: of none
+    cause: str = SOUND
+    invisible: bool = False  # harmed, and still takes the protocol's own test for a frame
+
+
+class Harm:
+    """Does to the frames of one stream what its faults say."""
+
+    def __init__(self, faults: Faults, sensor: Sensor, seed: Sequence[int], *, packets: bool) -> None:
+        self.faults, self.sensor, self.packets = faults, sensor, packets
+        self._rng = np.random.default_rng([*seed, 3])
+        rates = (faults.noise, faults.cut, faults.flip, faults.burst, faults.stall, faults.unplug)
+        rngs = [np.random.default_rng([*seed, 4, number]) for number in range(len(rates))]
+        happenings = [Happening(rate, rng) for rate, rng in zip(rates, rngs, strict=True)]
+        self._noise, self._cut, self._flip, self._burst, self._stall, self._unplug = happenings
+        self._stalls: list[tuple[int, int]] = []  # from, until; the last few
+        self._away: list[tuple[int, int]] = []
+        self._later: list[Item] = []  # what was put off beyond the frames at hand
+        self._quiet = faults == Faults(wrap_s=faults.wrap_s)
+
+    def done(self, frames: Sequence[bytes], due_ns: Sequence[int], first: int) -> list[Item]:
+        """Return what goes out instead of ``frames``, in order; ``first`` is the number of the first one's sample."""
+        items = [Item(due, data, first + row) for row, (data, due) in enumerate(zip(frames, due_ns, strict=True))]
+        if self._quiet or not items:
+            return items
+        until_ns = items[-1].due_ns + 1
+        self._change(items, until_ns)
+        self._judge(items, frames)
+        items = self._lose(items)
+        items = self._move(items) if self.packets else items
+        items = self._add_noise(items, until_ns)
+        items = self._stay_away(items, until_ns)
+        items = sorted([*self._later, *self._hold_up(items, until_ns)], key=lambda item: item.due_ns)
+        self._later = [item for item in items if item.due_ns >= until_ns]
+        return items[: len(items) - len(self._later)]
+
+    def _change(self, items: list[Item], until_ns: int) -> None:
+        for at_ns in self._flip.until(until_ns):
+            row = _row(items, at_ns)
+            changed = bytearray(items[row].data)
+            bit = int(self._rng.integers(8 * len(changed)))
+            changed[bit // 8] ^= 1 << bit % 8
+            items[row] = items[row]._replace(data=bytes(changed), cause=FLIP)
+        for at_ns in self._cut.until(until_ns):
+            row = _row(items, at_ns)
+            kept = int(self._rng.integers(1, max(2, len(items[row].data))))
+            data = items[row].data[:kept] if self._rng.random() < 0.5 else items[row].data[-kept:]
+            items[row] = items[row]._replace(data=data, cause=CUT)
+        for at_ns in self._burst.until(until_ns):
+            row = _row(items, at_ns)
+            start = int(self._rng.integers(len(items[row].data)))
+            self._replace_bytes(items, row, start, int(self._rng.integers(2, LONGEST_BURST + 1)))
+
+    def _replace_bytes(self, items: list[Item], row: int, start: int, count: int) -> None:
+        """Replace ``count`` bytes from ``start`` of a frame by random ones, into the frames behind it where they reach."""
+        while count > 0 and row < len(items):
+            data = items[row].data
+            there = min(count, len(data) - start)
+            if there > 0:
+                random = self._rng.integers(0, 256, there, dtype=np.uint8).tobytes()
+                items[row] = items[row]._replace(data=data[:start] + random + data[start + there :], cause=BURST)
+            row, start, count = row + 1, 0, 0 if self.packets else count - there
+
+    def _judge(self, items: list[Item], frames: Sequence[bytes]) -> None:
+        for row, item in enumerate(items):
+            if item.cause in CHANGED:
+                items[row] = item._replace(invisible=disguise.passes(self.sensor, frames, row, item.data))
+
+    def _lose(self, items: list[Item]) -> list[Item]:
+        if not self.faults.drop:
+            return items
+        lost = self._rng.random(len(items)) < self.faults.drop
+        return [
+            item._replace(data=b"", cause=DROP, invisible=False) if gone else item
+            for item, gone in zip(items, lost, strict=True)
+        ]
+
+    def _move(self, items: list[Item]) -> list[Item]:
+        """Return packets of which some come twice, and some behind the next."""
+        faults, moved = self.faults, list(items)
+        for row in np.flatnonzero(self._rng.random(len(items) - 1) < faults.reorder) if faults.reorder else ():
+            before, after = moved[row], moved[row + 1]
+            moved[row] = after._replace(due_ns=before.due_ns)
+            moved[row + 1] = before._replace(due_ns=after.due_ns, cause=before.cause or REORDER)
+        if not faults.duplicate:
+            return moved
+        twice = self._rng.random(len(moved)) < faults.duplicate
+        doubled: list[Item] = []
+        for item, again in zip(moved, twice, strict=True):
+            doubled.append(item)
+            if again and item.data:
+                doubled.append(item._replace(due_ns=item.due_ns + SEPARATION_NS, cause=DUPLICATE))
+        return doubled
+
+    def _add_noise(self, items: list[Item], until_ns: int) -> list[Item]:
+        noise = []
+        for at_ns in self._noise.until(until_ns):
+            count = int(self._rng.integers(1, LONGEST_NOISE + 1))
+            before = items[_row(items, at_ns)].due_ns - SEPARATION_NS
+            noise.append(Item(before, self._rng.integers(0, 256, count, dtype=np.uint8).tobytes(), -1, NOISE))
+        return sorted([*items, *noise], key=lambda item: item.due_ns) if noise else items
+
+    def _stay_away(self, items: list[Item], until_ns: int) -> list[Item]:
+        away_ns = round(self.faults.unplug_s * 1e9)
+        back_ns = self._away[-1][1] if self._away else -1
+        signs = []
+        for at_ns in self._unplug.until(until_ns):
+            if at_ns >= back_ns:
+                back_ns = at_ns + away_ns
+                self._away = [*self._away[-1:], (at_ns, back_ns)]
+                signs += [Item(at_ns, b"", -1, UNPLUG), Item(back_ns, b"", -1, REPLUG)]
+        if not self._away:
+            return items
+        kept = [
+            item._replace(data=b"", cause=UNPLUG, invisible=False)
+            if any(start <= item.due_ns < stop for start, stop in self._away)
+            else item
+            for item in items
+        ]
+        return sorted([*kept, *signs], key=lambda item: item.due_ns)
+
+    def _hold_up(self, items: list[Item], until_ns: int) -> list[Item]:
+        stall_ns = round(self.faults.stall_s * 1e9)
+        self._stalls = self._stalls[-2:] + [(at_ns, at_ns + stall_ns) for at_ns in self._stall.until(until_ns)]
+        if not self._stalls:
+            return items
+        held = []
+        for item in items:
+            for start, stop in self._stalls:
+                if start <= item.due_ns < stop and item.cause not in (UNPLUG, REPLUG):
+                    item = item._replace(due_ns=stop, cause=item.cause or STALL)
+            held.append(item)
+        return held
+
+
+def _row(items: Sequence[Item], at_ns: int) -> int:
+    """Return the row of the frame that is due at ``at_ns`` or next."""
+    low, high = 0, len(items) - 1
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if items[middle].due_ns < at_ns else (low, middle)
+    return low

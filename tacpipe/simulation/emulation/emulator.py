@@ -1,0 +1,210 @@
+"""The emulator: every stream of a rig, served without hardware, all driven by one physical simulation.
+
+One thread sends everything when it is due and hears the hosts; another plans ahead. So a rig of 1 kHz costs little, and
+what is sent does not depend on when the threads run: only when it is sent does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from tacpipe import params
+from tacpipe.recording.rig import Rig, Stream
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.simulation import faults as clocks
+from tacpipe.simulation import pick_and_move
+from tacpipe.simulation.emulation import serving
+from tacpipe.simulation.emulation.byte_faults import Faults
+from tacpipe.simulation.emulation.clock_steps import ClockSteps, no_steps
+from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
+from tacpipe.simulation.emulation.ledger import Ledger
+from tacpipe.simulation.emulation.pacing import Pace
+from tacpipe.simulation.emulation.source import Sampled, Source, Timing
+from tacpipe.simulation.emulation.transmission import Plan, Transmission
+from tacpipe.simulation.emulation.world import World
+
+LOOK_NS = 20_000_000  # between looks at what no descriptor tells
+FILL_S = 0.1  # between looks whether more must be planned
+LONGEST_S = 0.02  # that a wait lasts at most
+UNPACED_HZ = 2.0  # of sensors that say no rate: clouds that come when they come
+
+
+class Emulator:
+    """A rig that is served while the ``with`` statement lasts.
+
+    ``rig`` is the same rig with the addresses that were made, ``ledger`` tells for each stream what was sent and what was
+    harmed, ``folder`` holds pseudo-terminals and files.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        seed: int = 0,
+        faults: Faults | None = None,
+        folder: Path | None = None,
+        world: World | None = None,
+    ) -> None:
+        self.asked, self.seed, self.faults = rig, seed, faults or Faults()
+        self.folder = folder or Path()
+        self._temporary = folder is None
+        self._held = contextlib.ExitStack()
+        self.world = world or World(seed)
+        self.ledger = {name: Ledger(name) for name in rig.streams}
+        self._transmissions: dict[str, Transmission] = {}
+        self._stopped = threading.Event()
+        self._errors: list[BaseException] = []
+        self._commands: list[tuple[str, bool]] = []
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as hosts find it."""
+        streams = {
+            name: replace(stream, address=self._transmissions[name].endpoint.address)
+            for name, stream in self.asked.streams.items()
+        }
+        return replace(self.asked, streams=streams)
+
+    def __enter__(self) -> Self:
+        paces = {name: pace(self.asked, name) for name in self.asked.streams}
+        with contextlib.ExitStack() as held:
+            if self._temporary:
+                self.folder = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="tacpipe-")))
+            self.folder.mkdir(parents=True, exist_ok=True)
+            endpoints: dict[str, Endpoint] = {}
+            for name, stream in self.asked.streams.items():
+                endpoints[name] = serving.endpoint(stream, self.folder)
+                held.callback(endpoints[name].close)
+            self._held = held.pop_all()
+        self.epoch_ns = time.monotonic_ns()
+        for name, stream in self.asked.streams.items():
+            self._transmissions[name] = self._transmission(stream, paces[name], endpoints[name])
+        self._threads = [
+            threading.Thread(target=self._until_stopped, args=(work,), daemon=True) for work in (self._pace, self._fill)
+        ]
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopped.set()
+        for thread in self._threads:
+            thread.join()
+        self._held.close()
+        if self._errors and error is None:
+            raise self._errors[0]
+
+    def _until_stopped(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except BaseException as error:  # of a thread; the ``with`` statement raises it
+            self._errors.append(error)
+            self._stopped.set()
+
+    def unplug(self, name: str) -> None:
+        """Take the device of a stream away."""
+        self._commands.append((name, False))
+
+    def replug(self, name: str) -> None:
+        """Bring it back, under the same address."""
+        self._commands.append((name, True))
+
+    def _transmission(self, stream: Stream, its_pace: Pace, endpoint: Endpoint) -> Transmission:
+        packets = stream.address.scheme in serving.PACKETS
+        rate_hz = stream.sensor.rate_hz or UNPACED_HZ
+
+        def planned(rate: float, start_ns: int) -> Plan:
+            source = self.source(stream.name, its_pace, rate, start_ns)
+            seed = [*self._seed(stream.name), start_ns]
+            return Plan(source, its_pace, self.faults, seed, packets=packets)
+
+        return Transmission(endpoint, stream.sensor, self.ledger[stream.name], planned, rate_hz, self.epoch_ns)
+
+    def source(self, name: str, its_pace: Pace, rate_hz: float, start_ns: int = 0) -> Sampled:
+        """Return the source of a stream."""
+        seed, sensor = self._seed(name), self.asked.streams[name].sensor
+        steps = (
+            ClockSteps(self.faults.clock_step, self.faults.clock_step_ms, seed) if self.faults.clock_step else no_steps
+        )
+        timing = Timing(rate_hz, start_ns, clock(its_pace, seed), steps, self.faults.wrap_s)
+        last = name[-1] if name[-1] in "12" else "1"
+        if stream_of_clouds(sensor):
+            from tacpipe.simulation.emulation.cloud_source import CloudSource
+
+            return CloudSource(sensor, timing, seed)
+        return Source(sensor, self.world, timing, seed, (its_pace.finger or int(last)) - 1)
+
+    def _seed(self, name: str) -> list[int]:
+        return [self.seed, zlib.crc32(name.encode())]
+
+    def _fill(self) -> None:
+        while not self._stopped.wait(FILL_S):
+            for transmission in self._transmissions.values():
+                transmission.fill(time.monotonic_ns() - self.epoch_ns)
+
+    def _pace(self) -> None:
+        transmissions = list(self._transmissions.values())
+        owners: dict[int, Transmission] = {}  # of descriptors
+        look_ns, changed = 0, True
+        while not self._stopped.is_set():
+            if changed:
+                owners = {number: one for one in transmissions for number in one.endpoint.descriptors()}
+            now_ns = time.monotonic_ns()
+            next_ns = min([one.next_ns for one in transmissions])
+            wait_s = min(LONGEST_S, max(0.0, (next_ns - now_ns) / 1e9))
+            ready, _, _ = select.select(owners, [], [], wait_s)
+            now_ns = time.monotonic_ns()
+            for number in ready:
+                self._hear(owners[number], owners[number].endpoint.ready(number), now_ns)
+            changed = bool(ready)
+            for one in transmissions:
+                if one.next_ns <= now_ns:
+                    changed |= one.run(now_ns)
+            if now_ns >= look_ns:
+                look_ns, changed = now_ns + LOOK_NS, True
+                self._obey(now_ns)
+                for one in transmissions:
+                    self._hear(one, one.endpoint.look(), now_ns)
+
+    def _hear(self, transmission: Transmission, heard: Iterable[tuple[Peer, bytes]], now_ns: int) -> None:
+        for peer, data in heard:
+            transmission.heard(peer, data, now_ns)
+
+    def _obey(self, now_ns: int) -> None:
+        while self._commands:
+            name, back = self._commands.pop(0)
+            self._transmissions[name].plug(back, now_ns)
+
+
+def stream_of_clouds(sensor: Sensor) -> bool:
+    """Whether a sensor's samples are points of clouds."""
+    return [field.name for field in sensor.fields()][:3] == ["x_m", "y_m", "z_m"]
+
+
+def pace(rig: Rig, name: str) -> Pace:
+    """Return the pace of a stream: what the rig file says under ``emulate``, of the stream over that of the rig."""
+    where = f"stream {name}, emulate"
+    found: Pace = params.filled(Pace, {**rig.emulate, **rig.streams[name].emulate}, where, "key")
+    return found
+
+
+def clock(its_pace: Pace, seed: list[int]) -> clocks.Clock:
+    """Return a device's clock: as its pace says, or as far off as those of the simulated rig may be."""
+    rng, usual = np.random.default_rng([*seed, 8]), pick_and_move.Rig()
+    offset, skew = rng.uniform(-1, 1, 2)
+    offset_ms = its_pace.offset_ms if its_pace.offset_ms is not None else offset * usual.clock_offset_ms
+    skew_ppm = its_pace.skew_ppm if its_pace.skew_ppm is not None else skew * usual.clock_skew_ppm
+    return clocks.Clock(round(offset_ms * 1e6), float(skew_ppm * 1e-6))

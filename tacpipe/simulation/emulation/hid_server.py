@@ -1,0 +1,118 @@
+"""USB HID devices as umockdev plays them: a program for the system's Python, which has GObject introspection.
+
+It is run by itself and imports nothing of tacpipe. Standard input has a line a command: ``add NUMBER VENDOR PRODUCT
+DESCRIPTOR NAME`` plugs a device in, ``send NUMBER REPORT`` has it send a report, all numbers but the first in hexadecimal.
+Standard output has the folder that hosts need in UMOCKDEV_DIR, and then a line ``NUMBER REPORT`` for what a host writes.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import threading
+import time
+from typing import Any
+
+GET_SIZE, GET_DESCRIPTOR = 0x80044801, 0x90044802  # HIDIOCGRDESCSIZE and HIDIOCGRDESC of <linux/hidraw.h>
+MOST = 4096  # bytes of a descriptor or a report
+LOOK_S = 0.02  # between looks at a device that no host has open
+
+
+def described(number: int, vendor: str, product: str, descriptor: str, name: str) -> str:
+    """Return a device as umockdev reads it: USB device, interface, HID device and its hidraw node."""
+    usb = f"/devices/pci0000:00/0000:00:14.0/usb1/1-{number + 1}"
+    place = f"0003:{vendor.upper()}:{product.upper()}.{number + 1:04d}"
+    hid = f"{usb}/1-{number + 1}:1.0/{place}"
+    identity = f"0003:0000{vendor.upper()}:0000{product.upper()}"
+    usb_lines = ["E: SUBSYSTEM=usb", "E: DEVTYPE=usb_device", rf"A: idVendor={vendor}\n", rf"A: idProduct={product}\n"]
+    usb_lines += [r"A: manufacturer=tacpipe\n", rf"A: product={name}\n", rf"A: serial=emulated{number}\n"]
+    hid_lines = ["E: SUBSYSTEM=hid", f"E: HID_ID={identity}", f"E: HID_NAME={name}", f"E: HID_UNIQ=emulated{number}"]
+    hid_lines += [rf"A: uevent=HID_ID={identity}\nHID_NAME={name}\nHID_UNIQ=emulated{number}\n"]
+    parts = [
+        [f"P: {usb}", *usb_lines, r"A: bcdDevice=0100\n"],
+        [f"P: {usb}/1-{number + 1}:1.0", "E: SUBSYSTEM=usb", "E: DEVTYPE=usb_interface", r"A: bInterfaceNumber=00\n"],
+        [f"P: {hid}", *hid_lines, f"H: report_descriptor={descriptor}"],
+        [f"P: {hid}/hidraw/hidraw{number}", f"N: hidraw{number}", "E: SUBSYSTEM=hidraw"],
+    ]
+    parts[3] += [f"E: DEVNAME=/dev/hidraw{number}", f"L: device=../../../{place}"]
+    return "".join("\n".join(part) + "\n\n" for part in parts)
+
+
+def answering(descriptor: bytes) -> Any:
+    """Return what answers the kernel's questions for a report descriptor."""
+
+    def answer(_: Any, client: Any) -> bool:
+        request = client.get_request()
+        if request == GET_SIZE:
+            client.get_arg().resolve(0, 4).update(0, len(descriptor).to_bytes(4, "little"))
+        elif request == GET_DESCRIPTOR:
+            client.get_arg().resolve(0, 4 + MOST).update(4, descriptor)
+        else:
+            return False
+        client.complete(0, 0)
+        return True
+
+    return answer
+
+
+def hear(number: int, board: int) -> None:
+    """Tell what hosts write to a device."""
+    while select.select([board], [], []):
+        try:
+            data = os.read(board, MOST)
+        except OSError:  # taken by another, or no host has it open
+            time.sleep(LOOK_S)
+            continue
+        if data:
+            print(number, data.hex(), flush=True)
+
+
+def put(board: int, rest: bytes, report: bytes) -> bytes:
+    """Send a report behind the rest of the one before, or drop it as the kernel does; return what is left to be sent."""
+    data = rest or report
+    try:
+        data = data[os.write(board, data) :]
+        if not data and rest:
+            data = report[os.write(board, report) :]
+    except BlockingIOError:
+        return rest
+    return data
+
+
+def serve(mock: Any, testbed: Any, loop: Any) -> None:
+    """Carry out the commands of standard input."""
+    boards: dict[str, int] = {}
+    rests: dict[str, bytes] = {}
+    handlers = []
+    for line in sys.stdin:
+        what, number, *words = line.strip().split(maxsplit=5)
+        if what == "add":
+            testbed.add_from_string(described(int(number), *words))
+            handlers.append(mock.IoctlBase.new())
+            handlers[-1].connect("handle-ioctl", answering(bytes.fromhex(words[2])))
+            testbed.attach_ioctl(f"/dev/hidraw{number}", handlers[-1])
+            boards[number] = testbed.get_dev_fd(f"/dev/hidraw{number}")
+            os.set_blocking(boards[number], False)
+            threading.Thread(target=hear, args=(int(number), boards[number]), daemon=True).start()
+            print(number, flush=True)
+        elif number in boards:
+            rests[number] = put(boards[number], rests.get(number, b""), bytes.fromhex(words[0]))
+    loop.quit()
+
+
+def main() -> None:
+    """Play devices until standard input ends."""
+    import gi
+
+    gi.require_version("UMockdev", "1.0")
+    from gi.repository import GLib, UMockdev
+
+    testbed, loop = UMockdev.Testbed.new(), GLib.MainLoop()
+    print(testbed.get_root_dir(), flush=True)
+    threading.Thread(target=serve, args=(UMockdev, testbed, loop), daemon=True).start()
+    loop.run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""What an emulated stream sent, and what was harmed on the way: the truth that a recording of it is held against."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.sensors.sensor import Samples
+from tacpipe.simulation.emulation import byte_faults, perfect
+from tacpipe.simulation.emulation.byte_faults import CAUSES, Item
+from tacpipe.simulation.emulation.disguise import one_by_one
+from tacpipe.simulation.emulation.source import Sampled
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+UNHARMED = (byte_faults.SOUND, byte_faults.STALL, byte_faults.REORDER, byte_faults.DUPLICATE)
+CODES = {cause: code for code, cause in enumerate(CAUSES)}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What went out, or should have."""
+
+    due_ns: int  # on this computer's monotonic clock
+    sent_ns: int  # likewise; 0: it was not sent
+    number: int  # of the sample in its source, -1: no frame
+    size: int  # bytes that went out
+    cause: str
+    invisible: bool  # harmed, and still takes the protocol's own test for a frame
+    source: int  # number of the source: a device that is told another rate begins a new one
+
+
+class Ledger:
+    """The entries of one stream in the order of their sending, and what else happened to it."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.sources: list[Sampled] = []
+        self.events: list[tuple[int, str, str]] = []  # monotonic ns, what, and more about it
+        self.harmed: dict[int, bytes] = {}  # row of the entry to the bytes that went out instead of the frame
+        self._due_ns, self._sent_ns, self._number = array("q"), array("q"), array("q")
+        self._size, self._cause, self._invisible, self._source = array("q"), array("b"), array("b"), array("h")
+
+    def __len__(self) -> int:
+        return len(self._source)  # the column that is written last: a ledger may be read while it grows
+
+    def add(self, item: Item, due_ns: int, sent_ns: int, size: int, cause: str) -> None:
+        """Enter an item with what became of it: ``size`` bytes went out at ``sent_ns``."""
+        if cause not in UNHARMED and size:
+            self.harmed[len(self)] = item.data[:size]
+        self._due_ns.append(due_ns)
+        self._sent_ns.append(sent_ns if size else 0)
+        self._number.append(item.number)
+        self._size.append(size)
+        self._cause.append(CODES[cause])
+        self._invisible.append(item.invisible)
+        self._source.append(len(self.sources) - 1)
+
+    def tell(self, t_ns: int, what: str, more: str = "") -> None:
+        """Enter something that happened: opened, closed, unplug, replug, heard, rate, clock."""
+        self.events.append((t_ns, what, more))
+
+    @property
+    def entries(self) -> list[Entry]:
+        """All entries, one by one."""
+        return [self.entry(row) for row in range(len(self))]
+
+    def entry(self, row: int) -> Entry:
+        """Return one entry."""
+        cause = CAUSES[self._cause[row]]
+        size, invisible = self._size[row], bool(self._invisible[row])
+        sent_ns, number = self._sent_ns[row], self._number[row]
+        return Entry(self._due_ns[row], sent_ns, number, size, cause, invisible, self._source[row])
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Return a column (entry,): ``due_ns``, ``sent_ns``, ``number``, ``size``, ``cause`` (code), ..."""
+        kept: array[int] = getattr(self, f"_{name}")
+        return np.array(kept[: len(self)], dtype=np.int64)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many entries there are of each cause; of the sound ones under "sent"."""
+        codes = self.column("cause")
+        found = {cause or "sent": int((codes == code).sum()) for code, cause in enumerate(CAUSES)}
+        return {cause: count for cause, count in found.items() if count}
+
+    @property
+    def whole(self) -> NDArray[np.int64]:
+        """The rows of entries that went out as frames should (entry,)."""
+        codes = np.array([CODES[cause] for cause in UNHARMED])
+        rows: NDArray[np.int64] = np.flatnonzero(
+            (self.column("size") > 0) & np.isin(self.column("cause"), codes) & (self.column("number") >= 0)
+        )
+        return rows
+
+    def samples(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> Samples:
+        """Return what a perfect link would give of entries, made once more from the source; by default of all `whole` ones.
+
+        Values are those that were encoded, as far as the protocol can hold them; ``rows`` tells of which entry each is.
+        """
+        rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
+        sensor = self.sources[-1].sensor
+        parts = [perfect.decoded(sensor, sensor.encode(part)) for part in self._parts(rows)]
+        return perfect.joined(parts)
+
+    def frames(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> list[bytes]:
+        """Return the frames of entries as they were meant to go out; by default of all that did `whole`."""
+        rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
+        frames: list[bytes] = []
+        for part in self._parts(rows):
+            sensor = self.sources[-1].sensor
+            frames += one_by_one(sensor, sensor.encode(part))
+        return frames
+
+    def _parts(self, rows: NDArray[np.int64]) -> Iterator[Samples]:
+        """Yield the samples of entries, as far as neighbours are of one block."""
+        numbers, sources = self.column("number")[rows], self.column("source")[rows]
+        blocks = np.array(
+            [number // self.sources[source].rows for number, source in zip(numbers, sources, strict=True)]
+        )
+        edges = np.flatnonzero((np.diff(blocks) != 0) | (np.diff(sources) != 0)) + 1
+        for part in np.split(np.arange(len(rows)), edges):
+            if len(part):
+                source, block = self.sources[sources[part[0]]], int(blocks[part[0]])
+                yield taken(source.block(block), numbers[part] - block * source.rows)
+
+    def table(self) -> pa.Table:
+        """Return the entries as a table, a row each."""
+        import pyarrow as pa
+
+        columns = {name: pa.array(self.column(name)) for name in ("due_ns", "sent_ns", "number", "size", "source")}
+        columns["cause"] = pa.array([CAUSES[code] for code in self._cause])
+        columns["invisible"] = pa.array(self.column("invisible").astype(bool))
+        return pa.table(columns)
+
+    def write(self, folder: Path) -> None:
+        """Write ``NAME.parquet`` with the entries and ``NAME.json`` with the events and the bytes that were harmed."""
+        import pyarrow.parquet as pq
+
+        folder.mkdir(parents=True, exist_ok=True)
+        pq.write_table(self.table(), folder / f"{self.name}.parquet")
+        told = {
+            "counts": self.counts,
+            "clock": [_clock(source) for source in self.sources],
+            "events": [{"t_ns": t_ns, "what": what, "more": more} for t_ns, what, more in self.events],
+            "harmed": {str(row): data.hex() for row, data in self.harmed.items()},
+        }
+        (folder / f"{self.name}.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+
+
+def taken(samples: Samples, rows: NDArray[np.int64]) -> Samples:
+    """Return the samples of some frames, in their order."""
+    if samples.rows is not None:  # many samples a frame, as the points of a cloud
+        parts = [np.flatnonzero(samples.rows == row) for row in rows]
+        own = np.repeat(np.arange(len(rows), dtype=np.int64), [len(part) for part in parts])
+        return Samples(tuple(values[np.concatenate(parts)] for values in samples.values), rows=own)
+    seq, t_device_ns, device_seq = (
+        None if one is None else one[rows] for one in (samples.seq, samples.t_device_ns, samples.device_seq)
+    )
+    return Samples(tuple(values[rows] for values in samples.values), seq, t_device_ns, device_seq)
+
+
+def _clock(source: Sampled) -> dict[str, Any]:
+    """Return what is true of a source's clock, and when it was set."""
+    timing = source.timing
+    moments_ns = getattr(timing.steps, "moments_ns", [])
+    return {"offset_ns": timing.clock.offset_ns, "skew": timing.clock.skew, "set_at_ns": moments_ns}

@@ -1,0 +1,144 @@
+"""A serial device on a pseudo-terminal, behind a symbolic link that stays when the device is unplugged and comes back.
+
+A pseudo-terminal takes bytes as fast as they come and keeps some thousands of them. What it has no room for is lost, as in
+the buffer of a UART that nobody reads. While no host has the port open, nothing is sent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import select
+import struct
+import tty
+from collections.abc import Sequence
+from pathlib import Path
+
+from tacpipe.links.link import Address
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.simulation.emulation import byte_faults, uart
+from tacpipe.simulation.emulation.endpoint import stretched
+
+TERMIOS2, SPEED_AT = 44, 40  # bytes of struct termios2 of <asm-generic/termbits.h>, and where its output speed stands
+TCGETS2 = 0x802C542A  # likewise; tells speeds that have no name, too
+MOST_READ = 4096
+
+
+class Port:
+    """The one host that has the port open."""
+
+    def __init__(self, endpoint: Pty) -> None:
+        self.endpoint = endpoint
+        self.device = endpoint.sensor.device()
+        self.wanted = 0
+
+    @property
+    def fault(self) -> str:
+        """Whether the host listened at another speed when it was written to last."""
+        return byte_faults.BAUD if self.endpoint.garbling else byte_faults.SOUND
+
+    def send(self, pieces: Sequence[bytes]) -> list[int]:
+        """Write; return how many bytes of each piece the terminal had room for."""
+        return self.endpoint.write(pieces)
+
+
+class Pty:
+    """A serial port's other end."""
+
+    def __init__(self, sensor: Sensor, link: Path) -> None:
+        self.sensor, self.link = sensor, link
+        self.address = Address("serial", str(link))
+        self.peers: list[Port] = []
+        self._master = -1
+        self._baud = 0  # that the host has set
+        self.garbling = False
+        self.replug()
+
+    def replug(self) -> None:
+        """Make a new terminal and have the link point to it."""
+        if self._master >= 0:
+            return
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        name = os.ttyname(slave)
+        os.close(slave)  # from now on the master tells whether anybody has it open
+        draft = self.link.with_name(f".{self.link.name}")
+        draft.unlink(missing_ok=True)
+        draft.symlink_to(name)
+        draft.replace(self.link)
+        self._port = Port(self)
+
+    def unplug(self) -> None:
+        """Close the terminal, which the host sees as an unplugged port."""
+        if self._master >= 0:
+            os.close(self._master)
+            self.link.unlink(missing_ok=True)
+        self._master, self.peers = -1, []
+
+    def close(self) -> None:
+        """End."""
+        self.unplug()
+
+    def descriptors(self) -> list[int]:
+        """Return the terminal while a host has it open; before, it would never rest."""
+        return [self._master] if self.peers else []
+
+    def ready(self, descriptor: int) -> list[tuple[Port, bytes]]:
+        """Return what the host wrote."""
+        try:
+            data = os.read(self._master, MOST_READ)
+        except BlockingIOError:
+            return []
+        except OSError:  # EIO: the host closed its port
+            self.peers = []
+            return []
+        if self.wrong_baud():
+            data = uart.garbled(data, self._baud, self.sensor.baud)
+        return [(self._port, heard) for heard in self.understood(data)]
+
+    def look(self) -> list[tuple[Port, bytes]]:
+        """Find out whether a host has the port open."""
+        if self._master < 0 or self.peers:
+            return []
+        poll = select.poll()
+        poll.register(self._master, select.POLLIN)
+        if any(event & select.POLLHUP for _, event in poll.poll(0)):
+            return []
+        self.peers = [self._port]
+        return [(self._port, b"")]
+
+    def wrong_baud(self) -> bool:
+        """Whether the host has set another speed than the device's."""
+        self._baud = _speed(self._master) if self._master >= 0 else 0
+        return bool(self._baud) and self._baud != getattr(self.sensor, "baud", self._baud)
+
+    def write(self, pieces: Sequence[bytes]) -> list[int]:
+        """Write pieces, garbled at a wrong speed; return how many bytes of each were taken."""
+        told = [self.told(piece) for piece in pieces]
+        self.garbling = self.wrong_baud()
+        if self.garbling:
+            told = [uart.garbled(piece, self.sensor.baud, self._baud) for piece in told]
+        taken = 0
+        with contextlib.suppress(BlockingIOError):
+            taken = os.write(self._master, b"".join(told))
+        sizes = stretched([len(piece) for piece in told], taken)
+        return [
+            len(piece) if size == len(sent) else min(size, len(piece) - 1)
+            for piece, sent, size in zip(pieces, told, sizes, strict=True)
+        ]
+
+    def told(self, piece: bytes) -> bytes:
+        """Return a frame as it goes over the line."""
+        return piece
+
+    def understood(self, data: bytes) -> list[bytes]:
+        """Return what the host's bytes tell the device."""
+        return [data]
+
+
+def _speed(master: int) -> int:
+    """Return the speed in bits a second that the host has set."""
+    told = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2))
+    return int(struct.unpack_from("=I", told, SPEED_AT)[0])

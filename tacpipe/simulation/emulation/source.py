@@ -1,0 +1,198 @@
+"""The samples that an emulated sensor takes: its fields over time, filled from the one world that its rig shares.
+
+uSkin and proximity counts come from the models of the simulated rig, with their noise, drift and held frames; what other
+fields show follows from their quantity and unit. Samples are made a block at a time, so that hours need no memory, and
+any block can be made once more: the same seed gives the same values.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.simulation import faults, pick_and_move, proximity, taxels
+from tacpipe.simulation.emulation import quantities, scales
+from tacpipe.simulation.emulation.clock_steps import no_steps
+from tacpipe.simulation.emulation.quantities import View
+from tacpipe.simulation.emulation.world import World
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from _typeshed import DataclassInstance
+
+Times = NDArray[np.int64]
+Columns = dict[int, NDArray[Any]]  # number of the field to its values (time,)
+
+BLOCK_S = 0.5
+KEPT = 3  # blocks that are kept in case they are asked for once more
+PARTS = {"report": (1, 2)}  # what fields go through that name the part of a state that a frame tells
+UNCOUNTED = 1 << 32  # modulus of a counter that nobody looks at
+USKIN = 48  # channels of a 4x4
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When an emulated sensor takes its samples, and what its clock and its counters say."""
+
+    rate_hz: float
+    start_ns: int = 0  # of the first sample, in the world's time
+    clock: faults.Clock = field(default_factory=faults.Clock)  # its oscillator paces its samples too
+    steps: Callable[[Times], Times] = no_steps  # by how much the clock was set until then, ns (time,)
+    wrap_s: float | None = None  # counters go round so long after the start; None: they begin anywhere
+
+    def taken_ns(self, number: NDArray[np.int64]) -> Times:
+        """Return when samples ``number`` (sample,) are taken, in the world's time."""
+        taken: Times = self.start_ns + np.rint(number * (1e9 / self.rate_hz / (1 + self.clock.skew))).astype(np.int64)
+        return taken
+
+    def first_after(self, t_ns: int) -> int:
+        """Return the number of the first sample that is taken after ``t_ns``."""
+        return max(0, int(np.floor((t_ns - self.start_ns) * (1 + self.clock.skew) * self.rate_hz / 1e9)) + 1)
+
+
+class Sampled(Protocol):
+    """What an emulated sensor sends, a block of frames at a time."""
+
+    sensor: Sensor
+    timing: Timing
+    rows: int  # frames a block
+
+    def block(self, number: int) -> Samples:
+        """Return the samples of block ``number``."""
+
+    def numbers(self, block: int) -> NDArray[np.int64]:
+        """Return the numbers of a block's frames, counted from 0 through the stream (frame,)."""
+
+
+class Source:
+    """The samples of one sensor, from its start on."""
+
+    def __init__(
+        self, sensor: Sensor, world: World, timing: Timing, seed: Sequence[int] = (0,), finger: int = 0
+    ) -> None:
+        self.sensor, self.world, self.timing, self.finger = sensor, world, timing, finger
+        self.fields = sensor.fields()
+        self.rows = max(1, round(timing.rate_hz * BLOCK_S))
+        self._seed = list(seed)
+        self._groups = _grouped(self.fields)
+        self._widths = _widths(sensor, self.fields)
+        self._drift: list[NDArray[np.float64]] = [np.zeros((USKIN // 3, 3))]  # of a uSkin at the start of each block
+        self._samples = functools.lru_cache(KEPT)(self._made)
+        rng = np.random.default_rng([*seed, 0])
+        self._first = [
+            _first_count(timing, sensor.step, modulus or UNCOUNTED, rng)
+            for modulus in (sensor.counter, sensor.device_counter)
+        ]
+
+    def block(self, number: int) -> Samples:
+        """Return the samples of block ``number``, `rows` of them."""
+        return self._samples(number)
+
+    def numbers(self, block: int) -> NDArray[np.int64]:
+        """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
+        return block * self.rows + np.arange(self.rows, dtype=np.int64)
+
+    def _made(self, block: int) -> Samples:
+        numbers = self.numbers(block)
+        taken_ns = self.timing.taken_ns(numbers)
+        rng = np.random.default_rng([*self._seed, 1, block])
+        view = View(self.world, taken_ns, self.finger)
+        columns: Columns = {}
+        for group in self._groups:
+            columns |= self._filled(group, view, block, rng)
+        step = self.sensor.step
+        counts = [
+            (first + step * numbers) % (modulus or UNCOUNTED)
+            for first, modulus in zip(self._first, (self.sensor.counter, self.sensor.device_counter), strict=True)
+        ]
+        device_ns = faults.device_stamps(taken_ns, self.timing.clock) + self.timing.steps(taken_ns)
+        return Samples(_blocks(self._widths, columns), counts[0], device_ns, counts[1])
+
+    def _filled(self, group: Sequence[int], view: View, block: int, rng: np.random.Generator) -> Columns:
+        """Return the columns of the fields of one quantity."""
+        fields = [self.fields[number] for number in group]
+        quantity = quantities.of(fields[0], "quantity") or ""
+        if fields[0].name in PARTS:
+            parts = np.array(PARTS[fields[0].name], dtype=fields[0].type.to_pandas_dtype())
+            return {group[0]: parts[self.numbers(block) % len(parts)]}
+        if quantity == "text":
+            return {number: np.full(len(view.t_ns), "", dtype=object) for number in group}
+        if quantity == "tactile" and _is_uskin(fields):
+            counts = self._uskin(view, block, rng)
+            return {number: counts[:, row] for row, number in enumerate(group)}
+        if quantity == "proximity" and quantities.of(fields[0], "unit") == "count":
+            up_m = view.world.contact(view.t_ns, lambda scene: scene.contact.displacement_m[:, 1])
+            kinds = [one.type.to_pandas_dtype() for one in fields]
+            return {
+                number: proximity.readings(up_m, 1.0, rng).astype(kind)
+                for number, kind in zip(group, kinds, strict=True)
+            }
+        values = quantities.look(quantity, view, fields)
+        return dict(zip(group, scales.sent(quantity, values, fields, rng), strict=True))
+
+    def _uskin(self, view: View, block: int, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that goes on."""
+        one = view.world.skins[view.finger]
+        noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
+        counts = one.base_count + taxels.signal(one, view.world.touch(view.finger, view.t_ns)) + noise
+        digits = taxels.digitised(counts + self._drifted(block))
+        return faults.hold(digits, pick_and_move.Rig().hold_probability, rng)[0]
+
+    def _drifted(self, block: int) -> NDArray[np.float64]:
+        """Return the drift of a uSkin in a block (time, taxel, axis), a random walk from where the last block left it."""
+        while True:
+            number = min(block, len(self._drift) - 1)
+            rng = np.random.default_rng([*self._seed, 2, number])
+            at_s = self.timing.taken_ns(number * self.rows + np.arange(self.rows + 1)) / 1e9
+            walk = self._drift[number] + taxels.errors(at_s, 0.0, 1.0, rng)
+            if number == len(self._drift) - 1:
+                self._drift.append(walk[-1])
+            if number == block:
+                return walk[:-1]
+
+
+def _first_count(timing: Timing, step: int, modulus: int, rng: np.random.Generator) -> int:
+    """Return what a counter begins with: anything, or what makes it go round ``wrap_s`` after the start."""
+    if timing.wrap_s is None:
+        return int(rng.integers(max(1, min(modulus, UNCOUNTED) // 2) // step + 1)) * step
+    return (modulus - step * round(timing.wrap_s * timing.rate_hz)) % modulus
+
+
+def _grouped(fields: Sequence[pa.Field]) -> list[list[int]]:
+    """Return the numbers of the fields of each quantity; forces of taxels apart from those of whole sensors."""
+    groups: dict[tuple[str | None, bool, str | None], list[int]] = {}
+    for number, one in enumerate(fields):
+        quantity = one.name if one.name in PARTS else quantities.of(one, "quantity")
+        key = quantity, bool(quantities.of(one, "taxel")), quantities.of(one, "unit")
+        groups.setdefault(key, []).append(number)
+    return list(groups.values())
+
+
+def _is_uskin(fields: Sequence[pa.Field]) -> bool:
+    from tacpipe.formats import channels
+
+    return [one.name for one in fields] == [one.name for one in channels.uskin_fields()]
+
+
+def _widths(sensor: Sensor, fields: Sequence[pa.Field]) -> list[int]:
+    """Return the widths of the blocks of `Samples.values`: neighbours of one type, or those of each output."""
+    outputs: Sequence[str] | None = getattr(sensor, "outputs", None)
+    if outputs:
+        one = cast("DataclassInstance", sensor)
+        return [len(replace(one, outputs=(name,)).fields()) for name in outputs]  # type: ignore[attr-defined]
+    starts = [row for row in range(len(fields)) if not row or fields[row - 1].type != fields[row].type]
+    widths: list[int] = np.diff([*starts, len(fields)]).tolist()
+    return widths
+
+
+def _blocks(widths: Sequence[int], columns: Columns) -> tuple[NDArray[Any], ...]:
+    """Return the columns side by side in blocks (sample, channel) of these widths."""
+    stops = np.cumsum(widths).tolist()
+    runs = [range(stop - width, stop) for stop, width in zip(stops, widths, strict=True)]
+    return tuple(np.column_stack([columns[number] for number in run]) for run in runs)

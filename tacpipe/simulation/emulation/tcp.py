@@ -1,0 +1,169 @@
+"""A device that serves TCP: frames go over the connection, or, of a ``tcp+udp`` device, to a UDP port told there."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Sequence
+
+from tacpipe.links.link import Address
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.simulation.emulation import byte_faults
+from tacpipe.simulation.emulation.endpoint import stretched
+
+HOST = "127.0.0.1"
+MOST_READ = 65_536
+
+
+class Connection:
+    """A host that is connected."""
+
+    def __init__(self, made: socket.socket, sensor: Sensor) -> None:
+        made.setblocking(False)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.socket, self.device = made, sensor.device()
+        self.wanted = 0
+        self.fault = byte_faults.SOUND
+        self._rest = b""  # of a piece that was sent in part, and must be sent whole
+
+    def send(self, pieces: Sequence[bytes]) -> list[int]:
+        """Send over the connection what it has room for; a piece that was begun is ended before any other."""
+        if self._rest:
+            self._rest = self._rest[self._put(self._rest) :]
+            if self._rest:
+                return [0] * len(pieces)
+        sizes = [len(piece) for piece in pieces]
+        whole = b"".join(pieces)
+        taken = self._put(whole)
+        parts = stretched(sizes, taken)
+        for piece, part in zip(pieces, parts, strict=True):
+            if 0 < part < len(piece):
+                self._rest = piece[part:]
+        return [size if part else 0 for size, part in zip(sizes, parts, strict=True)]
+
+    def _put(self, data: bytes) -> int:
+        try:
+            return self.socket.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError:  # which reading tells as well
+            self.fault = byte_faults.GONE
+            return 0
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.socket.close()
+
+    def read(self) -> bytes | None:
+        """Return what the host wrote; None when it is gone."""
+        try:
+            return self.socket.recv(MOST_READ) or None
+        except BlockingIOError:
+            return b""
+        except OSError:
+            return None
+
+
+class Telling(Connection):
+    """A host that is connected, and told the device a UDP port to send frames to: replies go over the connection."""
+
+    def __init__(self, made: socket.socket, sensor: Sensor) -> None:
+        super().__init__(made, sensor)
+        self._port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._port.setblocking(False)
+        self.host = made.getpeername()[0]
+
+    def close(self) -> None:
+        """Close the connection and the port that frames go out by."""
+        super().close()
+        self._port.close()
+
+    def post(self, pieces: Sequence[bytes]) -> list[int]:
+        """Send frames to the port that the host told; those that the network refuses are lost."""
+        sizes = []
+        for piece in pieces:
+            try:
+                sizes.append(self._port.sendto(piece, (self.host, getattr(self.device, "port", None) or 0)))
+            except OSError:
+                sizes.append(0)
+        return sizes
+
+
+class Tcp:
+    """A TCP server that takes any number of hosts."""
+
+    scheme = "tcp"
+    kind: type[Connection] = Connection
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.peers: list[Connection] = []
+        self._server: socket.socket | None = None
+        self._port = 0
+        self.replug()
+        self.address = Address(self.scheme, f"{HOST}:{self._port}")
+
+    def replug(self) -> None:
+        """Serve, on the port of before."""
+        if self._server is None:
+            self._server = socket.create_server((HOST, self._port))
+            self._server.setblocking(False)
+            self._port = self._server.getsockname()[1]
+
+    def unplug(self) -> None:
+        """Close all connections and serve no more."""
+        for peer in self.peers:
+            self.leave(peer)
+        self.peers = []
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+
+    def close(self) -> None:
+        """End."""
+        self.unplug()
+
+    def leave(self, peer: Connection) -> None:
+        """Close a connection."""
+        peer.close()
+
+    def descriptors(self) -> list[int]:
+        """Return the server and its connections."""
+        own = [self._server.fileno()] if self._server is not None else []
+        return own + [peer.socket.fileno() for peer in self.peers]
+
+    def ready(self, descriptor: int) -> list[tuple[Connection, bytes]]:
+        """Take a connection, or return what a host wrote."""
+        if self._server is not None and descriptor == self._server.fileno():
+            try:
+                made = self.kind(self._server.accept()[0], self.sensor)
+            except OSError:  # it went away before it was taken
+                return []
+            self.peers = [*self.peers, made]
+            return [] if self.scheme == "ws" else [(made, b"")]
+        for peer in self.peers:
+            if peer.socket.fileno() == descriptor:
+                return self._heard(peer)
+        return []
+
+    def _heard(self, peer: Connection) -> list[tuple[Connection, bytes]]:
+        data = peer.read()
+        if data is None:
+            self.leave(peer)
+            self.peers = [other for other in self.peers if other is not peer]
+            return []
+        return self.understood(peer, data)
+
+    def understood(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
+        """Return what the host's bytes tell the device."""
+        return [(peer, data)] if data else []
+
+    def look(self) -> list[tuple[Connection, bytes]]:
+        """Return nothing: descriptors tell all."""
+        return []
+
+
+class TcpUdp(Tcp):
+    """A TCP server for control, frames by UDP."""
+
+    scheme = "tcp+udp"
+    kind = Telling

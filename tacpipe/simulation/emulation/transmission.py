@@ -1,0 +1,179 @@
+"""One stream of an emulated rig as it goes out: samples planned ahead, harmed as the faults say, sent when they are due."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.simulation.emulation import byte_faults, pacing
+from tacpipe.simulation.emulation.byte_faults import REPLUG, UNPLUG, Faults, Harm, Item
+from tacpipe.simulation.emulation.disguise import one_by_one
+from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
+from tacpipe.simulation.emulation.ledger import Ledger
+from tacpipe.simulation.emulation.pacing import Pace
+from tacpipe.simulation.emulation.source import Sampled
+
+AHEAD_NS = 1_500_000_000  # that frames are planned before they are due
+IDLE_NS = 20_000_000  # between looks at a stream that nobody receives
+MOST_TOLD = 1000  # messages of the host that the ledger keeps
+
+
+class Plan:
+    """The items of a stream, in order, a block of its source at a time: what goes out, when, and what was harmed."""
+
+    def __init__(self, source: Sampled, pace: Pace, faults: Faults, seed: Sequence[int], *, packets: bool) -> None:
+        self.source, self.pace = source, pace
+        self._harm = Harm(faults, source.sensor, seed, packets=packets)
+        self._rng = np.random.default_rng([*seed, 7])
+        self._block = 0
+        self.until_ns = source.timing.start_ns  # that all items before are out
+
+    def skip(self, t_ns: int) -> None:
+        """Begin with the block that holds the first sample after ``t_ns``."""
+        self._block = max(self._block, self.source.timing.first_after(t_ns) // self.source.rows)
+
+    def more(self) -> list[Item]:
+        """Return the items of the next block."""
+        source = self.source
+        numbers = source.numbers(self._block)
+        frames = one_by_one(source.sensor, source.sensor.encode(source.block(self._block)))
+        due_ns = pacing.due_ns(source.timing.taken_ns(numbers), self.pace, self.until_ns, self._rng)
+        self._block += 1
+        self.until_ns = int(due_ns[-1]) + 1
+        return self._harm.done(frames, due_ns.tolist(), int(numbers[0]))
+
+
+class Transmission:
+    """A stream that is served: its plan, its end of the link, its ledger. `fill` may come from another thread."""
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        sensor: Sensor,
+        ledger: Ledger,
+        planned: Callable[[float, int], Plan],  # of a rate and a start, ns from the rig's start
+        rate_hz: float,
+        epoch_ns: int,
+    ) -> None:
+        self.endpoint, self.sensor, self.ledger = endpoint, sensor, ledger
+        self._planned, self._epoch_ns = planned, epoch_ns
+        self._rate_hz = rate_hz
+        self._lock = threading.Lock()
+        self._items: deque[Item] = deque()
+        self._latest: Item | None = None  # the last frame that was due, for hosts that ask
+        self._asked = bool(sensor.request())
+        self._begin(rate_hz, 0)
+
+    def _begin(self, rate_hz: float, start_ns: int) -> None:
+        plan = self._planned(rate_hz, start_ns)
+        with self._lock:
+            self._rate_hz, self._plan, self._latest = rate_hz, plan, None
+            self._items.clear()
+            self.ledger.sources.append(plan.source)
+        self.fill(start_ns)
+
+    def fill(self, now_ns: int) -> None:
+        """Plan ahead of ``now_ns``, the time since the rig's start."""
+        with self._lock:
+            self._plan.skip(now_ns - AHEAD_NS)
+            while self._plan.until_ns < now_ns + AHEAD_NS:
+                self._items.extend(self._plan.more())
+
+    @property
+    def next_ns(self) -> int:
+        """When something is due, on the monotonic clock; a stream that nobody receives can wait."""
+        if not self._items:
+            return self._epoch_ns + self._plan.until_ns
+        due_ns = self._epoch_ns + self._items[0].due_ns
+        return due_ns if self._asked or self._receivers() else due_ns + IDLE_NS
+
+    def run(self, now_ns: int) -> bool:
+        """Send what is due at ``now_ns`` on the monotonic clock; return whether the device was unplugged or came back."""
+        since_ns, items, due = now_ns - self._epoch_ns, self._items, list[Item]()
+        plugged = False
+        if not items:  # the planning thread came too late
+            self.fill(since_ns)
+        while items and items[0].due_ns <= since_ns:
+            item = items.popleft()
+            if item.number < 0 and item.cause in (UNPLUG, REPLUG):
+                self._send(due, now_ns)
+                due, plugged = [], True
+                self.plug(item.cause == REPLUG, now_ns)
+            else:
+                due.append(item)
+        self._send(due, now_ns)
+        return plugged
+
+    def plug(self, back: bool, now_ns: int) -> None:
+        """Unplug the device, or bring it back."""
+        if back:
+            self.endpoint.replug()
+        else:
+            self.endpoint.unplug()
+        self.ledger.tell(now_ns, REPLUG if back else UNPLUG)
+
+    def _receivers(self) -> list[Peer]:
+        return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.wanted]
+
+    def _send(self, items: Sequence[Item], now_ns: int) -> None:
+        if not items:
+            return
+        self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)
+        sizes: list[int] | None = None
+        fault = byte_faults.SOUND
+        pieces = [item.data for item in items]
+        for peer in self._receivers():
+            part = pieces if peer.device.streaming else pieces[: peer.wanted]
+            taken = self._post(peer, part)
+            peer.wanted = max(0, peer.wanted - len(part)) if not peer.device.streaming else 0
+            if sizes is None:
+                sizes, fault = taken, peer.fault
+        if sizes is not None:
+            self._enter(items[: len(sizes)], sizes, fault, now_ns)
+
+    def _post(self, peer: Peer, pieces: Sequence[bytes]) -> list[int]:
+        post: Callable[[Sequence[bytes]], list[int]] = getattr(peer, "post", peer.send)
+        full = [piece for piece in pieces if piece]
+        taken = iter(post(full) if full else [])
+        return [next(taken) if piece else 0 for piece in pieces]
+
+    def _enter(self, items: Iterable[Item], sizes: Sequence[int], fault: str, now_ns: int) -> None:
+        for item, size in zip(items, sizes, strict=True):
+            cause = item.cause
+            if size < len(item.data):
+                cause = fault if fault == byte_faults.GONE else byte_faults.OVERRUN
+            elif fault and item.data:
+                cause = fault
+            self.ledger.add(item, self._epoch_ns + item.due_ns, now_ns, size, cause)
+
+    def heard(self, peer: Peer, data: bytes, now_ns: int) -> None:
+        """Have the device take what a host wrote: replies go first, then the frames that were asked for."""
+        if not data:
+            self.ledger.tell(now_ns, "connected")
+        elif len(self.ledger.events) < MOST_TOLD:
+            self.ledger.tell(now_ns, "heard", data.hex())
+        replies = [reply for reply in peer.device.hear(data) if reply]
+        if replies:
+            peer.send(replies)
+        rate_hz = peer.device.rate_hz
+        if rate_hz and rate_hz != self._rate_hz:
+            self.ledger.tell(now_ns, "rate", f"{rate_hz:g}")
+            self._begin(rate_hz, now_ns - self._epoch_ns)
+        wanted = peer.device.polled()
+        if wanted:
+            peer.wanted += wanted
+            self._hand_over(peer, now_ns)
+
+    def _hand_over(self, peer: Peer, now_ns: int) -> None:
+        """Send the latest frame to a host that asked; more that it asked for follow as they become due."""
+        before, peer.wanted = peer.wanted, 0
+        self.run(now_ns)  # frames that are due are those of others
+        peer.wanted = before
+        if self._latest is not None:
+            sizes = self._post(peer, [self._latest.data])
+            peer.wanted -= 1
+            self._enter([self._latest], sizes, peer.fault, now_ns)

@@ -1,0 +1,108 @@
+"""The vendors' own clients read from the emulator what its ledger says that it sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from anyskin import AnySkinBase
+from flexitac import FlexiTacSensor
+from numpy.typing import NDArray
+from optoforce import OptoForce16, OptoForce22, OptoForce34
+from optoforce.reading import FX_SCALE
+from paxini_sdk import HighSpeedHandBoard
+from pyrobotiqtactile import RobotiqTactileSensor
+from tactile_sdk import TactilePressureSDK
+
+from tacpipe.recording.rig import Rig
+from tacpipe.sensors.sensor import Samples
+from tacpipe.simulation.emulation.emulator import Emulator
+from tests.simulation.emulation.rigs import in_order, one
+
+FRAMES = 20
+
+
+def read(asked: Rig, client: Callable[[str], list[Any]]) -> tuple[NDArray[Any], Samples]:
+    """Return what a client that is given the port reads (frame, …), and what was sent."""
+    with Emulator(asked) as emulator:
+        found = client(emulator.rig.streams["load"].address.place)
+    return np.array(found), emulator.ledger["load"].samples()
+
+
+@pytest.mark.parametrize(("kind", "axes"), [(OptoForce16, 3), (OptoForce22, 6), (OptoForce34, 12)])
+def test_optoforce_reads_counters_and_first_axis(kind: Any, axes: int) -> None:
+    def client(port: str) -> list[Any]:
+        with kind(port, speed_hz=333) as sensor:
+            readings = [sensor.read(only_latest_data=False) for _ in range(FRAMES)]
+        assert all(reading.valid_checksum for reading in readings)
+        return [(reading.count, round(reading[2] / (FX_SCALE if axes != 6 else 1))) for reading in readings]
+
+    found, sent = read(one("optoforce", options=f"{{ axes = {axes} }}"), client)
+    assert sent.seq is not None
+    first = sent.values[1][:, 0] if axes != 6 else np.zeros(len(sent), int)
+    if axes == 6:
+        found[:, 1] = 0  # scaled by the sheet of one specimen
+    assert in_order(found, np.column_stack([sent.seq, first]))
+
+
+def test_flexitac_reads_the_taxels() -> None:
+    def client(port: str) -> list[Any]:
+        with FlexiTacSensor(port, baseline=0.0) as sensor:
+            return [sensor.read().raw.ravel() for _ in range(FRAMES)]
+
+    found, sent = read(one("flexitac"), client)
+    assert found.max() > 0
+    assert in_order(found[2:], sent.values[0])  # its first ones may begin at a marker within a frame
+
+
+def test_anyskin_reads_the_flux() -> None:
+    def client(port: str) -> list[Any]:
+        sensor = AnySkinBase(num_mags=5, port=port, temp_filtered=False)
+        try:
+            return [sensor.get_sample()[1] for _ in range(FRAMES)]
+        finally:
+            sensor.close()
+
+    found, sent = read(one("anyskin"), client)
+    assert in_order(found[2:].astype(np.float32), sent.values[0])
+
+
+def test_robotiq_reads_the_taxels_of_both_fingers() -> None:
+    def client(port: str) -> list[Any]:
+        sensor = RobotiqTactileSensor(port=port)
+        sensor.connect()
+        try:
+            sensor.configure(update_period_ms=10)
+            return [sensor.read_frame(timeout=2.0).pressure.ravel() for _ in range(FRAMES)]
+        finally:
+            sensor.close()
+
+    found, sent = read(one("robotiq"), client)
+    known = {tuple(row) for row in sent.values[0].tolist()}
+    assert {tuple(row) for row in found[2:].tolist()} <= known  # it tells nothing by which to know a frame read twice
+    assert len(found) == FRAMES
+
+
+def test_paxini_reads_the_points() -> None:
+    def client(port: str) -> list[Any]:
+        with HighSpeedHandBoard(port) as board:
+            frames = list(board.stream_auto_push(max_frames=FRAMES))
+        return [next(iter(frame.distributed_forces.values())) for frame in frames]
+
+    found, sent = read(one("paxini"), client)
+    assert found.shape[2] == 3
+    _, signed, along = sent.values
+    planes = signed[:, 2:].reshape(len(sent), -1, 2).astype(int)
+    points = np.concatenate([planes, along[:, 1:, None].astype(int)], axis=2)
+    assert in_order(found, points)
+
+
+def test_the_modbus_client_polls_the_points() -> None:
+    def client(port: str) -> list[Any]:
+        with TactilePressureSDK(port) as sdk:
+            return [sdk.pressure.read_fast() for _ in range(FRAMES)]
+
+    found, sent = read(one("modbus-tactile"), client)
+    assert np.array_equal(found, sent.values[0])
