@@ -23,6 +23,7 @@ MODULES = (
     "startup",
     "small",
     "synchronization",
+    "decode",
     "forward_training",
     "material_training",
     "touch_training",

@@ -32,7 +32,7 @@ class Params:
 
     rate_hz: float = 50.0  # points a second of the uniform grid
     grid: str = "uniform"  # uniform; logged: at the master's own stamps; fresh: at those whose rows are not held
-    master: str = ""  # stream whose first sample starts the grid; empty for the first tactile one by name
+    master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
     gap_ms: float = 50.0  # milliseconds; a point between samples further apart than this is marked as in a gap
     clock: str = "auto"  # device: when the device says a sample was taken; arrival: when it came; auto: as can be had
     unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are
@@ -58,7 +58,7 @@ class _Stream:
         return all(name.startswith(TRUTH) for name in self.channels)
 
 
-@stage(version=2)
+@stage(version=2, reads=("master",))
 def synchronize(params: Params, recording: Shard) -> Recording:
     """Return one table on one clock, over the time that all streams cover, with masks of holds and gaps."""
     import pyarrow as pa
@@ -68,7 +68,8 @@ def synchronize(params: Params, recording: Shard) -> Recording:
     _require_known(params)
     tables = {name: recording.table(name) for name in sorted(recording.streams) if name != EVENTS}
     streams = {name: _stream(recording.name, name, table, params.clock) for name, table in tables.items()}
-    master = streams[_master(recording.name, params.master, tables)]
+    wanted = params.master or str(recording.attributes.get("master", ""))
+    master = streams[_master(recording.name, wanted, tables)]
     grid_ns, rows = _grid(recording.name, params, streams, master)
     columns: list[tuple[pa.Field, Any]] = [(master.table.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {"grid": params.grid, "grid_master": master.name}

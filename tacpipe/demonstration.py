@@ -11,6 +11,8 @@ from tacpipe.errors import TacpipeError
 TRIALS = 30
 MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
 OBJECTS, GRASPS = 1, 90  # of each of six families; and as many grasps of each object
+LIVE_S, LIVE_TRIALS = 30, 6  # of the emulated rig
+EMULATED = "emulated"
 
 
 def commands(output: Path) -> list[list[str]]:
@@ -74,6 +76,53 @@ def touch(output: Path) -> list[list[str]]:
     ]
 
 
+def rig(output: Path) -> list[list[str]]:
+    """Return the commands after the emulated rig is up: 30 s recorded live, then the chain to a forecast."""
+    names = ("recordings", "synced", "segments", "split", "model", "results")
+    place = {name: str(output / name) for name in names}
+    split = ["--split", place["split"]]
+    live = ["--trials", str(LIVE_TRIALS), "--duration", str(LIVE_S / LIVE_TRIALS), "--label", "simulated=true"]
+    return [
+        ["acquire", str(output / EMULATED / "rig.toml"), "-o", place["recordings"], *live],
+        ["show", place["recordings"]],
+        ["synchronize", place["recordings"], "-o", place["synced"]],
+        ["segment", "contacts", place["synced"], "-o", place["segments"]],
+        ["split", place["segments"], "-o", place["split"], "--scheme", "random"],
+        ["train", "forward", place["segments"], *split, "-o", place["model"], "--epochs", "6", "--stride", "2"],
+        ["evaluate", place["model"], place["segments"], *split, "-o", place["results"]],
+        ["report", place["results"], "-o", str(output / "report.html")],
+    ]
+
+
+def run_rig(output: Path, rig_file: Path) -> Path:
+    """Emulate a rig, record it live, run the chain on that, and return the path of the report.
+
+    Raises `TacpipeError` if a command fails.
+    """
+    emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / EMULATED)]
+    print("$ tacpipe " + " ".join(emulate) + " &", file=sys.stderr, flush=True)
+    serving = subprocess.Popen([sys.executable, "-m", "tacpipe.cli", *emulate], stdout=subprocess.PIPE)
+    assert serving.stdout is not None
+    try:
+        if not serving.stdout.readline():  # the path of its rig file, once all streams are served
+            raise TacpipeError(f"The demo stopped: {rig_file} could not be emulated.")
+        acquire, *chain = rig(output)
+        _run([acquire])
+    finally:
+        serving.terminate()
+        serving.communicate()
+    _run(chain)
+    return output / "report.html"
+
+
+def _run(several: list[list[str]]) -> None:
+    for command in several:
+        print("$ tacpipe " + " ".join(command), file=sys.stderr, flush=True)
+        done = subprocess.run([sys.executable, "-m", "tacpipe.cli", *command], stdout=subprocess.DEVNULL, check=False)
+        if done.returncode:
+            raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(command)}` ended with {done.returncode}.")
+
+
 def _results(output: Path) -> list[str]:
     tasks = (
         ("results", "paper-results"),
@@ -88,9 +137,5 @@ def run(output: Path) -> Path:
 
     Raises `TacpipeError` if one of them fails.
     """
-    for command in commands(output):
-        print("$ tacpipe " + " ".join(command), file=sys.stderr, flush=True)
-        done = subprocess.run([sys.executable, "-m", "tacpipe.cli", *command], stdout=subprocess.DEVNULL, check=False)
-        if done.returncode:
-            raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(command)}` ended with {done.returncode}.")
+    _run(commands(output))
     return output / "report.html"

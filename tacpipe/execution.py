@@ -16,7 +16,7 @@ from tacpipe import provenance, registry
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.hashing import bytes_digest, digest, remembered_file_digest
-from tacpipe.manifest import Manifest, shard_path
+from tacpipe.manifest import ACQUIRE, Manifest, shard_path
 from tacpipe.stage import Recording, Result, Stage
 from tacpipe.store import MissingError, Object, Store
 
@@ -167,12 +167,13 @@ def _adopt(store: Store, name: str, path: str, beside: tuple[str, ...]) -> bytes
 
 def _remake(store: Store, name: str, path: str, why: str) -> bytes:
     for identity in _makers(store, name):
-        stage = stage_of(identity["stage"])
-        if stage.source:
+        acquired = identity["stage"] == ACQUIRE
+        if acquired or stage_of(identity["stage"]).source:
             raise DamagedError(
-                f"{why} It is the recording {path}, which cannot be made again: restore it with `tacpipe store pull`, "
-                f"or ingest it again."
+                f"{why} It is the recording {path}, which cannot be made again: restore it with `tacpipe store pull`"
+                f"{'' if acquired else ', or ingest it again'}."
             )
+        stage = stage_of(identity["stage"])
         if stage.version != identity["version"]:
             continue
         execute(Task(str(store.root), identity["stage"], identity), store, store)

@@ -15,6 +15,7 @@ from tacpipe.stage import Attribute
 
 FORMAT = 1
 NAME = "manifest.json"
+ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
 
 

@@ -1,0 +1,125 @@
+"""Record an emulated rig for long, as a lab would, and hold every sample against what was sent.
+
+    python benchmarks/rig_endurance.py [--minutes 10] [--rig rigs/first-paper.toml]
+
+The rig is emulated here; `tacpipe acquire` runs beside it as a process of its own, whose processor time and memory are
+read from the kernel. Everything that was sent between the first and the last recorded sample must be recorded, value by
+value.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+import tacpipe
+from tacpipe.recording import rig as rig_of
+from tacpipe.simulation.emulation import rig_file
+from tacpipe.simulation.emulation.emulate_command import SWITCH_S
+from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.simulation.emulation.ledger import Ledger
+
+BIN = Path(sys.executable).parent
+TICKS = os.sysconf("SC_CLK_TCK")
+LOOK_S = 5.0
+SETTLED_S = 15.0  # after which memory should not grow
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the kernel says of a process at a moment."""
+
+    at_s: float
+    processor_s: float
+    resident_mb: float
+
+
+def look(process: int) -> Look:
+    """Return the processor time and the resident memory of a process."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    resident = next(
+        line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line.startswith("VmRSS")
+    )
+    return Look(time.monotonic(), (int(fields[11]) + int(fields[12])) / TICKS, int(resident.split()[1]) / 1024)
+
+
+def watched(command: list[str], seconds: float, store: Path) -> list[Look]:
+    """Run a command that records for ``seconds`` and return looks at it while it does."""
+    process = subprocess.Popen(command, env={**os.environ, "TACPIPE_STORE": str(store)})
+    looks = []
+    until_s = time.monotonic() + seconds
+    while process.poll() is None:
+        if time.monotonic() < until_s:
+            looks.append(look(process.pid))
+        time.sleep(LOOK_S if time.monotonic() < until_s else 0.2)
+    if process.returncode:
+        raise SystemExit(f"acquire ended with {process.returncode}.")
+    return looks
+
+
+def accounted(table: pa.Table, ledger: Ledger) -> str:
+    """Return what a recorded stream has beside what was sent; raises `AssertionError` for a sample that is wrong."""
+    sent = ledger.samples()
+    channels = [name for name in table.column_names if name not in ("t_ns", "t_device_ns", "seq", "device_seq")]
+    values = [
+        np.concatenate([block[:, column] for block in [block]])
+        for block in sent.values
+        for column in range(block.shape[1])
+    ]
+    recorded = [table.column(name).to_numpy() for name in channels]
+    counts = table.column("seq").to_numpy()
+    assert sent.seq is not None
+    assert np.array_equal(np.diff(counts), np.ones(len(counts) - 1)), "the counter has gaps"
+    starts = np.flatnonzero(sent.seq == counts[0])
+    for start in starts:
+        stop = start + len(counts)
+        if stop <= len(sent.seq) and all(
+            np.array_equal(ours, theirs[start:stop], equal_nan=True)
+            for ours, theirs in zip(recorded, values, strict=True)
+        ):
+            return f"{len(counts):,} of {stop - start:,} sent meanwhile, all values equal"
+    raise AssertionError("what was recorded is not what was sent")
+
+
+def main() -> None:
+    """Record, compare, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--rig", type=Path, default=Path(__file__).parents[1] / "rigs/first-paper.toml")
+    chosen = parser.parse_args()
+    sys.setswitchinterval(SWITCH_S)
+    with tempfile.TemporaryDirectory(prefix="tacpipe-rig-") as name:
+        folder = Path(name)
+        with Emulator(rig_of.read(chosen.rig), folder=folder / "emulated") as emulator:
+            rig = folder / "rig.toml"
+            rig.write_text(rig_file.text(emulator.rig))
+            seconds = 60 * chosen.minutes
+            words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration", str(seconds), "--quiet"]
+            looks = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")
+        os.environ["TACPIPE_STORE"] = str(folder / "store")
+        recordings = tacpipe.open(folder / "rec")
+        (shard,) = recordings.shards.values()
+        first, last = looks[0], looks[-1]
+        share = (last.processor_s - first.processor_s) / (last.at_s - first.at_s)
+        settled = [one.resident_mb for one in looks if one.at_s - first.at_s > SETTLED_S]
+        print(f"recorded {seconds:g} s: {100 * share:.1f} % of one core")
+        told = f"{max(settled):.0f} MB at most, {settled[-1]:.0f} MB at the end"
+        print(f"resident memory: {settled[0]:.0f} MB after {SETTLED_S:g} s, {told}")
+        for stream in shard.streams:
+            if stream == "events":
+                print(f"events: {shard.table(stream).to_pylist()}")
+                continue
+            print(f"{stream}: {accounted(shard.table(stream), emulator.ledger[stream])}")
+
+
+if __name__ == "__main__":
+    main()

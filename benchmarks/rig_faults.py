@@ -1,0 +1,200 @@
+"""Harm the bytes of every sensor for minutes of its own time, and hold what its driver gives against what was sent.
+
+    python benchmarks/rig_faults.py [--minutes 5] [--only tfmini contactile] [--faults noise=1,cut=1]
+
+Nothing waits: the clock is the emulator's. A sample that was never sent is an error, unless the harm made a frame that the
+protocol itself takes for good (`invisible`: nothing in it could tell). Printed are, for each sensor, what was done to it,
+the samples that came, those that were lost and what the driver says was lost, and the most unharmed frames in a row that
+were not given out after a disturbance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tacpipe.recording import rig as rig_of
+from tacpipe.recording.reading import Batch, Reading
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Samples
+from tacpipe.simulation.emulation import byte_faults, serving
+from tacpipe.simulation.emulation.byte_faults import Faults, Item
+from tacpipe.simulation.emulation.emulator import UNPACED_HZ, Emulator, pace
+from tacpipe.simulation.emulation.ledger import Ledger
+from tacpipe.simulation.emulation.transmission import Plan
+
+RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"
+USUAL = Faults(
+    noise=0.3,
+    cut=0.3,
+    flip=0.3,
+    burst=0.3,
+    drop=0.001,
+    duplicate=0.001,
+    reorder=0.001,
+    stall=0.05,
+    unplug=0.02,
+    wrap_s=30,
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a sensor's frames under faults."""
+
+    name: str
+    harmed: dict[str, int]
+    sent: int  # samples that went out unharmed
+    given: int  # samples that the driver gave
+    wrong: int  # of them that were never sent, and that the protocol could have told
+    invisible: int  # of them of frames whose harm the protocol cannot tell
+    lost: int  # samples between the first and the last given that were not, harmed or not sent
+    told: int  # that the driver says were lost
+    longest: int  # unharmed frames in a row right behind a disturbance that were not given
+    causes: dict[str, int]
+
+
+def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
+    """Return what became of ``seconds`` of a stream of the rig of all sensors."""
+    emulator = Emulator(rig_of.read(RIG), seed=1, faults=faults)
+    stream = emulator.asked.streams[name]
+    its_pace, rate_hz = pace(emulator.asked, name), stream.sensor.rate_hz or UNPACED_HZ
+    source = emulator.source(name, its_pace, rate_hz)
+    packets = stream.address.scheme in serving.PACKETS
+    plan = Plan(source, its_pace, faults, [1], packets=packets)
+    ledger, reading = Ledger(name), Reading(stream.sensor)
+    ledger.sources.append(source)
+    batches: list[Batch] = []
+    harmed: Counter[str] = Counter()
+    away = False
+    while plan.until_ns < seconds * 1e9:
+        for item in plan.more():
+            if item.number < 0 and item.cause in (byte_faults.UNPLUG, byte_faults.REPLUG):
+                away = item.cause == byte_faults.UNPLUG
+                harmed[item.cause] += 1
+                if away:
+                    batches.append(reading.broken())
+                continue
+            size = 0 if away else len(item.data)
+            cause = byte_faults.GONE if away and item.data else item.cause
+            ledger.add(item, item.due_ns, max(1, item.due_ns), size, cause)
+            harmed.update([cause] if cause else [])
+            if size:
+                batches.append(reading.feed(_chunks(item, packets=packets)))
+    batches.append(reading.finish())
+    return _held(name, ledger, batches, reading, dict(harmed))
+
+
+def _chunks(item: Item, *, packets: bool) -> Chunks:
+    """Return an item as a link would give it; a link of bytes in two pieces."""
+    half = len(item.data) // 2
+    pieces = [item.data] if packets or not half else [item.data[:half], item.data[half:]]
+    return Chunks.of([(item.due_ns, piece) for piece in pieces])
+
+
+def _held(name: str, ledger: Ledger, batches: list[Batch], reading: Reading, harmed: dict[str, int]) -> Outcome:
+    """Hold samples against what was sent: in the order of their sending, by all that they say."""
+    sent = ledger.samples()
+    assert sent.rows is not None
+    whole = ledger.whole
+    wanted = _keys(sent, reading)
+    places: dict[bytes, list[int]] = {}
+    for place, key in enumerate(wanted):
+        places.setdefault(key, []).append(place)
+    given = np.zeros(len(wanted), dtype=bool)
+    wrong, last = 0, -1
+    found = [key for batch in batches if len(batch) for key in _keys(batch, reading)]
+    for key in found:
+        there = places.get(key, [])
+        if not there:
+            wrong += 1
+            continue
+        place = next((one for one in there if one > last), there[0])
+        given[place], last = True, max(last, place)
+    entries = whole[sent.rows]  # (sample,), the entry of each
+    invisible = int(ledger.column("invisible").sum())
+    first, final = int(given.argmax()), len(given) - 1 - int(given[::-1].argmax())
+    numbers = ledger.column("number")
+    span = int(numbers[entries[final]] - numbers[entries[first]]) + 1
+    unwanted = min(wrong, invisible * max(1, len(wanted) // max(1, len(whole))))
+    causes = Counter[str]()
+    for batch in batches:
+        for event in batch.events:
+            causes[event.cause] += 1
+    lost = span - len(np.unique(entries[first : final + 1][given[first : final + 1]]))
+    return Outcome(
+        name, harmed, len(wanted), len(found), wrong - unwanted, unwanted, lost, reading.lost,
+        _longest(ledger, entries[given]), dict(causes),
+    )  # fmt: skip
+
+
+def _keys(samples: Samples | Batch, reading: Reading) -> list[bytes]:
+    """Return for each sample all that it says, its counter as the frame holds it."""
+    modulus = reading.sensor.counter
+    texts = [
+        np.array([[hash(cell)] for cell in map(str, block.tolist())])
+        for block in samples.values
+        if block.dtype.kind == "O"
+    ]
+    parts = texts + [block for block in samples.values if block.dtype.kind != "O"]
+    if samples.seq is not None and modulus is not None:
+        parts.append(
+            (samples.seq * reading.sensor.step % modulus)[:, None]
+            if isinstance(samples, Batch)
+            else samples.seq[:, None]
+        )
+    rows = [np.ascontiguousarray(part).view(np.uint8).reshape(len(part), -1) for part in parts]
+    joined = np.hstack(rows)
+    return [row.tobytes() for row in joined]
+
+
+def _longest(ledger: Ledger, given: np.ndarray) -> int:
+    """Return the most unharmed frames in a row right behind a disturbance, with more behind them, that were not given."""
+    there = np.zeros(len(ledger), dtype=bool)
+    there[given] = True
+    whole = np.zeros(len(ledger), dtype=bool)
+    whole[ledger.whole] = True
+    longest = run = 0
+    counting = False
+    for good, came in zip(whole.tolist(), there.tolist(), strict=True):
+        if not good:
+            counting, run = True, 0
+        elif came:
+            longest, counting = max(longest, run if counting else 0), False
+        elif counting:
+            run += 1
+    return longest
+
+
+def main() -> None:
+    """Harm each sensor and print what became of it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--only", nargs="+")
+    parser.add_argument("--faults", help="as for `tacpipe sensors emulate`; a little of everything by default")
+    chosen = parser.parse_args()
+    faults = byte_faults.parse(chosen.faults) if chosen.faults else USUAL
+    print("| sensor | harmed | given | wrong | invisible | lost | told as lost | not given behind a disturbance |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    failed = False
+    for name in chosen.only or rig_of.read(RIG).streams:
+        began_s = time.monotonic()
+        found = outcome(name, 60 * chosen.minutes, faults)
+        failed |= bool(found.wrong)
+        harmed = sum(found.harmed.values())
+        print(
+            f"| {name} | {harmed} | {found.given:,} | {found.wrong} | {found.invisible} | {found.lost} | {found.told} | "
+            f"{found.longest} |", flush=True,
+        )  # fmt: skip
+        print(f"{name}: {found.harmed} {found.causes}, {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True)
+    raise SystemExit(int(failed))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""``tacpipe acquire``: record a rig, look at it without recording, or seal what a crash left behind."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tacpipe.errors import TacpipeError, UsageError
+
+if TYPE_CHECKING:
+    from tacpipe.recording.rig import Rig, Stream
+    from tacpipe.recording.trials import Recorded
+    from tacpipe.sensors.framing import Chunks
+    from tacpipe.stage import Attribute
+    from tacpipe.store import Store
+
+SCHEMA_VERSION = 1
+DRY_RUN_S = 3.0
+RATE_OFF = 0.1  # share by which a rate may differ from what the rig file says before it is told
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the command to ``program``."""
+
+    @program.command(
+        "acquire",
+        help=f"{summary}\n\nExample: tacpipe acquire rig.toml -o data/recordings --duration 30 --label material=cork",
+    )
+    def acquire(
+        rig: Annotated[Path | None, typer.Argument(help="The rig file; docs/rig.md tells how to write one.")] = None,
+        output: Annotated[
+            Path | None, typer.Option("-o", "--output", help="Dataset of recordings to append to.")
+        ] = None,
+        duration: Annotated[
+            float | None, typer.Option(help="Seconds a recording; without it until Ctrl-C or --stop.")
+        ] = None,
+        trials: Annotated[int, typer.Option(help="Recordings, one after another.")] = 1,
+        label: Annotated[list[str] | None, typer.Option(help="name=value, on every recording.")] = None,
+        note: Annotated[str | None, typer.Option(help="What the operator wants to say of it.")] = None,
+        name: Annotated[
+            str | None, typer.Option(help="Name of the recording; the time of its start by default.")
+        ] = None,
+        start: Annotated[str, typer.Option(help="What starts a trial: now, key, contact or tap.")] = "now",
+        stop: Annotated[str, typer.Option(help="What stops it, beside --duration: key, contact (its end) or tap.")] = (
+            "duration"
+        ),
+        contact_count: Annotated[
+            float, typer.Option(help="From rest, in the sensor's unit: beyond is contact.")
+        ] = 50.0,
+        tare: Annotated[
+            bool | None,
+            typer.Option("--tare/--no-tare", help="Have devices tare before each trial; by default with --trials."),
+        ] = None,
+        dry_run: Annotated[bool, typer.Option("--dry-run", help="Open, check rates for 3 s, record nothing.")] = False,
+        recover: Annotated[bool, typer.Option("--recover", help="Seal what a crash left behind, and end.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="Nothing on stderr but errors.")] = False,
+        as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    ) -> None:
+        from tacpipe import store as stores
+        from tacpipe.recording import rig as rig_of
+        from tacpipe.recording import trials as trials_of
+
+        store = stores.locate()
+        if rig is None and not recover:
+            raise UsageError("acquire needs a rig file, as in `tacpipe acquire rig.toml -o data/recordings`.")
+        found = rig_of.read(rig) if rig is not None else None
+        if found is not None and dry_run:
+            print(_dry_run(found, as_json=as_json))
+            return
+        if found is not None and output is None and not recover:
+            raise UsageError("acquire needs -o: the dataset of recordings to append to.")
+        began_s = time.monotonic()
+        sealed = _recovered(store, quiet=quiet)
+        if found is None or output is None or recover:
+            _tell(output, sealed, began_s, as_json=as_json)
+            return
+        plan = trials_of.Plan(
+            output,
+            name or time.strftime("%Y%m%d-%H%M%S", time.gmtime()),
+            duration,
+            trials,
+            start,
+            stop,
+            contact_count,
+            trials > 1 if tare is None else tare,
+            _attributes(label or [], note),
+        )
+        _tell(output, _record(found, store, plan, quiet=quiet), began_s, as_json=as_json)
+
+
+def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> list[Recorded]:
+    from tacpipe import directory
+    from tacpipe.recording import appending, trials, triggers
+    from tacpipe.recording.recorder import Recorder
+    from tacpipe.recording.view import View
+
+    for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
+        if value not in known:
+            raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
+    if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
+        raise UsageError("--trials and --duration must be above 0.")
+    if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
+        raise UsageError("--trials needs --duration or --stop, or the first trial never ends.")
+    store.prepare()
+    directory.check_output(store, plan.output)
+    appending.existing(plan.output)
+    recorder = Recorder(rig)
+    with trials.Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
+        recorder.await_first(_instead, ended)
+        return trials.run(recorder, store, plan, view, ended)
+
+
+def _recovered(store: Store, *, quiet: bool) -> list[Recorded]:
+    """Seal what earlier processes left behind; what cannot be sealed is told and stays."""
+    from tacpipe.recording import spool, trials
+    from tacpipe.recording.appending import NothingError
+
+    sealed = []
+    for folder in spool.abandoned(store.root):
+        try:
+            one = trials.recover(store, folder)
+        except NothingError:
+            continue  # it ended before a sample came
+        except TacpipeError as error:
+            print(f"tacpipe: the spool {folder} stays as it is: {error}", file=sys.stderr)
+            continue
+        sealed.append(one)
+        if not quiet:
+            print(f"recovered {one.line()}", file=sys.stderr)
+    return sealed
+
+
+def _dry_run(rig: Rig, *, as_json: bool) -> str:
+    """Open every stream and return what each does. Raises `DeviceError` for those that do not open or give nothing."""
+    from dataclasses import asdict
+
+    from tacpipe.recording.recorder import Recorder
+    from tacpipe.recording.trials import Ended
+    from tacpipe.recording.view import line
+
+    recorder = Recorder(rig)
+    with Ended() as ended, recorder.open():
+        recorder.await_first(_instead, ended)
+        until_s = time.monotonic() + DRY_RUN_S
+        recorder.run(lambda: ended() or time.monotonic() > until_s)
+        figures = {name: watch.figures(time.monotonic_ns()) for name, watch in recorder.watches.items()}
+    if as_json:
+        return json.dumps({"schema_version": SCHEMA_VERSION, "streams": {n: asdict(f) for n, f in figures.items()}})
+    lines = []
+    for name, found in figures.items():
+        wanted_hz = rig.streams[name].sensor.rate_hz
+        off = wanted_hz and abs(found.rate_hz / wanted_hz - 1) > RATE_OFF
+        lines.append(line(name, found) + (f"; {wanted_hz:g} Hz were expected" if off else ""))
+    return "\n".join(lines)
+
+
+def _instead(stream: Stream, heard: Iterable[Chunks]) -> str:
+    """Return a sentence on what else the bytes of a stream may be."""
+    import numpy as np
+
+    from tacpipe.links.recognition import recognise
+    from tacpipe.sensors.framing import Chunks
+
+    several = list(heard)
+    joined = Chunks(
+        np.concatenate([one.t_ns for one in several]),
+        np.concatenate([one.size for one in several]),
+        b"".join(one.data for one in several),
+    )
+    found = recognise(joined, stream.address.scheme)
+    if found and found[0].candidate.sensor != stream.sensor:
+        return f"They are those of {found[0].candidate}: tell the rig file so, or plug in the other device."
+    baud = getattr(stream.sensor, "baud", None)
+    at = f" is set to another rate than {baud} baud, or" if baud and stream.address.scheme == "serial" else ""
+    return f"Either the device{at} it speaks another protocol; `tacpipe sensors probe {stream.address}` tries them all."
+
+
+def _attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
+    from tacpipe import labels as labels_of
+
+    attributes = labels_of.parse(labels, None, include=False) if labels else {}
+    return {**attributes, **({"note": note} if note else {})}
+
+
+def _tell(output: Path | None, recorded: list[Recorded], began_s: float, *, as_json: bool) -> None:
+    from dataclasses import asdict
+
+    if as_json:
+        seconds = round(time.monotonic() - began_s, 3)
+        told = [asdict(one) for one in recorded]
+        where = None if output is None else str(output)
+        rows = sum(sum(one.rows.values()) for one in recorded)
+        value = {
+            "schema_version": SCHEMA_VERSION,
+            "output": where,
+            "recordings": told,
+            "rows": rows,
+            "seconds": seconds,
+        }
+        print(json.dumps(value))
+        return
+    for one in recorded:
+        print(one.line(), file=sys.stderr)
+    if output is not None:
+        print(output)

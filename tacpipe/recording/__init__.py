@@ -1,0 +1,1 @@
+"""From a rig file to recordings: the streams of a rig, a spool that outlasts a crash, and what is sealed of it."""

@@ -1,0 +1,127 @@
+"""A sealed recording put into the store and appended to its dataset, looked at once more before success is said."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe import directory, provenance
+from tacpipe import manifest as manifest_of
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.hashing import digest
+from tacpipe.manifest import ACQUIRE, Entry, Manifest
+from tacpipe.recording.rig import Rig
+from tacpipe.recording.sealing import Sealed, events_table
+from tacpipe.recording.spool import Spooled
+from tacpipe.stage import Attribute
+from tacpipe.store import Object, Store
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+VERSION = 1
+RIG = "rig.toml"  # under this name the rig file goes along with a recording
+
+
+class NothingError(TacpipeError):
+    """A recording without a single sample."""
+
+
+def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> str:
+    """Append a recording to the dataset at ``output`` and return its name.
+
+    Its shards are durable, and read again and compared, before the manifest names them. Raises `NothingError` if no stream
+    gave anything, and `DamagedError` if what was written is not what is read.
+    """
+    began_s = time.perf_counter()
+    tables = {name: one.table for name, one in sealed.items() if one.table.num_rows}
+    if not tables:
+        raise NothingError(
+            f"No stream gave a single sample ({', '.join(sealed)}), so there is no recording. "
+            f"`tacpipe acquire --dry-run` tells what each device sends."
+        )
+    events = events_table(sealed, spooled)
+    if events.num_rows:
+        tables["events"] = events
+    shards = {name: _shard(store, name, table) for name, table in sorted(tables.items())}
+    text = vars(store.put(rig.text.encode(), durable=True))
+    entry: Entry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
+    result = {"recordings": {"": entry}, "files": {RIG: text}}
+    identity = {
+        "stage": ACQUIRE,
+        "version": VERSION,
+        "params": {"rig": text["digest"]},
+        "inputs": {"spool": spooled.folder.name},
+    }
+    made = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
+    store.commit(identity, result, made, durable=True)
+    output = output.absolute()
+    with store.leases.hold(digest([ACQUIRE, str(output)])):
+        before = existing(output)
+        there = {} if before is None else before.recordings
+        for name, other in there.items():
+            if other["shards"] == shards:
+                return name  # a crash came between this and the spool's end
+        name = _free(spooled.header["recording"], there)
+        now = before or Manifest(ACQUIRE, VERSION)
+        now = replace(
+            now,
+            recordings=dict(sorted({**now.recordings, name: entry}.items())),
+            sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
+        )
+        store.put(now.content, durable=True)
+        directory.publish(store, now, output)
+    return name
+
+
+def existing(output: Path) -> Manifest | None:
+    """Return the manifest of the acquired recordings at ``output``, None if nothing is there yet.
+
+    Raises `UsageError` if another command made what is there.
+    """
+    if not (output / manifest_of.NAME).exists():
+        return None
+    found = manifest_of.find(output).manifest
+    if found.stage != ACQUIRE:
+        raise UsageError(
+            f"{output} was made by {found.stage}, and acquire appends to acquired recordings alone. Give -o another "
+            f"directory; later stages read several datasets as one."
+        )
+    return found
+
+
+def _free(wanted: str, taken: Mapping[str, Any]) -> str:
+    """Return ``wanted``, with a number behind it if a recording has that name already."""
+    name, number = wanted, 2
+    while name in taken:
+        name, number = f"{wanted}-{number}", number + 1
+    return name
+
+
+def _shard(store: Store, stream: str, table: pa.Table) -> dict[str, Any]:
+    from tacpipe.tables import from_parquet, to_parquet
+
+    stored: Object = store.put(to_parquet(table), durable=True)
+    if not from_parquet(store.read(stored.digest)).equals(table):
+        raise DamagedError(
+            f"Stream {stream} does not read as it was written; the disk is not to be trusted. The spool is kept: "
+            f"`tacpipe acquire --recover` seals it once that is mended."
+        )
+    return {"digest": stored.digest, "rows": table.num_rows, "bytes": stored.bytes}
+
+
+def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dict[str, Attribute]:
+    """Return labels, and for each stream how many samples were lost; what a crash cost where there was one."""
+    master = rig.streams[rig.master]
+    attributes: dict[str, Attribute] = {"sensor": master.sensor.product or master.kind, "master": rig.master}
+    attributes |= {**rig.labels, **spooled.header["attributes"]}
+    for name, one in sealed.items():
+        attributes[f"{name}_lost"] = one.lost
+        if not one.table.num_rows:
+            attributes[f"{name}_missing"] = True
+        if one.crashed[0]:
+            attributes |= {f"{name}_crash_lost_reads": one.crashed[0], f"{name}_crash_lost_bytes": one.crashed[1]}
+    return attributes

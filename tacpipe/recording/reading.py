@@ -1,0 +1,200 @@
+"""One stream from the bytes of its link to samples: framed, decoded, counted, with every loss told and counted once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.sensors.counting import Counted, Counting
+from tacpipe.sensors.framing import Account, Chunks, Loss, Run
+from tacpipe.sensors.sensor import Samples, Sensor
+
+Times = NDArray[np.int64]
+
+LINK = "link"  # frames that the counter misses and of which no byte came
+DEVICE = "device"  # samples that the device itself passed over
+DUPLICATE, LATE, RESET = "duplicate", "late", "counter_reset"
+SILENT = (
+    "silent"  # of a device that does not count: nothing came for longer than it should, and no burst made up for it
+)
+SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000  # of both the longer one
+
+
+class Event(NamedTuple):
+    """Something that went wrong with a stream: when, why, and how many frames and bytes it cost."""
+
+    t_ns: int
+    cause: str
+    frames: int = 0  # lost; below 0 for one that was counted as lost and came late
+    bytes: int = 0  # thrown away
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples of one stream in the order of their arrival, and what went wrong meanwhile."""
+
+    t_ns: Times  # (sample,), arrival on the monotonic clock
+    values: tuple[NDArray[Any], ...]  # blocks (sample, channel)
+    seq: Times | None = None  # (sample,), unrolled
+    device_seq: Times | None = None  # (sample,), unrolled
+    t_device_ns: Times | None = None  # (sample,)
+    events: tuple[Event, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+class Reading:
+    """Turns what a link gave into samples; the same bytes give the same samples, however they are cut."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.frames = 0  # that carried samples
+        self.lost = 0  # frames, by counter where there is one
+        self._framer = sensor.framer()
+        self._before = Account()  # of the framers of links that were lost
+        self._counting = _counting(sensor, sensor.counter)
+        self._device_counting = _counting(sensor, sensor.device_counter)
+        self._unexplained: list[Loss] = []  # losses before a sample that tells how many frames they cost
+        self._last_ns: int | None = None
+        self._silence: Event | None = None  # that may still be made up for
+
+    @property
+    def account(self) -> Account:
+        """The bytes of all links so far."""
+        now = self._framer.account
+        return Account(
+            self._before.received + now.received, self._before.framed + now.framed, self._before.lost + now.lost
+        )
+
+    def feed(self, chunks: Chunks) -> Batch:
+        """Return the samples that are complete now."""
+        return self._batch(*self._framer.feed(chunks))
+
+    def broken(self) -> Batch:
+        """Return what was left when the link was lost; what comes next is from a new one."""
+        batch = self._batch(*self._framer.flush())
+        self._before = self.account
+        self._framer = self.sensor.framer()
+        return batch
+
+    def finish(self) -> Batch:
+        """Return what is left when nothing more comes."""
+        batch = self._batch(*self._framer.flush())
+        left = tuple(_event(loss, loss.frames) for loss in self._unexplained)
+        left += () if self._silence is None else (self._silence,)
+        self.lost += sum(event.frames for event in left)
+        self._unexplained, self._silence = [], None
+        return replace(batch, events=batch.events + left)
+
+    def _batch(self, runs: Sequence[Run], losses: Sequence[Loss]) -> Batch:
+        decoded = [(run, self.sensor.decode(run.frames)) for run in runs]
+        decoded = [(run, samples) for run, samples in decoded if len(samples)]
+        stamps = [run.t_ns if samples.rows is None else run.t_ns[samples.rows] for run, samples in decoded]
+        t_ns = np.concatenate(stamps) if stamps else np.zeros(0, dtype=np.int64)
+        self.frames += sum(len(s) if s.rows is None else len(np.unique(s.rows)) for _, s in decoded)
+        every = [samples for _, samples in decoded]
+        seq, device_seq, t_device_ns = (_joined(every, name) for name in ("seq", "device_seq", "t_device_ns"))
+        events: list[Event] = []
+        kept = np.ones(len(t_ns), dtype=bool)
+        self._unexplained += losses
+        if self._counting is not None:
+            if seq is not None:
+                counted = self._counting.feed(seq, t_ns)
+                seq, kept = counted.seq, ~counted.duplicate
+                events += self._explained(counted, t_ns)
+                if self._device_counting is not None and device_seq is not None:
+                    skipped = self._device_counting.feed(device_seq, t_ns)
+                    device_seq = skipped.seq
+                    events += _device_events(skipped, counted, t_ns)
+        else:
+            events += [_event(loss, loss.frames) for loss in self._unexplained]
+            self._unexplained = []
+            events += self._silences(t_ns)
+        self.lost += sum(event.frames for event in events)
+        if len(t_ns):
+            self._last_ns = int(t_ns[-1])
+        blocks = tuple(np.concatenate(several) for several in zip(*(one.values for one in every), strict=True))
+        batch = Batch(t_ns, blocks, seq, device_seq, t_device_ns, tuple(sorted(events)))
+        return batch if kept.all() else _chosen(batch, kept)
+
+    def _explained(self, counted: Counted, t_ns: Times) -> list[Event]:
+        """Return the events of a batch whose samples are counted: each loss costs what the counter says, and no more."""
+        events: list[Event] = []
+        odd = np.flatnonzero((counted.missing > 0) | counted.duplicate | counted.late | counted.reset)
+        for row in odd.tolist():
+            at_ns, missing = int(t_ns[row]), int(counted.missing[row])
+            if counted.duplicate[row]:
+                events.append(Event(at_ns, DUPLICATE))
+                continue
+            if counted.late[row]:
+                events.append(Event(at_ns, LATE, frames=-1))
+                continue
+            if counted.reset[row]:
+                events.append(Event(at_ns, RESET, detail=f"began anew at {counted.seq[row]}"))
+            for loss in [loss for loss in self._unexplained if loss.t_ns <= at_ns]:
+                share = min(loss.frames, missing)
+                missing -= share
+                events.append(_event(loss, share))
+                self._unexplained.remove(loss)
+            if missing:
+                events.append(Event(at_ns, LINK, frames=missing))
+        if len(t_ns):  # a loss after which the counter went on as it should cost no frame
+            last_ns = int(t_ns[-1])
+            events += [_event(loss, 0) for loss in self._unexplained if loss.t_ns <= last_ns]
+            self._unexplained = [loss for loss in self._unexplained if loss.t_ns > last_ns]
+        return events
+
+    def _silences(self, t_ns: Times) -> list[Event]:
+        """Return the silences that are over; what comes in a burst behind one was late and is not lost."""
+        rate_hz = self.sensor.rate_hz
+        if not rate_hz or not len(t_ns):
+            return []
+        period_ns = 1e9 / rate_hz
+        apart_ns = np.diff(t_ns, prepend=int(t_ns[0]) if self._last_ns is None else self._last_ns)
+        silent = apart_ns > max(SILENT_NS, SILENT_PERIODS * period_ns)
+        if self._silence is None and not silent.any():
+            return []
+        events = []
+        for at_ns, step_ns, began in zip(t_ns.tolist(), apart_ns.tolist(), silent.tolist(), strict=True):
+            if self._silence is not None and (began or step_ns > period_ns / 2):
+                events.append(self._silence)
+                self._silence = None
+            elif self._silence is not None:
+                self._silence = self._silence._replace(frames=max(0, self._silence.frames - 1))
+            if began:
+                lost = max(0, round(step_ns / period_ns) - 1)
+                self._silence = Event(at_ns, SILENT, lost, detail=f"{step_ns / 1e6:.0f} ms, by the clock")
+        return events
+
+
+def _counting(sensor: Sensor, modulus: int | None) -> Counting | None:
+    return None if modulus is None else Counting(modulus, sensor.rate_hz, sensor.step)
+
+
+def _joined(samples: Sequence[Samples], name: str) -> Times | None:
+    found = [getattr(one, name) for one in samples]
+    return np.concatenate(found) if found and found[0] is not None else None
+
+
+def _event(loss: Loss, frames: int) -> Event:
+    return Event(loss.t_ns, loss.cause, frames, loss.bytes)
+
+
+def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[Event]:
+    """Return the samples that the device passed over itself: those that its own counter misses beyond lost packets."""
+    beyond = skipped.missing - counted.missing
+    return [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
+
+
+def _chosen(batch: Batch, rows: NDArray[np.bool_]) -> Batch:
+    def of(values: Times | None) -> Times | None:
+        return None if values is None else values[rows]
+
+    blocks = tuple(block[rows] for block in batch.values)
+    return Batch(batch.t_ns[rows], blocks, of(batch.seq), of(batch.device_seq), of(batch.t_device_ns), batch.events)

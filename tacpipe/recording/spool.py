@@ -1,0 +1,262 @@
+"""The spool: what came over the links of a rig, byte for byte, in a file that is only ever appended to.
+
+A recording's folder in the store holds
+
+- ``header.json``: what is recorded and for whom, and the UTC time of one reading of the monotonic clock;
+- ``bytes``: blocks, each with a mark, a check sum, and the chunks of one stream with their arrival, or a note;
+- ``tally``: how much every stream has received so far, in memory shared with the disk cache: what a killed process had
+  read and not yet written is known from it.
+
+What is written outlasts the process; what is synced outlasts a loss of power. A block that is torn or damaged ends what
+can be read of it, and the next mark begins anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import mmap
+import os
+import struct
+import time
+import uuid
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError
+from tacpipe.files import readable_errors, sync_folder, write_whole
+from tacpipe.sensors.framing import Chunks
+
+FOLDER = "spool"  # within the store
+MARK = b"tacB"
+HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
+CHUNKS, NOTE = 0, 1  # kinds of blocks
+TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
+MOST_STREAMS = 256
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something that happened to a stream besides its bytes: a link that opened, was lost, was paused."""
+
+    t_ns: int
+    stream: str
+    what: str
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes of a spool that are no block: at its end what a crash tore off, elsewhere what a disk did."""
+
+    offset: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Tallied:
+    """What a stream had received when the process ended, spooled or not."""
+
+    chunks: int
+    bytes: int
+    last_ns: int
+
+
+def now() -> dict[str, int]:
+    """Return one reading of the monotonic clock and the UTC time then, both in ns; of five tries the tightest."""
+    tries = []
+    for _ in range(5):
+        before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        tries.append((after_ns - before_ns, (before_ns + after_ns) // 2, utc_ns))
+    _, monotonic_ns, utc_ns = min(tries)
+    return {"monotonic_ns": monotonic_ns, "utc_ns": utc_ns}
+
+
+class Spool:
+    """A spool that is being written. One thread appends; the threads that read links each `tally` their own stream."""
+
+    def __init__(self, store: Path, header: Mapping[str, Any], streams: Sequence[str]) -> None:
+        self.folder = store / FOLDER / uuid.uuid4().hex
+        self.streams = {name: number for number, name in enumerate(streams)}
+        with readable_errors(store):
+            self.folder.mkdir(parents=True)
+            told = {**header, "streams": list(streams), "clock": now()}
+            self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+            fcntl.flock(self._file, fcntl.LOCK_EX)  # until the process ends: nobody recovers what is being written
+            self._tally = _tally(self.folder, len(streams))
+            content = json.dumps(told, sort_keys=True).encode()
+            write_whole(str(self.folder / "header.json"), content, str(self.folder / ".header.json"))
+            for folder in (self.folder, self.folder.parent):
+                sync_folder(str(folder))
+        self._waiting: list[bytes] = []
+        self.bytes = 0
+
+    def tally(self, stream: int, chunks: int, size: int, last_ns: int) -> None:
+        """Note how much a stream has received in all, before it is appended."""
+        TALLY.pack_into(self._tally, stream * TALLY.size, chunks, size, last_ns)
+
+    def append(self, stream: str, chunks: Chunks) -> None:
+        """Add what came over a link; it is on its way to the disk with the next `write`."""
+        if len(chunks.size):
+            body = chunks.t_ns.astype("<i8").tobytes() + chunks.size.astype("<u4").tobytes() + chunks.data
+            self._waiting.append(_block(CHUNKS, self.streams[stream], len(chunks.size), body))
+
+    def note(self, note: Note) -> None:
+        """Add a note."""
+        body = json.dumps({"t_ns": note.t_ns, "what": note.what, "detail": note.detail}).encode()
+        self._waiting.append(_block(NOTE, self.streams[note.stream], 0, body))
+
+    def write(self) -> None:
+        """Hand over what was added to the operating system: it outlasts this process.
+
+        Raises `TacpipeError` when the disk is full.
+        """
+        left = memoryview(b"".join(self._waiting))
+        self._waiting = []
+        self.bytes += len(left)
+        with readable_errors(self.folder):
+            while left:
+                left = left[os.write(self._file, left) :]
+
+    def sync(self) -> None:
+        """Have what was written outlast a loss of power."""
+        with readable_errors(self.folder):
+            os.fdatasync(self._file)
+
+    def close(self) -> None:
+        """Write and sync the rest."""
+        self.write()
+        self.sync()
+        self._tally.flush()
+        os.close(self._file)
+
+
+class Spooled:
+    """A spool that is read: of a recording that has ended, or whose process has."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            self.header: dict[str, Any] = json.loads((folder / "header.json").read_bytes())
+            self.streams: list[str] = self.header["streams"]
+        except FileNotFoundError:
+            raise TacpipeError(f"The spool {folder} has no header: its process ended before it recorded.") from None
+        except (OSError, ValueError, KeyError) as error:
+            raise TacpipeError(
+                f"The spool {folder} has no readable header ({error}): its recording ended before it began. "
+                f"Remove the folder."
+            ) from error
+        self.damage: list[Damage] = []
+
+    def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | Note]]:
+        """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
+
+        What is no block is passed over, and noted in ``damage``.
+        """
+        wanted = None if stream is None else self.streams.index(stream)
+        self.damage = []
+        path = self.folder / "bytes"
+        if not path.stat().st_size:
+            return
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            place = 0
+            while place < len(content):
+                stop = _end(content, place)
+                if stop is None:
+                    found = content.find(MARK, place + 1)
+                    found = len(content) if found < 0 else found
+                    self._damaged(place, found - place)
+                    place = found
+                    continue
+                _, _, kind, number, _, count, size = HEAD.unpack_from(content, place)
+                if (wanted is None or number == wanted) and number < len(self.streams):
+                    body = content[place + HEAD.size : place + HEAD.size + size]
+                    yield self.streams[number], _body(kind, self.streams[number], count, body)
+                place = stop
+
+    def _damaged(self, offset: int, size: int) -> None:
+        last = self.damage[-1] if self.damage else None
+        if last is not None and last.offset + last.bytes == offset:
+            self.damage[-1] = Damage(last.offset, last.bytes + size)
+        else:
+            self.damage.append(Damage(offset, size))
+
+    def tallied(self) -> dict[str, Tallied]:
+        """Return what each stream had received in the end."""
+        try:
+            content = (self.folder / "tally").read_bytes()
+            return {name: Tallied(*TALLY.unpack_from(content, n * TALLY.size)) for n, name in enumerate(self.streams)}
+        except (OSError, struct.error):
+            return {}
+
+    def utc_ns(self, t_ns: Any) -> Any:
+        """Return UTC time in ns for stamps of the monotonic clock."""
+        clock = self.header["clock"]
+        return t_ns + (clock["utc_ns"] - clock["monotonic_ns"])
+
+    def remove(self) -> None:
+        """Remove the spool, whose content is sealed."""
+        for name in ("bytes", "tally", "header.json"):
+            with contextlib.suppress(FileNotFoundError):
+                (self.folder / name).unlink()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+
+def abandoned(store: Path) -> list[Path]:
+    """Return the folders of spools that no process writes any more, oldest first."""
+    found = []
+    for folder in (store / FOLDER).glob("*"):
+        try:
+            handle = os.open(folder / "bytes", os.O_RDONLY)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            found.append((os.fstat(handle).st_mtime, folder))
+        except BlockingIOError:
+            pass
+        finally:
+            os.close(handle)
+    return [folder for _, folder in sorted(found)]
+
+
+def _tally(folder: Path, streams: int) -> mmap.mmap:
+    handle = os.open(folder / "tally", os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+    try:
+        os.ftruncate(handle, max(1, streams) * TALLY.size)
+        return mmap.mmap(handle, max(1, streams) * TALLY.size)
+    finally:
+        os.close(handle)
+
+
+def _block(kind: int, stream: int, count: int, body: bytes) -> bytes:
+    rest = HEAD.pack(MARK, 0, kind, stream, 0, count, len(body))[8:]
+    return MARK + struct.pack("<I", zlib.crc32(body, zlib.crc32(rest))) + rest + body
+
+
+def _end(content: mmap.mmap, place: int) -> int | None:
+    """Return where the block at ``place`` ends, or None if there is no whole and undamaged one."""
+    if place + HEAD.size > len(content) or content[place : place + 4] != MARK:
+        return None
+    _, check, _, _, _, _, size = HEAD.unpack_from(content, place)
+    stop = place + HEAD.size + int(size)
+    if stop > len(content):
+        return None
+    with memoryview(content) as view, view[place + 8 : stop] as covered:
+        return stop if zlib.crc32(covered) == check else None
+
+
+def _body(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note:
+    if kind == NOTE:
+        told = json.loads(body)
+        return Note(told["t_ns"], stream, told["what"], told["detail"])
+    stamps = np.frombuffer(body, "<i8", count)
+    sizes = np.frombuffer(body, "<u4", count, 8 * count)
+    return Chunks(stamps.astype(np.int64), sizes.astype(np.int64), body[12 * count :])

@@ -1,0 +1,205 @@
+"""One stream at work: its link is opened, read by a thread of its own, and opened anew when it was lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from tacpipe.errors import DeviceError, TacpipeError
+from tacpipe.links import dialogue, opening
+from tacpipe.links.link import Link, LinkLostError
+from tacpipe.recording.rig import Stream
+from tacpipe.recording.spool import Note
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+
+OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
+READ_S = 0.1  # longest wait of a read, after which the thread looks whether it should end
+AGAIN_S = (0.1, 2.0)  # between two tries to open a lost link: first, and at most
+REPLY_S = 0.5  # after which a device that is asked for each frame is asked once more
+
+Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
+
+
+class Station:
+    """A stream whose link is open, or was lost and is tried again until it is back.
+
+    `take` gives what came since; nothing of it is looked at here.
+    """
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+        self.error: TacpipeError | None = None  # why the link is lost, while it is
+        self._tally: Tally | None = None
+        self._link: Link | None = None
+        self._came: deque[tuple[int, bytes]] = deque()
+        self._notes: deque[Note] = deque()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=stream.name, daemon=True)
+        self._keeping = threading.Lock()
+        self._orders: deque[Callable[[Link], None]] = deque()  # carried out by the thread, between two reads
+        self._chunks = self._bytes = self._overruns = 0
+        self._wait_s = AGAIN_S[0]
+
+    def start(self) -> None:
+        """Open the link and begin to read it. Raises `DeviceError` if that fails."""
+        self._open()
+        self._thread.start()
+
+    def take(self) -> list[Chunks | Note]:
+        """Return what came since the last call, bytes and notes in their order."""
+        with self._keeping:
+            return self._taken()
+
+    def begin(self, tally: Tally) -> list[Chunks | Note]:
+        """Return what came since the last call, and tell ``tally`` from now on how much came after that."""
+        with self._keeping:
+            found = self._taken()
+            self._chunks = self._bytes = 0
+            self._tally = tally
+            return found
+
+    def end(self) -> list[Chunks | Note]:
+        """Return what came since the last call, and tell no tally any more."""
+        with self._keeping:
+            self._tally = None
+            return self._taken()
+
+    def tare(self, timeout_s: float = 5.0) -> bool:
+        """Have the device take its present reading for zero; return False if it has no such command.
+
+        Raises `DeviceError` if the link is lost or the device does not reply.
+        """
+        sensor, name = self.stream.sensor, self.stream.name
+        if type(sensor).taring is Sensor.taring:
+            return False
+        done, failed = threading.Event(), []
+
+        def order(link: Link) -> None:
+            try:
+                self._keep(dialogue.hold(link, sensor.taring(), name))
+            except DeviceError as error:
+                failed.append(error)
+            done.set()
+
+        self._orders.append(order)
+        if not done.wait(timeout_s):
+            raise DeviceError(f"Stream {name} could not be tared: its link is lost. Wait until it is back.")
+        if failed:
+            raise failed[0]
+        return True
+
+    def stop(self) -> None:
+        """End the thread, tell the device to stop, close the link."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+        link, self._link = self._link, None
+        if link is not None:
+            try:
+                said = self.stream.sensor.closing()
+                if said:
+                    link.write(said)
+            except LinkLostError:
+                pass
+            finally:
+                link.close()
+
+    def _open(self) -> None:
+        sensor = self.stream.sensor
+        link = opening.open_link(self.stream.address, sensor, self.stream.name)
+        try:
+            early = dialogue.hold(link, sensor.opening(link.local), self.stream.name)
+        except BaseException:
+            link.close()
+            raise
+        self._overruns = link.overruns
+        self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
+        self._link, self.error = link, None
+        self._keep(early)
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            try:
+                if self._link is None:
+                    self._open()
+                self._read()
+            except DeviceError as error:
+                self._lose(error)
+
+    def _lose(self, error: TacpipeError) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+            self._notes.append(Note(time.monotonic_ns(), self.stream.name, LOST, str(error)))
+            self._wait_s = AGAIN_S[0]
+        self.error = error
+        self._ending.wait(self._wait_s)
+        self._wait_s = min(2 * self._wait_s, AGAIN_S[1])
+
+    def _read(self) -> None:
+        """Read the link until it is lost or the thread is to end."""
+        link, sensor = self._link, self.stream.sensor
+        assert link is not None
+        asked, answers = sensor.request(), type(sensor).answer is not Sensor.answer
+        if asked:
+            self._ask(link, asked)
+            return
+        while not self._ending.is_set():
+            came = link.read(READ_S)
+            self._keep(came)
+            self._obey(link)
+            if answers:
+                for _, chunk in came:
+                    said = sensor.answer(chunk)
+                    if said:
+                        link.write(said)
+            if link.overruns != self._overruns:
+                self._overran(link.overruns)
+
+    def _ask(self, link: Link, asked: bytes) -> None:
+        """Read a device that sends a frame when it is asked: at the sensor's rate, never before it replied."""
+        period_s = 1.0 / self.stream.sensor.rate_hz
+        due_s = time.monotonic()
+        while not self._ending.is_set():
+            link.write(asked)
+            self._keep(link.read(REPLY_S))
+            self._obey(link)
+            due_s = max(due_s + period_s, time.monotonic() - period_s)
+            while not self._ending.is_set() and (left_s := due_s - time.monotonic()) > 0:
+                self._keep(link.read(min(left_s, READ_S)))  # the rest of a reply that came in pieces
+
+    def _obey(self, link: Link) -> None:
+        while self._orders:
+            self._orders.popleft()(link)
+
+    def _overran(self, overruns: int) -> None:
+        self._notes.append(Note(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))
+        self._overruns = overruns
+
+    def _keep(self, came: list[tuple[int, bytes]]) -> None:
+        if not came:
+            return
+        with self._keeping:
+            self._came.extend(came)
+            if self._tally is not None:
+                self._chunks += len(came)
+                self._bytes += sum(len(data) for _, data in came)
+                self._tally(self._chunks, self._bytes, came[-1][0])
+
+    def _taken(self) -> list[Chunks | Note]:
+        found: list[Chunks | Note] = []
+        while self._notes:
+            note = self._notes.popleft()
+            found += [*_chunks(self._came, note.t_ns), note]
+        return found + _chunks(self._came, None)
+
+
+def _chunks(came: deque[tuple[int, bytes]], before_ns: int | None) -> list[Chunks]:
+    """Return what came before a moment, taken from the front of the queue."""
+    taken = []
+    while came and (before_ns is None or came[0][0] < before_ns):
+        taken.append(came.popleft())
+    return [Chunks.of(taken)] if taken else []

@@ -1,0 +1,162 @@
+"""One recording after another on an open rig: tared, started and stopped as asked, sealed, appended."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from tacpipe.errors import DeviceError
+from tacpipe.recording import appending, sealing, triggers
+from tacpipe.recording.recorder import Recorder
+from tacpipe.recording.rig import Rig
+from tacpipe.recording.spool import Spooled
+from tacpipe.recording.view import View
+from tacpipe.stage import Attribute
+from tacpipe.store import Store
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be recorded, and what starts and stops it."""
+
+    output: Path
+    name: str
+    duration_s: float | None = None
+    trials: int = 1
+    start: str = "now"
+    stop: str = "duration"
+    contact_count: float = 50.0
+    tare: bool = False
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One recording, as it was appended."""
+
+    name: str
+    seconds: float
+    rows: dict[str, int]  # stream to samples
+    lost: dict[str, int]  # stream to frames
+
+    def line(self) -> str:
+        """Return it in words."""
+        told = ", ".join(
+            f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
+            for name, rows in self.rows.items()
+        )
+        return f"{self.name}: {self.seconds:.1f} s, {told}"
+
+
+class Ended:
+    """Whether somebody asked to end: the first Ctrl-C ends a recording and keeps it, the second interrupts."""
+
+    def __init__(self) -> None:
+        self._asked = threading.Event()
+
+    def __enter__(self) -> Ended:
+        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        """Return whether somebody did."""
+        return self._asked.is_set()
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self._asked.is_set():
+            raise KeyboardInterrupt
+        self._asked.set()
+
+
+def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> list[Recorded]:
+    """Record what ``plan`` asks for and return what was recorded; ``ended`` cuts it short.
+
+    Raises `DeviceError`, after what came was sealed, if a stream was lost and is not back.
+    """
+    recorded = []
+    with triggers.keys() as pressed:
+        for trial in range(plan.trials):
+            if plan.tare:
+                recorder.tare()
+            starts, stops = _triggers(recorder, plan, pressed)
+            _await(recorder, starts, ended, view, f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}")
+            if ended():
+                break
+            recorded.append(_record(recorder, store, plan, trial, stops, view, ended))
+            lost = recorder.lost()
+            if lost:
+                raise DeviceError(
+                    f"{recorded[-1].line()}\nThis was recorded and kept, but lost on the way and not back: {'; '.join(lost)}"
+                )
+            if ended():
+                break
+    return recorded
+
+
+def _await(recorder: Recorder, starts: triggers.Trigger, ended: Ended, view: View, waiting: str) -> None:
+    recorder.run(lambda: ended() or starts(), lambda: view.show(waiting))
+
+
+def recover(store: Store, folder: Path) -> Recorded:
+    """Seal what an abandoned spool holds and append it to the dataset that it was recorded for."""
+    from tacpipe.recording import rig as rig_of
+
+    spooled = Spooled(folder)
+    rig = rig_of.parse(spooled.header["rig"], f"the rig file in {folder}")
+    return _sealed(store, Path(spooled.header["output"]), spooled, rig)
+
+
+def _record(
+    recorder: Recorder, store: Store, plan: Plan, trial: int, stops: triggers.Trigger, view: View, ended: Ended
+) -> Recorded:
+    name = plan.name if plan.trials == 1 else f"{plan.name}-{trial + 1:03d}"
+    attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
+    header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
+    began_s = time.monotonic()
+
+    def over() -> bool:
+        late = plan.duration_s is not None and time.monotonic() - began_s >= plan.duration_s
+        return ended() or late or stops()
+
+    with recorder.recording(store.root, header, preroll=plan.start != "now") as spool:
+        recorder.run(over, lambda: view.show(f"recording {name}, {time.monotonic() - began_s:.0f} s"))
+    view.show(f"sealing {name}")
+    return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig)
+
+
+def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
+    sealed = sealing.seal(spooled, rig)
+    try:
+        name = appending.append(store, output, spooled, rig, sealed)
+    except appending.NothingError:
+        spooled.remove()
+        raise
+    spooled.remove()
+    rows = {stream: one.table.num_rows for stream, one in sealed.items()}
+    stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
+    first, last = (min(times[0].as_py() for times in stamps), max(times[-1].as_py() for times in stamps))
+    return Recorded(name, (last - first) / 1e9, rows, {stream: one.lost for stream, one in sealed.items()})
+
+
+def _triggers(recorder: Recorder, plan: Plan, pressed: triggers.Trigger) -> tuple[triggers.Trigger, triggers.Trigger]:
+    """Return what starts the next trial, and what stops it beside its duration."""
+    asked = {plan.start, plan.stop}
+    contact = triggers.Contact(recorder.watches, plan.contact_count) if "contact" in asked else None
+    tap: Any = triggers.Tap(recorder.watches) if "tap" in asked else None
+    starts = {"now": lambda: True, "key": pressed}
+    stops = {"duration": lambda: False, "key": pressed}
+    if contact is not None:
+        starts["contact"], stops["contact"] = contact.touched, contact.released
+    if tap is not None:
+        starts["tap"], stops["tap"] = (lambda: tap.said("start")), (lambda: tap.said("stop"))
+    return starts[plan.start], stops[plan.stop]

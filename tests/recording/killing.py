@@ -1,0 +1,141 @@
+"""A recording whose process is killed, and what `acquire --recover` makes of what it left behind.
+
+    python -m tests.recording.killing [--kills 100]
+
+kills as many recordings of an emulated rig at random moments and prints what that cost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import tacpipe
+from tacpipe.recording import rig as rig_of
+from tacpipe.simulation.emulation import rig_file
+from tacpipe.simulation.emulation.emulate_command import SWITCH_S
+from tacpipe.simulation.emulation.emulator import Emulator
+
+BIN = Path(sys.executable).parent
+RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"
+NOT_CHANNELS = ("t_ns", "t_device_ns", "seq", "device_seq")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a kill cost one stream."""
+
+    stream: str
+    recovered: int  # samples
+    lost_s: float  # between the last recovered sample and the kill, of a recording that was still running
+    unread: int  # frames sent before the kill of which neither a sample nor the count of lost reads tells
+    told: int  # reads that the recording says were never written
+
+
+@contextmanager
+def emulated(folder: Path) -> Iterator[Emulator]:
+    """Serve the rig of the first paper, its rig file with addresses in ``folder``."""
+    with Emulator(rig_of.read(RIG), folder=folder / "emulated") as emulator:
+        (folder / "rig.toml").write_text(rig_file.text(emulator.rig))
+        yield emulator
+
+
+def kill(emulator: Emulator, folder: Path, after_s: float, duration_s: float) -> list[Cost] | None:
+    """Kill a recording ``after_s`` seconds after its start, recover it, compare; None if it had not begun or had ended."""
+    environment = {**os.environ, "TACPIPE_STORE": str(folder / "store")}
+    output = folder / "rec"
+    before = set(names(output))
+    words = ["acquire", str(folder / "rig.toml"), "-o", str(output), "--duration", str(duration_s), "--quiet"]
+    process = subprocess.Popen([str(BIN / "tacpipe"), *words], env=environment, stdout=subprocess.DEVNULL)
+    time.sleep(after_s)
+    process.send_signal(signal.SIGKILL)
+    killed_ns = time.monotonic_ns()
+    process.wait()
+    spooled = [path for path in (folder / "store/spool").glob("*") if (path / "bytes").stat().st_size]
+    recover = [str(BIN / "tacpipe"), "acquire", "--recover", "--quiet", "--json"]
+    told: dict[str, Any] = json.loads(subprocess.run(recover, env=environment, capture_output=True, check=True).stdout)
+    assert not list((folder / "store/spool").glob("*/header.json")), "a spool was left"
+    new = sorted(set(names(output)) - before)
+    assert len(new) <= 1, "one recording became two"
+    assert len(new) == 1 or not spooled, "a recording was lost"
+    if not new or not told["recordings"]:
+        return None
+    os.environ["TACPIPE_STORE"] = str(folder / "store")
+    shard = tacpipe.open(output).shards[new[0]]
+    whole = float(told["recordings"][0]["seconds"]) > duration_s - 0.2  # it was being sealed
+    return [_cost(emulator, shard, name, killed_ns, whole=whole) for name in shard.streams if name != "events"]
+
+
+def names(output: Path) -> list[str]:
+    """Return the recordings of a dataset, none where there is none yet."""
+    return list(tacpipe.open(output).shards) if (output / "manifest.json").exists() else []
+
+
+def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, whole: bool) -> Cost:
+    """Compare a recovered stream with the ledger, sample by sample."""
+    table, ledger = shard.table(name), emulator.ledger[name]
+    rows = ledger.whole
+    sent_ns = ledger.column("sent_ns")[rows]
+    sent = ledger.samples(rows[sent_ns > killed_ns - 20_000_000_000])
+    sent_ns = sent_ns[sent_ns > killed_ns - 20_000_000_000]
+    counts = table.column("seq").to_numpy()
+    assert sent.seq is not None
+    values = [column for block in sent.values for column in block.T]
+    recorded = [table.column(column).to_numpy() for column in table.column_names if column not in NOT_CHANNELS]
+    for start in np.flatnonzero(sent.seq == counts[0]):
+        stop = start + len(counts)
+        if all(np.array_equal(a, b[start:stop], equal_nan=True) for a, b in zip(recorded, values, strict=True)):
+            break
+    else:
+        raise AssertionError(f"{name}: what was recovered is not what was sent")
+    missed = int((sent_ns[stop:] < killed_ns).sum())
+    lost_reads = int(shard.attributes.get(f"{name}_crash_lost_reads", 0))
+    lost_bytes = int(shard.attributes.get(f"{name}_crash_lost_bytes", 0))
+    frame = len(ledger.frames(rows[-1:])[0])
+    told = lost_bytes // frame if emulator.rig.streams[name].address.scheme == "serial" else lost_reads
+    lost_s = 0.0 if whole else (killed_ns - int(sent_ns[stop - 1])) / 1e9
+    return Cost(name, len(counts), lost_s, 0 if whole else missed - told, told)
+
+
+def main() -> None:
+    """Kill, recover, compare, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    sys.setswitchinterval(SWITCH_S)
+    rng = random.Random(chosen.seed)
+    costs: list[Cost] = []
+    nothing = 0
+    with tempfile.TemporaryDirectory(prefix="tacpipe-kill-") as name, emulated(Path(name)) as emulator:
+        for number in range(chosen.kills):
+            found = kill(emulator, Path(name), rng.uniform(0.8, 4.5), 3.0)
+            nothing += found is None
+            costs += found or []
+            print(f"{number + 1}: {found}", file=sys.stderr, flush=True)
+    print(f"{chosen.kills} kills; {nothing} before the first byte or after the end; every recovered sample is equal")
+    recovered, told = sum(cost.recovered for cost in costs), sum(cost.told for cost in costs)
+    print(f"samples recovered: {recovered:,}; reads told as lost: {told:,}")
+    print(f"lost at most {max(cost.lost_s for cost in costs):.3f} s")
+    print("sent before the kill, neither recovered nor told:")
+    for stream in sorted({cost.stream for cost in costs}):
+        of_it = [cost.unread for cost in costs if cost.stream == stream]
+        print(f"  {stream}: {min(of_it)} to {max(of_it)} frames")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""A spool gives back what was appended, up to where a crash or a disk tore it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tacpipe.errors import TacpipeError
+from tacpipe.recording import spool
+from tacpipe.recording.spool import Note, Spool, Spooled
+from tacpipe.sensors.framing import Chunks
+
+STREAMS = ["a", "b"]
+HEADER = {"output": "o", "recording": "r", "attributes": {}, "rig": ""}
+
+
+def pairs(blocks: list[tuple[str, Chunks | Note]]) -> list[tuple[str, int, bytes]]:
+    """Return stream, arrival and bytes of every chunk."""
+    return [
+        (name, t_ns, packet)
+        for name, block in blocks
+        if isinstance(block, Chunks)
+        for t_ns, packet in zip(block.t_ns.tolist(), block.packets(), strict=True)
+    ]
+
+
+def written(folder: Path, blocks: int = 20) -> tuple[Path, list[tuple[str, int, bytes]]]:
+    made = Spool(folder, HEADER, STREAMS)
+    rng = np.random.default_rng(0)
+    expected = []
+    for number in range(blocks):
+        name = STREAMS[number % 2]
+        chunks = [(number * 10 + k, rng.bytes(int(rng.integers(0, 40)))) for k in range(3)]
+        made.append(name, Chunks.of(chunks))
+        made.write()
+        expected += [(name, t_ns, data) for t_ns, data in chunks]
+    made.close()
+    return made.folder, expected
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+@given(
+    parts=st.lists(
+        st.tuples(
+            st.sampled_from(STREAMS), st.lists(st.tuples(st.integers(0, 2**62), st.binary(max_size=50)), max_size=5)
+        ),
+        max_size=8,
+    )
+)
+def test_what_was_appended_is_read_in_its_order(
+    tmp_path: Path, parts: list[tuple[str, list[tuple[int, bytes]]]]
+) -> None:
+    made = Spool(tmp_path, HEADER, STREAMS)
+    for name, chunks in parts:
+        made.append(name, Chunks.of(chunks))
+    made.note(Note(7, "b", "lost", "unplugged"))
+    made.close()
+
+    read = list(Spooled(made.folder).blocks())
+
+    assert pairs(read) == [(name, t_ns, data) for name, chunks in parts for t_ns, data in chunks]
+    assert read[-1] == ("b", Note(7, "b", "lost", "unplugged"))
+
+
+def test_a_torn_end_costs_the_block_that_is_torn(tmp_path: Path) -> None:
+    folder, expected = written(tmp_path)
+    file = folder / "bytes"
+    whole = file.read_bytes()
+    rng = np.random.default_rng(1)
+    for cut in rng.integers(1, len(whole), 50).tolist():
+        file.write_bytes(whole[:cut])
+        read = Spooled(folder)
+        found = pairs(list(read.blocks()))
+        torn = sum(one.bytes for one in read.damage)
+
+        assert found == expected[: len(found)] and len(found) % 3 == 0
+        assert torn < 200  # less than one block here
+
+
+def test_a_flipped_bit_costs_its_block_and_no_other(tmp_path: Path) -> None:
+    folder, expected = written(tmp_path)
+    file = folder / "bytes"
+    whole = file.read_bytes()
+    rng = np.random.default_rng(2)
+    for place in rng.integers(0, len(whole), 100).tolist():
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        file.write_bytes(flipped)
+        read = Spooled(folder)
+        found = pairs(list(read.blocks()))
+
+        assert set(found) < set(expected) and len(found) == len(expected) - 3
+        assert len(read.damage) == 1
+
+
+def test_zeros_that_a_loss_of_power_left_are_passed_over(tmp_path: Path) -> None:
+    folder, expected = written(tmp_path)
+    file = folder / "bytes"
+    file.write_bytes(file.read_bytes() + bytes(4096))
+
+    read = Spooled(folder)
+
+    assert pairs(list(read.blocks())) == expected
+    assert [one.bytes for one in read.damage] == [4096]
+
+
+def test_one_stream_is_read_alone(tmp_path: Path) -> None:
+    folder, expected = written(tmp_path)
+
+    assert pairs(list(Spooled(folder).blocks("b"))) == [row for row in expected if row[0] == "b"]
+
+
+def test_a_spool_that_is_written_is_not_abandoned_and_one_of_a_killed_process_is(tmp_path: Path) -> None:
+    made = Spool(tmp_path, HEADER, STREAMS)
+    assert spool.abandoned(tmp_path) == []
+    made.close()
+    assert spool.abandoned(tmp_path) == [made.folder]
+    program = f"""
+import time
+from pathlib import Path
+from tacpipe.recording.spool import Spool
+from tacpipe.sensors.framing import Chunks
+made = Spool(Path({str(tmp_path)!r}), {HEADER!r}, ["a"])
+made.tally(0, 7, 70, 123)
+made.append("a", Chunks.of([(1, b"one"), (2, b"two")]))
+made.write()
+made.append("a", Chunks.of([(3, b"three")]))
+print("ready", flush=True)
+time.sleep(60)
+"""
+    child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    child.stdout.readline()
+    assert len(spool.abandoned(tmp_path)) == 1
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+
+    folder = next(path for path in spool.abandoned(tmp_path) if path != made.folder)
+    read = Spooled(folder)
+
+    assert pairs(list(read.blocks())) == [("a", 1, b"one"), ("a", 2, b"two")]
+    assert read.tallied() == {"a": spool.Tallied(7, 70, 123)}
+
+
+def test_a_spool_without_a_header_is_refused_with_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "bytes").touch()
+    with pytest.raises(TacpipeError, match="no header"):
+        Spooled(tmp_path)
+
+
+def test_stamps_are_mapped_to_utc_by_one_reading_of_both_clocks(tmp_path: Path) -> None:
+    before_ns = time.time_ns()
+    made = Spool(tmp_path, HEADER, STREAMS)
+    stamp_ns = time.monotonic_ns()
+    after_ns = time.time_ns()
+    made.close()
+
+    assert before_ns - 1_000_000 <= Spooled(made.folder).utc_ns(stamp_ns) <= after_ns + 1_000_000
