@@ -3,11 +3,13 @@
 Ours is the framer and `decode`; the vendors' are fed through an object in place of the serial port, and called as their
 users call them. In bulk we get all bytes at once, as when a recording is sealed; live, in pieces of a tenth of a second at
 the product's own rate, where most of the time goes into each piece and not into its frames. Both must give the same numbers.
+XELA has no parser beside its server: there it is a loop over `json.loads` and the counts, as one would write it.
 """
 
 from __future__ import annotations
 
 import functools
+import json
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,18 +26,22 @@ from paxini_sdk import protocol
 from paxini_sdk.boards.high_speed import AutoPushConfig, AutoPushFrame
 from paxini_sdk.transport import SerialTransport
 from pyrobotiqtactile.protocol import PacketParser
+from RSIPI.xml_handler import FastXMLParser
 from tactile_sdk.protocol.modbus_rtu import ModbusRTU
 
+from tacpipe.sensors import anyskin, kuka_rsi, xela
 from tacpipe.sensors.anyskin import AnySkin
 from tacpipe.sensors.flexitac import FlexiTac
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.generic import Generic
+from tacpipe.sensors.kuka_rsi import KukaRsi
 from tacpipe.sensors.layout import Number, Sequence, Sum
 from tacpipe.sensors.modbus_tactile import ModbusTactile
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.paxini import SLOTS, Paxini
 from tacpipe.sensors.robotiq import Robotiq
 from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.xela import Xela
 
 FRAMES, PIECE_S, BAR = 2000, 0.1, 10.0
 Table = NDArray[Any]  # (frame, number)
@@ -96,16 +102,35 @@ class Contest:
     vendor: Callable[[bytes, int], Table]  # of all bytes and how many come in a piece
     ours: Callable[[Samples], Table]  # the numbers of samples as the vendor gives them
 
+    packets: bool = False  # a link gives the frames one by one
+    forget: Callable[[], object] = dict  # what the driver keeps of texts, so that each round reads them anew
+
     @functools.cached_property
     def data(self) -> bytes:
         """The bytes of all frames."""
         return b"".join(bytes(frame) for frame in self.frames)
 
-    def read(self, size: int) -> Table:
-        """Return what our driver makes of the bytes in pieces of ``size``."""
-        framer, data, found = self.sensor.framer(), self.data, []
-        for place in range(0, len(data), size):
-            runs, _ = framer.feed(Chunks.of([(place, data[place : place + size])]))
+    @property
+    def live(self) -> int:
+        """How many frames come in a piece."""
+        return max(1, int(self.sensor.rate_hz * PIECE_S))
+
+    def given(self, count: int) -> Iterator[Chunks]:
+        """Yield what a link gives of so many frames at a time."""
+        if self.packets:
+            for start in range(0, FRAMES, count):
+                yield Chunks.of(enumerate(self.frames[start : start + count]))
+            return
+        size = int(len(self.data) / FRAMES * count)
+        for place in range(0, len(self.data), size):
+            yield Chunks.of([(place, self.data[place : place + size])])
+
+    def read(self, count: int) -> Table:
+        """Return what our driver makes of the bytes of so many frames at a time."""
+        self.forget()
+        framer, found = self.sensor.framer(), []
+        for chunks in self.given(count):
+            runs, _ = framer.feed(chunks)
             found += [self.sensor.decode(run.frames) for run in runs]
         runs, _ = framer.flush()
         found += [self.sensor.decode(run.frames) for run in runs]
@@ -119,29 +144,29 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
 
 
 def _measure(contest: Contest, rounds: int) -> Iterator[timing.Line]:
-    data = contest.data
-    live = max(1, int(len(data) / FRAMES * contest.sensor.rate_hz * PIECE_S))
-    theirs = contest.vendor(data, live)
-    for size in (len(data), live):
-        ours = contest.read(size)
+    data, live = contest.data, contest.live
+    size = int(len(data) / FRAMES * live)
+    theirs = contest.vendor(data, size)
+    for count in (FRAMES, live):
+        ours = contest.read(count)
         lost = len(theirs) - len(ours)
         first = int(contest.name in HEADLESS)
         assert 0 <= lost <= 1 and np.array_equal(ours, theirs[first : first + len(ours)]), contest.name
     times = timing.interleaved(
         {
-            "bulk": lambda: contest.read(len(data)),
+            "bulk": lambda: contest.read(FRAMES),
             "live": lambda: contest.read(live),
-            "vendor": lambda: contest.vendor(data, live),
+            "vendor": lambda: contest.vendor(data, size),
         },
         rounds,
     )
     for name in ("bulk", "live"):
         found = timing.ratio(times, "vendor", name)
-        bar = BAR if name == "bulk" and contest.name not in TEXT else None
+        bar = BAR if name == "bulk" and contest.name not in UNPARSED else None
         yield timing.Line(
-            f"{contest.name}, {'in bulk' if name == 'bulk' else f'{live} bytes at a time'}",
+            f"{contest.name}, {'in bulk' if name == 'bulk' else f'{live} frames at a time'}",
             _rate(timing.median(times, name)),
-            f"vendor: {_rate(timing.median(times, 'vendor'))}",
+            f"{'json' if contest.name in UNPARSED else 'vendor'}: {_rate(timing.median(times, 'vendor'))}",
             f"{found:.1f} times as fast",
             "" if bar is None else f"{bar:g} times as fast",
             None if bar is None else found >= bar,
@@ -152,7 +177,7 @@ def _rate(seconds: float) -> str:
     return f"{FRAMES / seconds:,.0f} frames/s"
 
 
-TEXT = ("anyskin, ASCII",)  # of which Python reads number by number, as the vendor does
+UNPARSED = ("xela",)  # without a vendor's parser
 HEADLESS = ("anyskin", "anyskin, ASCII")  # the first frame is lost: where it begins is known behind an end alone
 
 
@@ -160,7 +185,7 @@ def contests() -> list[Contest]:
     """Return what is measured, each with frames of random numbers."""
     rng = np.random.default_rng(0)
     made = [_flexitac(rng), _anyskin(rng, "binary"), _anyskin(rng, "ascii"), _optoforce(rng), _described(rng)]
-    return [*made, _paxini(rng), _robotiq(rng), _modbus(rng)]
+    return [*made, _paxini(rng), _robotiq(rng), _modbus(rng), _kuka(rng), _xela(rng)]
 
 
 def _flexitac(rng: np.random.Generator) -> Contest:
@@ -184,7 +209,8 @@ def _anyskin(rng: np.random.Generator, mode: Any) -> Contest:
         return np.stack([client.get_sample()[1] for _ in range(FRAMES)]).astype(np.float32)
 
     name = "anyskin" if mode == "binary" else "anyskin, ASCII"
-    return Contest(name, sensor, sensor.encode(Samples((numbers,))), vendor, lambda samples: samples.values[0])
+    frames = sensor.encode(Samples((numbers,)))
+    return Contest(name, sensor, frames, vendor, lambda samples: samples.values[0], forget=anyskin._table.cache_clear)
 
 
 def _daq(rng: np.random.Generator) -> tuple[OptoForce, Samples, Callable[[bytes, int], Table]]:
@@ -285,3 +311,40 @@ def _modbus(rng: np.random.Generator) -> Contest:
     return Contest(
         "modbus-tactile", sensor, sensor.encode(Samples((taxels,))), vendor, lambda samples: samples.values[0]
     )
+
+
+def _kuka(rng: np.random.Generator) -> Contest:
+    sensor = KukaRsi()
+    still = np.broadcast_to(np.array([0.0, 0, 0, 1]), (FRAMES, 4))
+    joints_rad = rng.uniform(-3, 3, (FRAMES, 6))
+    poses = np.hstack([rng.uniform(-2, 2, (FRAMES, 3)), still])
+    frames = sensor.encode(Samples((poses, joints_rad), seq=4 * np.arange(FRAMES)))
+
+    def vendor(data: bytes, size: int) -> Table:
+        blank: dict[str, Any] = {
+            "RIst": dict.fromkeys("XYZABC", 0.0),
+            "AIPos": {f"A{n}": 0.0 for n in range(1, 7)},
+            "IPOC": 0,
+        }
+        parser, told, found = FastXMLParser(blank), dict(blank), []
+        for frame in frames:
+            parser.parse(frame.decode(), told)
+            found.append([*told["AIPos"].values()])
+        return np.radians(found)
+
+    forget = kuka_rsi._table.cache_clear
+    return Contest("kuka-rsi", sensor, frames, vendor, lambda samples: samples.values[1], packets=True, forget=forget)
+
+
+def _xela(rng: np.random.Generator) -> Contest:
+    sensor = Xela()
+    counts = rng.integers(0, 1 << 16, (FRAMES, 48)).astype(np.uint16)
+    t_ns = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(FRAMES)
+    frames = sensor.encode(Samples((counts,), seq=np.arange(FRAMES), t_device_ns=t_ns))
+
+    def loop(data: bytes, size: int) -> Table:
+        readings = [json.loads(frame)["1"]["data"] for frame in frames]
+        return np.array([[int(count, 16) for count in reading.split(",")] for reading in readings], dtype=np.uint16)
+
+    forget = xela._parsed.cache_clear
+    return Contest("xela", sensor, frames, loop, lambda samples: samples.values[0], packets=True, forget=forget)

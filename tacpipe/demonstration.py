@@ -81,7 +81,7 @@ def rig(output: Path) -> list[list[str]]:
     names = ("recordings", "synced", "segments", "split", "model", "results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["split"]]
-    live = ["--trials", str(LIVE_TRIALS), "--duration", str(LIVE_S / LIVE_TRIALS), "--label", "simulated=true"]
+    live = ["--trials", str(LIVE_TRIALS), "--duration", str(LIVE_S / LIVE_TRIALS)]
     return [
         ["acquire", str(output / EMULATED / "rig.toml"), "-o", place["recordings"], *live],
         ["show", place["recordings"]],

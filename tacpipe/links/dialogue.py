@@ -12,10 +12,19 @@ from tacpipe.sensors.sensor import Ask, Dialogue
 SHOWN = 16  # bytes of what came instead of a reply
 
 
+class NoReplyError(DeviceError):
+    """No reply came in time: ``awaited`` says which and for how long, ``heard`` holds what came instead."""
+
+    def __init__(self, ask: Ask, heard: Arrived, stream: str) -> None:
+        super().__init__(_silent(ask, heard, stream))
+        self.awaited = f"{ask.what} was awaited for {ask.timeout_s:g} s"
+        self.heard = heard
+
+
 def hold(link: Link, dialogue: Dialogue, stream: str) -> Arrived:
     """Carry out a dialogue; return what came that was no reply as (arrival, bytes), so that no sample is lost.
 
-    What is behind a reply counts for the next question only if nothing is sent for it. Raises `DeviceError` where no reply
+    What is behind a reply counts for the next question only if nothing is sent for it. Raises `NoReplyError` where no reply
     comes in time, and what a question raises for a reply that means no.
     """
     other: Arrived = []
@@ -48,7 +57,7 @@ def _reply(link: Link, ask: Ask, since: Arrived, stream: str) -> tuple[bytes, Ar
         seen = len(since)
         left_s = until - time.monotonic()
         if left_s <= 0:
-            raise DeviceError(_silent(ask, since, stream))
+            raise NoReplyError(ask, since, stream)
         since += link.read(left_s)
 
 

@@ -63,9 +63,9 @@ class Opened:
         """How many packets this computer dropped: 0 where it does not tell."""
         return 0
 
-    def lost(self, why: str) -> LinkLostError:
+    def lost(self, why: str, check: str = "its cable and its power") -> LinkLostError:
         """Return the error that says that the device is gone."""
-        return LinkLostError(f"{self.name} is lost: {why}. Check its cable and its power.")
+        return LinkLostError(f"{self.name} is lost: {why}. Check {check}.")
 
     def _refuse_closed(self) -> None:
         if self._closed:

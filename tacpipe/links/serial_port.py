@@ -54,7 +54,7 @@ def refused(error: OSError, place: str, name: str) -> DeviceError:
         return DeviceError(f"{name}: you may not open {place}; {_right(place)}.")
     if error.errno in (errno.EBUSY, errno.EAGAIN):
         return _busy(place, holders.of_file(place), name)
-    if error.errno in (errno.ENOTTY, errno.EINVAL):
+    if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
         return DeviceError(f"{name}: {place} is no serial port; {ports.listed(ports.serial_ports())}.")
     return DeviceError(f"{name}: {place} cannot be opened: {error.strerror or error}. Unplug it and plug it in again.")
 

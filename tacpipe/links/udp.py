@@ -112,9 +112,11 @@ class UdpLink(Descriptor):
             except BlockingIOError:
                 return found
             except OSError as error:
-                refused = isinstance(error, ConnectionRefusedError)
-                why = "the host is there, but refuses the port" if refused else error.strerror or str(error)
-                raise self.lost(why) from error
+                if isinstance(error, ConnectionRefusedError):
+                    raise self.lost(
+                        "the host is there, but refuses the port", "the port, and that it streams"
+                    ) from error
+                raise self.lost(error.strerror or str(error)) from error
             found.append((self._arrival(told), data))
             self._sender = sender
 

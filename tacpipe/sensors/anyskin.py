@@ -8,6 +8,8 @@ Source: the packages anyskin 1.0.0 and reskin_sensor 2.0.2 (MIT).
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -15,9 +17,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.sensors import options, taxels
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing, LineFramer
+from tacpipe.sensors import number_texts, options, taxels
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
+from tacpipe.sensors.text_framer import LineFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -60,7 +64,7 @@ class AnySkin(Sensor):
     def framer(self) -> Framer:
         """Return a framer of frames of one size with their end, or of lines with as many numbers."""
         if self.mode == "ascii":
-            return LineFramer(self._is_line)
+            return LineFramer(self._is_line, every=self._are_lines)
         size = 4 * CHANNELS * self.magnetometers + len(TAIL)
         return ByteFramer(Framing(tail=TAIL, size=size, check=_can_be_read, lock=3, weak=True))
 
@@ -73,10 +77,18 @@ class AnySkin(Sensor):
             return False
         return isfinite(sum(numbers)) and min(numbers) >= -MOST and max(numbers) <= MOST
 
+    def _are_lines(self, lines: Sequence[bytes]) -> bool:
+        numbers = _table(tuple(lines), CHANNELS * self.magnetometers)
+        return numbers is not None and bool((np.abs(numbers) <= MOST).all())
+
     def decode(self, frames: Frames) -> Samples:
         """Return temperature and flux (frame, channel)."""
         if self.mode == "ascii":
-            return Samples((_numbers(b" ".join(frames)).reshape(-1, CHANNELS * self.magnetometers),))
+            wide = CHANNELS * self.magnetometers
+            numbers = _table(tuple(frames), wide)
+            if numbers is None:
+                numbers = np.array(list(map(float, b" ".join(frames).split())), dtype=np.float64).reshape(-1, wide)
+            return Samples((numbers.astype(np.float32),))
         return Samples((_floats(frames),))
 
     def encode(self, samples: Samples) -> Frames:
@@ -95,8 +107,9 @@ def _floats(frames: Bytes) -> NDArray[np.float32]:
     return floats
 
 
-def _numbers(text: bytes) -> NDArray[np.float32]:
-    return np.array(list(map(float, text.split())), dtype=np.float64).astype(np.float32)
+@functools.lru_cache(maxsize=4)  # kept between the framer's look at them and their decoding
+def _table(lines: tuple[bytes, ...], width: int) -> NDArray[np.float64] | None:
+    return number_texts.of_lines(lines, width)
 
 
 def _can_be_read(frames: Bytes) -> NDArray[np.bool_]:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Bytes, Framer, PacketFramer
+from tacpipe.sensors.framing import Bytes, Framer
+from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:

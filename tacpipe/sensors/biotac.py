@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
 from tacpipe.formats.channels import ELECTRODES, VIBRATIONS, biotac_fields
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Samples, Sensor
 
 if TYPE_CHECKING:

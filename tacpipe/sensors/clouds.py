@@ -20,8 +20,9 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.depth_frame import MAGIC, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats import pcd, ply
-from tacpipe.sensors.framing import Framer, TextFramer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

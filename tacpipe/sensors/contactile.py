@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.formats.channels import AXES
 from tacpipe.sensors import pts
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 from tacpipe.sensors.stale import FreshFramer
 

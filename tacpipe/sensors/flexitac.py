@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from tacpipe.sensors import options, taxels
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Line, Samples, Sensor
 
 if TYPE_CHECKING:

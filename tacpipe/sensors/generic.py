@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, options, taxels
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing, PacketFramer
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.layout import Clock, Length, Number, Order, Place, Sequence, Sum
+from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -72,6 +74,10 @@ class Generic(Sensor):
             raise UsageError("generic: no number is a channel; list in numbers what the board measures.")
         self._check_names()
         self._check_roles()
+        place = self._places[self.clock.number] if self.clock is not None else None
+        if self.clock is not None and place is not None and place.kind.kind in "ui" and place.width < 8:
+            wrap_ns = place.range * layout.UNITS_NS[self.clock.unit]  # as a u32 of microseconds after 71.6 minutes
+            object.__setattr__(self, "device_wrap_ns", wrap_ns)
 
     def _check_names(self) -> None:
         names = [name for place in self._channels for name, _ in _names(place.number)]

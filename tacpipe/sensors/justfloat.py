@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
 from tacpipe.sensors import options, taxels
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Line, Samples, Sensor
 
 if TYPE_CHECKING:

@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Framer, TextFramer
+from tacpipe.sensors import number_texts
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Device, Samples, Sensor
+from tacpipe.sensors.text_framer import TextFramer
 from tacpipe.signals import rotations
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ POSES, ANGLES = ("RIst", "RSol"), ("AIPos", "ASPos")
 OTHER = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)?")  # an element, or an attribute of one
 TRUTH = {"true": "1", "false": "0"}
 AT_HAND = 1024  # texts whose numbers are kept between the framer's look at them and their decoding
+BATCHES_AT_HAND = 4  # likewise, of texts that were looked at together
 IPOC = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
 
 
@@ -89,12 +92,17 @@ class KukaRsi(Sensor):
 
     def framer(self) -> Framer:
         """Return a framer that takes whole texts with an IPOC and every output."""
-        return TextFramer(lambda packet: _numbers(self.outputs, packet) is not None)
+        return TextFramer(
+            lambda packet: _numbers(self.outputs, packet) is not None,
+            every=lambda packets: _table(self.outputs, tuple(packets)) is not None,
+        )
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return the outputs, with the controller's clock for counter and time."""
-        numbers = [_numbers(self.outputs, frame) or () for frame in frames]
-        table = np.array(numbers, dtype=np.float64).reshape(len(frames), 1 + sum(map(_width, self.outputs)))
+        table = _table(self.outputs, tuple(frames))
+        if table is None:
+            numbers = [_numbers(self.outputs, frame) or () for frame in frames]
+            table = np.array(numbers, dtype=np.float64).reshape(len(frames), 1 + sum(map(_width, self.outputs)))
         blocks, place = [], 1
         for name in self.outputs:
             blocks.append(_columns(name, table[:, place : place + _width(name)]))
@@ -133,6 +141,37 @@ def _numbers(outputs: tuple[str, ...], packet: bytes) -> tuple[float, ...] | Non
         return None
     whole = len(numbers) == 1 + sum(map(_width, outputs)) and 0 <= ipoc < 1 << 32
     return tuple(numbers) if root.tag == "Rob" and whole and all(map(math.isfinite, numbers)) else None
+
+
+@functools.lru_cache(maxsize=BATCHES_AT_HAND)
+def _table(outputs: tuple[str, ...], packets: tuple[bytes, ...]) -> Floats | None:
+    """Return IPOC and the numbers of the outputs (packet, number); None where packets differ in more than their numbers."""
+    known = _pattern(outputs, number_texts.numbered(packets[0])) if packets else None
+    if known is None:
+        return None
+    pattern, columns = known
+    written = pattern.written(packets)
+    numbers = None if written is None else number_texts.floats(written)
+    if written is None or numbers is None or not np.isfinite(numbers).all():
+        return None
+    wide = len(pattern.before)
+    clock = number_texts.wholes(number_texts.taken(written, range(columns[0], len(written), wide)))
+    if clock is None or clock.min() < 0 or clock.max() >= 1 << 32:
+        return None
+    table = numbers.reshape(len(packets), wide)[:, columns]
+    table.flags.writeable = False  # it is kept
+    return table
+
+
+@functools.lru_cache(maxsize=BATCHES_AT_HAND)
+def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Pattern, NDArray[np.intp]] | None:
+    """Return the pattern of a text in which each number stands for itself, and which ones are IPOC and the outputs."""
+    pattern, told = number_texts.pattern(text), _numbers(outputs, text)
+    if pattern is None or told is None:
+        return None
+    columns = np.array(told) - number_texts.FIRST
+    known = (columns >= 0) & (columns < len(pattern.before))
+    return (pattern, columns.astype(np.intp)) if known.all() else None
 
 
 def _width(name: str) -> int:

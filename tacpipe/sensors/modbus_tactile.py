@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import DeviceError
 from tacpipe.sensors import options, taxels
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_modbus
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import options, taxels
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import lrc
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.paxini_board import (
     ACTIVE,
     CALIBRATE_FUNCTION,

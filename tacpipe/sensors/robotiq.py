@@ -11,14 +11,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
 from tacpipe.sensors import options, taxels
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -42,7 +43,20 @@ PARTS = {code: part for part, (code, _, _) in KINDS.items()}
 TYPES = (np.dtype(">u2"), np.dtype(">i2"), np.dtype(">u8"))  # of the blocks of a sample
 SIGNED = ("dynamic", "acceleration", "angular_velocity", "magnetic_field", "temperature")
 KNOWN = np.isin(np.arange(256), (*DATA, VERSION))  # which commands a packet from the device may have
-Layout = dict[tuple[int, int], int]  # kind and finger to the place of the first number in a frame
+Key = tuple[int, int]  # kind and finger of a field
+Layout = tuple[tuple[Key, int], ...]  # the fields of a frame, with the place of the first number of each
+Columns = tuple[NDArray[np.intp], ...]  # the bytes of a frame that are the numbers of each block
+
+
+class Structure(NamedTuple):
+    """What frames of one size must have in common to have the same fields."""
+
+    places: NDArray[np.intp]  # of the command and of the kinds
+    values: Bytes  # in these places
+    layout: Layout | None  # None: such frames are not made of known fields
+
+
+_latest: dict[int, Structure] = {}  # of each size, the one met last, which is the next one's as a rule
 
 
 @dataclass(frozen=True)
@@ -103,17 +117,19 @@ class Robotiq(Sensor):
         """Return the numbers of those frames that hold all ``parts`` of all ``fingers``."""
         rows, blocks = [], []
         for at, layout in _alike(frames, np.arange(len(frames))):
-            if layout is None or any(key not in layout for key in self._keys):
+            columns = layout and _columns(tuple(self._groups.values()), layout)
+            if not columns:
                 continue
             rows.append(at)
-            blocks.append(self._blocks(frames if len(at) == len(frames) else frames[at], layout))
+            blocks.append(self._blocks(frames if len(at) == len(frames) else frames[at], columns))
         if not blocks:
             blocks, rows = [self._empty()], [np.zeros(0, dtype=np.int64)]
-        order = np.concatenate(rows)
-        values = tuple(np.concatenate(column) for column in zip(*blocks, strict=True))
+        order, values = rows[0], tuple(blocks[0])
         if len(blocks) > 1:
+            order = np.concatenate(rows)
             sort = np.argsort(order)
-            order, values = order[sort], tuple(block[sort] for block in values)
+            values = tuple(np.concatenate(several)[sort] for several in zip(*blocks, strict=True))
+            order = order[sort]
         every = len(order) == len(frames)
         return Samples(values, t_device_ns=self._device_ns(values), rows=None if every else order)
 
@@ -156,13 +172,11 @@ class Robotiq(Sensor):
                 groups[kind] = keys
         return groups
 
-    def _blocks(self, frames: Bytes, layout: Layout) -> list[NDArray[Any]]:
-        """Return the blocks (frame, channel) of frames of one layout, one a type."""
+    def _blocks(self, frames: Bytes, columns: Columns) -> list[NDArray[Any]]:
+        """Return the blocks (frame, channel) of frames whose numbers stand in these columns, one a type."""
         return [
-            frames.take(_columns(tuple(layout[key] for key in keys), tuple(SIZES[code] for code, _ in keys)), axis=1)
-            .view(kind)
-            .astype(kind.newbyteorder("="))
-            for kind, keys in self._groups.items()
+            frames.take(places, axis=1).view(kind).astype(kind.newbyteorder("="))
+            for kind, places in zip(self._groups, columns, strict=True)
         ]
 
     def _empty(self) -> list[NDArray[Any]]:
@@ -217,9 +231,12 @@ def command(code: int, data: bytes = b"") -> bytes:
 
 
 @functools.lru_cache(maxsize=64)
-def _columns(places: tuple[int, ...], sizes: tuple[int, ...]) -> NDArray[np.intp]:
-    """Return the bytes of a frame that fields of these first bytes and sizes are."""
-    return np.concatenate([np.arange(place, place + size) for place, size in zip(places, sizes, strict=True)])
+def _columns(groups: tuple[tuple[Key, ...], ...], layout: Layout) -> Columns | None:
+    """Return the columns of frames that each group of fields is in; None where a field is not there."""
+    places = dict(layout)
+    if any(key not in places for keys in groups for key in keys):
+        return None
+    return tuple(np.concatenate([places[key] + np.arange(SIZES[key[0]]) for key in keys]) for keys in groups)
 
 
 def _fields(part: str, finger: int) -> list[pa.Field]:
@@ -240,42 +257,45 @@ def _fields(part: str, finger: int) -> list[pa.Field]:
 
 def _sizes(heads: Bytes) -> NDArray[np.int64]:
     """Return the whole size of frames from their headers (frame, 4); 0 for a command that no packet has."""
-    sizes: NDArray[np.int64] = np.where(KNOWN[heads[:, 2]], HEADER + heads[:, 3].astype(np.int64), 0)
+    sizes: NDArray[np.int64] = KNOWN.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
     return sizes
 
 
-def _layout(frame: bytes) -> tuple[Layout | None, list[int]]:
-    """Return where the fields of a packet of data are, or None where it is not made of known ones; and what was looked at.
-
-    Packets of one size that have the same bytes in these places have the same layout.
-    """
-    found: Layout = {}
-    place, seen = HEADER, [2]
-    if frame[2] not in DATA:
-        return None, seen
-    while place < len(frame):
+def _structure(frame: bytes) -> Structure:
+    """Return what a packet of data or of something else is made of, as far as its fields are known."""
+    found: dict[Key, int] = {}
+    place, seen, known = HEADER, [2], frame[2] in DATA
+    while known and place < len(frame):
         seen.append(place)
         code, finger = frame[place] & 0xF0, frame[place] >> 2 & 3
-        if code not in SIZES or finger > 1 or (code, finger) in found:
-            return None, seen
+        known = code in SIZES and finger <= 1 and (code, finger) not in found
         found[code, finger] = place + 1
-        place += 1 + SIZES[code]
-    return found if place == len(frame) and found else None, seen
+        place += 1 + SIZES.get(code, 0)
+    whole = known and place == len(frame) and bool(found)
+    values = np.frombuffer(frame, np.uint8)[seen]
+    return Structure(np.array(seen), values, tuple(found.items()) if whole else None)
 
 
 def _alike(frames: Bytes, rows: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.intp], Layout | None]]:
-    """Yield those ``rows`` of frames of one size that have the same layout, and the layout."""
+    """Yield those ``rows`` of frames of one size that have the same fields, and their layout."""
+    size = frames.shape[1]
     while len(rows):
-        layout, seen = _layout(frames[rows[0]].tobytes())
-        some = frames[:, seen] if len(rows) == len(frames) else frames[np.ix_(rows, np.array(seen))]
-        same = (some == some[0]).all(axis=1)
-        yield rows[same], layout
-        rows = rows[~same]
+        some = frames if len(rows) == len(frames) else frames[rows]
+        structure = _latest.get(size)
+        if structure is None or (some[0, structure.places] != structure.values).any():
+            structure = _latest[size] = _structure(some[0].tobytes())
+        same = some.take(structure.places, axis=1) == structure.values
+        if same.all():
+            yield rows, structure.layout
+            return
+        like = same.all(axis=1)
+        yield rows[like], structure.layout
+        rows = rows[~like]
 
 
 def _is_packet(frames: Bytes) -> NDArray[np.bool_]:
-    """Return which frames (frame, byte) of one size are made of known fields, or are a version."""
-    good = (frames[:, 0] == START) & (_sizes(frames[:, :HEADER]) == frames.shape[1])
-    for rows, layout in _alike(frames, np.flatnonzero(good & (frames[:, 2] != VERSION))):
+    """Return which frames (frame, byte) of one size, which their headers tell, are made of known fields, or a version."""
+    good = frames[:, 2] == VERSION
+    for rows, layout in _alike(frames, np.flatnonzero(~good)):
         good[rows] = layout is not None
     return np.asarray(good)

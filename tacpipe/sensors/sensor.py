@@ -91,6 +91,7 @@ class Sensor:
     counter: ClassVar[int | None] = None  # modulus of ``seq``; None: the device does not count
     device_counter: ClassVar[int | None] = None  # modulus of ``device_seq``
     step: ClassVar[int] = 1  # by which ``seq`` grows from a sample to the next
+    device_wrap_ns: ClassVar[int | None] = None  # after which the device's clock begins at 0 again
     exclusive: ClassVar[str] = ""  # what else cannot use the device meanwhile; a sentence, empty: nothing
     usb_ids: ClassVar[tuple[str, ...]] = ()  # "16d0:14cc": vendor and product, where the product has its own
 

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.sensors.framing import Framer, TextFramer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -29,8 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import DeviceError, UsageError
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum8
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:

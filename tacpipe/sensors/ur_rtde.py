@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 from tacpipe.sensors.ur_outputs import POSE, WIRE, fields_of, type_of
 from tacpipe.signals import rotations

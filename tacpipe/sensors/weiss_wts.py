@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import taxels
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
-from tacpipe.sensors.framing import ByteFramer, Bytes, Framer, Framing
+from tacpipe.sensors.framing import Bytes, Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class WeissWts(Sensor):
     """A WTS tactile sensor."""
 
     summary: ClassVar[str] = "Weiss Robotics WTS tactile sensors over USB."
+    device_wrap_ns: ClassVar[int | None] = TICK_NS << 32  # 11.9 hours
 
     rows: int = 14  # of the matrix; that of a WTS 0614 is 14 by 6
     columns: int = 6  # of the matrix

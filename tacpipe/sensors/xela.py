@@ -8,6 +8,7 @@ Welcome for its ``message`` and holds no reading. Source: the vendor's ROS node 
 
 from __future__ import annotations
 
+import binascii
 import functools
 import json
 import math
@@ -20,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Framer, TextFramer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.text_framer import TextFramer
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -77,11 +79,12 @@ class Xela(Sensor):
 
     def framer(self) -> Framer:
         """Return a framer that takes the server's texts, those without this sensor too, and no other."""
-        return TextFramer(self._is_right)
+        return TextFramer(self._is_right, every=self._are_right)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return counts and forces; NaN where the server sent no forces."""
-        texts = [json.loads(frame) for frame in frames]
+        texts = _parsed(tuple(frames))
+        assert texts is not None, "the framer gives JSON alone"
         key = str(self.sensor)
         rows = [row for row, text in enumerate(texts) if key in text]
         readings = [texts[row][key] for row in rows]
@@ -110,10 +113,14 @@ class Xela(Sensor):
         ]
 
     def _is_right(self, packet: bytes) -> bool:
-        try:
-            text = json.loads(packet)
-        except (ValueError, RecursionError):
-            return False
+        return self._are_right([packet])
+
+    def _are_right(self, packets: Sequence[bytes]) -> bool:
+        texts = _parsed(tuple(packets))
+        return texts is not None and all(map(self._says, texts))
+
+    def _says(self, text: Any) -> bool:
+        """Return whether a text is the server's: with what this sensor's part must have, or without this sensor."""
         if not isinstance(text, dict) or "message" not in text:
             return False
         reading = text.get(str(self.sensor))
@@ -124,18 +131,45 @@ class Xela(Sensor):
         if not isinstance(reading, dict) or not _is_finite(reading.get("time")) or abs(reading["time"]) > LATEST_S:
             return False
         data, forces = reading.get("data"), reading.get("calibrated")
-        if not isinstance(data, str):
-            return False
-        if not _list_of(3 * self.taxels).fullmatch(data):
+        if not isinstance(data, str) or not _are_counts(data, 3 * self.taxels):
             return False
         return not forces or (isinstance(forces, list) and len(forces) == 3 * self.taxels and _are_finite(forces))
+
+
+@functools.lru_cache(maxsize=4)  # kept between the framer's look at them and their decoding
+def _parsed(packets: tuple[bytes, ...]) -> list[Any] | None:
+    """Return what texts hold; None where one is no JSON."""
+    try:
+        return [json.loads(_decoded(packet)) for packet in packets]
+    except (ValueError, RecursionError):
+        return None
+
+
+def _decoded(packet: bytes) -> bytes | str:
+    """Return a text as `json.loads` would decode it, which takes longer to find that it is UTF-8."""
+    return packet.decode("utf-8", "surrogatepass") if packet.startswith(b'{"') else packet
+
+
+def _are_counts(data: str, width: int) -> bool:
+    """Return whether a text is a list of so many hexadecimal counts; at once where all have four digits."""
+    if len(data) == width * (DIGITS + 1) - 1 and data[DIGITS :: DIGITS + 1] == "," * (width - 1):
+        try:
+            return len(_of_digits(data)) == 2 * width
+        except ValueError:
+            return False
+    return _list_of(width).fullmatch(data) is not None
+
+
+def _of_digits(data: str) -> bytes:
+    """Return the bytes of a list of hexadecimal numbers; raises `ValueError` where it is none."""
+    return binascii.unhexlify(data.encode().translate(None, b","))
 
 
 def _counts(texts: Sequence[str], width: int) -> NDArray[np.uint16]:
     """Return the counts (sample, channel) of lists of hexadecimal numbers; at once where all have four digits."""
     joined = ",".join(texts)
     if len(joined) == len(texts) * width * (DIGITS + 1) - 1:  # as long as it can be
-        found = np.frombuffer(bytes.fromhex(joined.replace(",", "")), dtype=">u2").astype(np.uint16)
+        found = np.frombuffer(_of_digits(joined), dtype=">u2").astype(np.uint16)
     else:
         found = np.array([int(count, 16) for count in joined.split(",") if count], dtype=np.uint16)
     return found.reshape(len(texts), width)
@@ -166,8 +200,8 @@ def _are_finite(values: Sequence[Any]) -> bool:
 
 
 def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 53
+    return type(value) is int and 0 <= value < 1 << 53
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return type(value) in (int, float) and math.isfinite(value)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.sensors.framing import Chunks, Framer, LineFramer, Loss, Run
+from tacpipe.sensors.framing import Chunks, Framer, Loss, Run
 from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.text_framer import LineFramer
 
 Columns = dict[str, NDArray[Any]]
 Limits = dict[str, tuple[int, int]]

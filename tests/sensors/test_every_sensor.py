@@ -12,9 +12,10 @@ import pytest
 from tacpipe import registry
 from tacpipe.errors import UsageError
 from tacpipe.recording import rig
-from tacpipe.sensors.framing import LineFramer, Run, TextFramer
+from tacpipe.sensors.framing import Run
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.sensors.spacemouse import StateFramer
+from tacpipe.sensors.text_framer import LineFramer, TextFramer
 from tests.sensors import harm, made, told
 
 KINDS = list(registry.sensors())

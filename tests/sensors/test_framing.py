@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tacpipe.sensors import checks, framing
-from tacpipe.sensors.framing import ByteFramer, Chunks, Framing, LineFramer, Loss, PacketFramer, Run
+from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.framing import Chunks, Framing, Loss, Run
+from tacpipe.sensors.packet_framer import PacketFramer
+from tacpipe.sensors.text_framer import LineFramer
 
 Right = NDArray[np.bool_]
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe.sensors.framing import Chunks, LineFramer, Run
+from tacpipe.sensors.framing import Chunks, Run
 from tacpipe.sensors.sensor import Frames, Sensor
+from tacpipe.sensors.text_framer import LineFramer
 
 CAN_BYTES = 13  # of a CAN frame as a link gives it
 NEIGHBOURS = 8  # sound frames on either side: more than any framer needs to lock

@@ -69,12 +69,12 @@ class Emulator:
 
     @property
     def rig(self) -> Rig:
-        """The rig as hosts find it."""
+        """The rig as hosts find it; its recordings are marked as simulated."""
         streams = {
             name: replace(stream, address=self._transmissions[name].endpoint.address)
             for name, stream in self.asked.streams.items()
         }
-        return replace(self.asked, streams=streams)
+        return replace(self.asked, streams=streams, labels={**self.asked.labels, "simulated": True})
 
     def __enter__(self) -> Self:
         paces = {name: pace(self.asked, name) for name in self.asked.streams}

@@ -96,9 +96,9 @@ class Ledger:
     def whole(self) -> NDArray[np.int64]:
         """The rows of entries that went out as frames should (entry,)."""
         codes = np.array([CODES[cause] for cause in UNHARMED])
-        rows: NDArray[np.int64] = np.flatnonzero(
-            (self.column("size") > 0) & np.isin(self.column("cause"), codes) & (self.column("number") >= 0)
-        )
+        count = len(self)  # of all columns, though it may grow meanwhile
+        size, cause, number = (self.column(name)[:count] for name in ("size", "cause", "number"))
+        rows: NDArray[np.int64] = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
         return rows
 
     def samples(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> Samples:

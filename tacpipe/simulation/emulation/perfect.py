@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.sensors.framing import ByteFramer
+from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 
 

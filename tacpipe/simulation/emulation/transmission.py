@@ -173,7 +173,7 @@ class Transmission:
         before, peer.wanted = peer.wanted, 0
         self.run(now_ns)  # frames that are due are those of others
         peer.wanted = before
-        if self._latest is not None:
+        if self._latest is not None and peer in self.endpoint.peers:  # it may have been unplugged just now
             sizes = self._post(peer, [self._latest.data])
             peer.wanted -= 1
             self._enter([self._latest], sizes, peer.fault, now_ns)

@@ -1,0 +1,279 @@
+"""From a stream of bytes to frames: lock on repeated marks, check sums, resynchronize.
+
+No byte is looked at by itself in Python: as long as all is well, the bytes at hand are one array (frame, byte).
+
+A frame is given out when it is known to be one. Where nothing but the marks speaks for it (`Framing.check` is None), or a
+sum of 8 bits, that is once ``confirm`` good frames follow it: the frame before a disturbance may be a part of it. After a
+disturbance a lock takes ``lock`` good frames in a row, all of which are then given out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.sensors.framing import (
+    CUT,
+    GARBLED,
+    NOISE,
+    START,
+    UNCONFIRMED,
+    Account,
+    Bytes,
+    Chunks,
+    Framing,
+    Loss,
+    Run,
+)
+from tacpipe.sensors.pending import Pending
+
+AMBIGUOUS = 64  # frames that are kept while marks repeat in more than one place
+MOST_BYTES = 1 << 23  # looked at in one go, which bounds the memory of a check
+Span = tuple[int, int, int]  # frames of one size that follow one another: where they start, their size, how many
+
+
+class ByteFramer:
+    """Cuts a stream of bytes into frames as a `Framing` tells."""
+
+    def __init__(self, framing: Framing) -> None:
+        self.framing = framing
+        self.account = Account()
+        self._text = Pending()
+        self._locked = False
+        self._begun = False  # whether any frame was found yet
+        self._broken_at: int | None = None  # where a frame should have begun that did not; counted from the first byte
+        self._barred = -1  # where the chain that broke could begin once more, which it must not
+        self._usual = framing.size or 0  # size of the last good frame
+        self._marked: tuple[int, list[tuple[int, bytes]]] = (0, [])  # marks of frames of the last size, see `_marks`
+        self._told = (b"", 0)  # the last header whose size was asked for, and the size
+
+    def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
+        """Take what a link gave; return the frames that are complete now, and what was lost."""
+        self.account.received += len(chunks.data)
+        self._text.append(chunks)
+        return self._scan(ended=False)
+
+    def flush(self) -> tuple[list[Run], list[Loss]]:
+        """Return what is left when nothing more comes: frames with a sum are good, others lack what confirms them."""
+        runs, losses = self._scan(ended=True)
+        left = len(self._text.data)
+        if left:
+            whole = self._locked and bool(self._usual) and left >= self._usual
+            losses.append(self._lose(0, left, UNCONFIRMED if whole else CUT if self._begun else START))
+            self._text.cut(left)
+        return runs, losses
+
+    def _scan(self, *, ended: bool) -> tuple[list[Run], list[Loss]]:
+        runs: list[Run] = []
+        losses: list[Loss] = []
+        place, size = 0, len(self._text.data)
+        while place < size:
+            if not self._locked:
+                found, kept = self._search(place, ended=ended)
+                if found is None:
+                    place = self._skip(place, kept, losses) if kept - place > self.framing.most else place
+                    break
+                place = self._skip(place, found, losses)
+                self._locked = self._begun = True
+                self._broken_at = None
+            spans, stop, broken = self._chain(place)
+            held = 0 if ended and not broken and self.framing.summed else self.framing.confirm
+            place = self._give(spans, held, runs, place)
+            if not broken:
+                break
+            self._locked, self._broken_at, self._barred = False, self._text.base + stop, self._text.base + place
+        self._text.cut(place)
+        return runs, losses
+
+    def _give(self, spans: Sequence[Span], held: int, runs: list[Run], place: int) -> int:
+        """Append the runs of a chain but for its last ``held`` frames; return where those begin."""
+        give = -held
+        for _, _, count in spans:
+            give += count
+        for start, size, count in spans:
+            count = min(count, give)
+            if count <= 0:
+                break
+            give -= count
+            place = start + count * size
+            runs.append(
+                Run(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, place, size)))
+            )
+            self.account.framed += count * size
+            self._usual = size
+        return place
+
+    def _chain(self, place: int, most: int | None = None) -> tuple[list[Span], int, bool]:
+        """Return the good frames that follow one another from ``place``: spans of (start, size, count).
+
+        And where they end, and whether it is certain that no frame begins there. With ``most``, no more than so many.
+        """
+        spans: list[Span] = []
+        there = len(self._text.data)
+        left = there if most is None else most
+        while left > 0:
+            size = self._size(place)
+            if size is None or place + size > there:
+                return spans, place, False
+            if size == 0:
+                return spans, place, True
+            count = max(1, min((there - place) // size, MOST_BYTES // size, left))
+            run = self._good(place, size, count)
+            if run:
+                spans.append((place, size, run))
+                place += run * size
+                left -= run
+            if run < count and (run == 0 or self._size(place) == size):
+                return spans, place, True
+        return spans, place, False
+
+    def _size(self, place: int) -> int | None:
+        """Return the size of the frame that begins at ``place``, 0 if none does, None if too few bytes are there."""
+        text, framing = self._text.data, self.framing
+        if not text.startswith(framing.marker, place):
+            there = text[place : place + len(framing.marker)]
+            if len(there) == len(framing.marker) or not framing.marker.startswith(there):
+                return 0
+        if framing.size is not None:
+            return framing.size
+        if framing.sizes is None:
+            return self._size_to_tail(place)
+        head = text[place : place + framing.header]
+        if len(head) < framing.header:
+            return None
+        if head != self._told[0]:
+            size = int(framing.sizes(np.frombuffer(head, np.uint8)[None])[0])
+            self._told = head, size if framing.header <= size <= framing.most else 0
+        return self._told[1]
+
+    def _size_to_tail(self, place: int) -> int | None:
+        """Return how many bytes there are up to the next tail: the usual number if that gives a tail as well."""
+        text, tail = self._text.data, self.framing.tail
+        if self._usual and text[place + self._usual - len(tail) : place + self._usual] == tail:
+            return self._usual
+        found = place + len(self.framing.marker) - 1
+        while (found := text.find(tail, found + 1, place + self.framing.most)) >= 0:
+            stop = found + len(tail)
+            frame = np.frombuffer(text, np.uint8, stop - place, place)[None]  # (1, byte)
+            if self.framing.check is None or self.framing.check(frame)[0]:
+                return stop - place
+            if text.startswith(self.framing.marker, stop) and stop < len(text):
+                return 0  # another frame begins right behind, so this was the tail, and the sum is wrong
+        return 0 if len(text) - place >= self.framing.most else None
+
+    def _good(self, place: int, size: int, count: int) -> int:
+        """Return how many of ``count`` frames from ``place`` on, up to the first that has not, have marks, size and sum."""
+        framing, text = self.framing, self._text.data
+        for at, mark in self._marks(size):
+            column = text[place + at : place + count * size : size]  # the mark's byte of each frame
+            count -= len(column.lstrip(mark))
+        if framing.sizes is not None and count > 1:  # the first was asked for its size
+            count = _leading(framing.sizes(self._frames(place, size, count)[:, : framing.header]) == size)
+        if framing.check is not None and count:
+            count = _leading(framing.check(self._frames(place, size, count)))
+        return count
+
+    def _marks(self, size: int) -> list[tuple[int, bytes]]:
+        """Return where in a frame of so many bytes its marks are, byte by byte."""
+        if size != self._marked[0]:
+            framing = self.framing
+            places = [*range(len(framing.marker)), *range(size - len(framing.tail), size)]
+            marks = framing.marker + framing.tail
+            self._marked = size, [(at, marks[row : row + 1]) for row, at in enumerate(places)]
+        return self._marked[1]
+
+    def _frames(self, place: int, size: int, count: int) -> Bytes:
+        """Return frames of one size as an array (frame, byte), without a copy."""
+        return np.frombuffer(self._text.data, np.uint8, count * size, place).reshape(count, size)
+
+    def _search(self, place: int, *, ended: bool) -> tuple[int | None, int]:
+        """Return the first place from ``place`` on at which ``lock`` good frames follow one another, or None.
+
+        And the first place at which they still may, once more bytes are there.
+        """
+        possible: int | None = None
+        there = len(self._text.data)
+        enough = 1 if ended and self.framing.summed else self.framing.lock
+        for start in self._candidates(place):
+            spans, stop, ruined = self._chain(start, self.framing.lock)
+            count = sum(found for _, _, found in spans)
+            if count >= enough and (count >= self.framing.lock or (stop == there and not ruined)):
+                return self._phase(start)
+            if not ruined and possible is None:
+                possible = start
+        return None, there if possible is None else possible
+
+    def _phase(self, start: int) -> tuple[int | None, int]:
+        """Return of the places within a frame from ``start`` on the one at which marks repeat for longest, as `_search`.
+
+        A payload that holds still may show the marker in every frame. Where marks alone speak for frames, only its change
+        tells the true place.
+        """
+        size = self.framing.size
+        if self.framing.summed or size is None:
+            return start, start
+        places = [start]
+        for other in self._candidates(start + 1):
+            if other >= start + size:
+                break
+            places.append(other)
+        there = len(self._text.data)
+        chains = [self._chain(place, AMBIGUOUS) for place in places]
+        alive = [place for place, (_, _, ruined) in zip(places, chains, strict=True) if not ruined]
+        whole = [place for place in alive if place + size * self.framing.lock <= there]
+        if len(whole) > 1:
+            return None, max(start, there - AMBIGUOUS * size)
+        longest = max(range(len(places)), key=lambda number: chains[number][1] - places[number])
+        found = whole[0] if whole else places[longest]
+        return found, found
+
+    def _candidates(self, place: int) -> Iterable[int]:
+        """Yield where a frame may begin: at markers, or behind tails; not where the chain that broke began."""
+        text, framing = self._text.data, self.framing
+        mark = framing.marker or framing.tail
+        shift = 0 if framing.marker else len(mark)
+        barred = self._barred - self._text.base
+        found = text.find(mark, max(0, place - shift))
+        while found >= 0:
+            if found + shift >= place and found + shift != barred:
+                yield found + shift
+            found = text.find(mark, found + 1)
+        for there in range(len(mark) - 1, 0, -1):  # a mark of which the end is not there yet
+            start = len(text) - there
+            if start >= place and start != barred and text.endswith(mark[:there]):
+                yield start
+
+    def _skip(self, place: int, start: int, losses: list[Loss]) -> int:
+        if start > place:
+            losses.append(self._lose(place, start, self._cause(place, start)))
+        return start
+
+    def _cause(self, place: int, start: int) -> str:
+        """Return what became of the bytes from ``place`` to ``start``, between good frames."""
+        if not self._begun:
+            return START
+        broken = place if self._broken_at is None else max(place, self._broken_at - self._text.base)
+        between, usual = start - broken, self._usual
+        if between <= 0:
+            return UNCONFIRMED
+        if usual and between % usual == 0:
+            return GARBLED
+        marker = self.framing.marker
+        begins = bool(marker) and self._text.data.startswith(marker, broken)
+        if between < usual:
+            return CUT if begins or not marker or place < broken else NOISE
+        return GARBLED
+
+    def _lose(self, start: int, stop: int, cause: str) -> Loss:
+        self.account.lost += stop - start
+        usual = self._usual or stop - start
+        frames = 0 if cause in (START, NOISE) else max(1, round((stop - start) / usual))
+        return Loss(self._text.arrival(stop - 1), cause, frames, stop - start)
+
+
+def _leading(good: NDArray[np.bool_]) -> int:
+    """Return how many frames are good (frame,) before the first that is not."""
+    first = int(good.argmin())
+    return len(good) if good[first] else first

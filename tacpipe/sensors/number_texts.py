@@ -1,0 +1,136 @@
+"""Numbers in texts, read from many texts at once: from lines, and from texts that differ in nothing but their numbers.
+
+A text that only a look at it by itself can read makes all of them unread (None): what is read here is what `float` reads.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+SPACES = b" \t\r\n"
+NEWLINE = 0x0A
+MOST_BYTES = (1 << 31) - 1  # that 32-bit places in a text reach
+NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # of an XML text, between its marks
+FIRST = 1_000_000  # by which numbers stand for themselves, see `numbered`
+ODD = (b"<?", b"<!", b"&", b"'", b"\0")  # in an XML text: other marks than quotes and tags
+APART = b"\0"  # between texts: no XML holds it
+
+
+def of_lines(lines: Sequence[bytes], width: int) -> Floats | None:
+    """Return the numbers (line, number) of lines that hold ``width`` each, with space between; None where one does not."""
+    text = b"\n".join(lines) + b"\n"
+    data = np.frombuffer(text, np.uint8)
+    spaces = np.flatnonzero(data <= SPACES[0])
+    solid = text.translate(None, SPACES)
+    if len(solid) + len(spaces) != len(text):
+        return None  # another character below the space
+    ends = spaces - np.arange(len(spaces))  # of numbers within ``solid``, and again where spaces follow one another
+    last = np.flatnonzero(ends != np.concatenate([[0], ends[:-1]]))
+    if len(last) != len(lines) * width or (data[spaces[last[width - 1 :: width]]] != NEWLINE).any():
+        return None
+    texts = _texts(solid, np.concatenate([[0], ends[last]]))
+    numbers = None if texts is None else floats(texts)
+    return None if numbers is None else numbers.reshape(len(lines), width)
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """An XML text but for its numbers."""
+
+    marks: int  # quotes and angle brackets in it
+    before: Places  # (number,), which of these each follows; the next one ends it
+    rest: bytes  # the text without its numbers, and what parts it from the next
+
+    def written(self, texts: Sequence[bytes]) -> pa.Array | None:
+        """Return the numbers of texts as they are written (text times number,); None where a text has another pattern.
+
+        They stand between the right marks, but may be no numbers.
+        """
+        text = APART.join(texts) + APART
+        marks = _marks(text)
+        if len(marks) != len(texts) * self.marks:
+            return None
+        places = marks.reshape(len(texts), self.marks)
+        edges = np.empty((len(texts), len(self.before), 2), dtype=np.int64)  # (text, number, start and end)
+        edges[:, :, 0] = places[:, self.before] + 1
+        edges[:, :, 1] = places[:, self.before + 1]
+        pieces = _texts(text, np.concatenate([[0], edges.ravel(), [len(text)]]))
+        if pieces is None:
+            return None
+        between, numbers = (taken(pieces, range(first, len(pieces), 2)) for first in (0, 1))
+        return numbers if between.buffers()[2].to_pybytes() == self.rest * len(texts) else None
+
+
+def numbered(text: bytes) -> bytes:
+    """Return an XML text with the number of each number in its place, from `FIRST` on.
+
+    >>> numbered(b'<a x="-1.5" y="yes">7</a>')
+    b'<a x="1000000" y="yes">1000001</a>'
+    """
+    count = itertools.count(FIRST)
+    return NUMBERS.sub(lambda _: b"%d" % next(count), text)
+
+
+def pattern(text: bytes) -> Pattern | None:
+    """Return the pattern of a text; None where it has no numbers, or parts that need more than a look at its marks."""
+    starts = np.array([found.start() for found in NUMBERS.finditer(text)])
+    if not len(starts) or any(odd in text for odd in ODD):
+        return None
+    marks = _marks(text)
+    return Pattern(len(marks), np.searchsorted(marks, starts) - 1, NUMBERS.sub(b"", text) + APART)
+
+
+def _marks(text: bytes) -> Places:
+    data = np.frombuffer(text, np.uint8)
+    return np.flatnonzero((data == ord('"')) | (data == ord("<")) | (data == ord(">")))
+
+
+def _texts(text: bytes, edges: Places) -> pa.Array | None:
+    """Return the pieces of a text between ``edges``; None where it is too long to tell them."""
+    import pyarrow as pa
+
+    if len(text) > MOST_BYTES:
+        return None
+    return pa.StringArray.from_buffers(len(edges) - 1, pa.py_buffer(edges.astype(np.int32)), pa.py_buffer(text))
+
+
+def taken(texts: pa.Array, rows: range) -> pa.Array:
+    """Return some of the texts."""
+    import pyarrow as pa
+
+    places = np.arange(rows.start, rows.stop, rows.step)
+    return texts.take(pa.Array.from_buffers(pa.int64(), len(places), [None, pa.py_buffer(places)]))
+
+
+def floats(texts: pa.Array) -> Floats | None:
+    """Return the numbers (text,) of texts; None where one is none."""
+    return _cast(texts, np.dtype(np.float64))
+
+
+def wholes(texts: pa.Array) -> NDArray[np.int64] | None:
+    """Return the whole numbers (text,) of texts; None where one is none."""
+    return _cast(texts, np.dtype(np.int64))
+
+
+def _cast(texts: pa.Array, kind: np.dtype[Any]) -> NDArray[Any] | None:
+    """Return the numbers (text,) in the buffer that holds them: pyarrow would import pandas to make an array of them."""
+    import pyarrow as pa
+
+    try:
+        cast = texts.cast(kind.name)
+    except pa.ArrowInvalid:
+        return None
+    return np.frombuffer(cast.buffers()[1], kind, len(texts))
