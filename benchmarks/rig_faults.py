@@ -115,8 +115,8 @@ def _held(name: str, ledger: Ledger, batches: list[Batch], reading: Reading, har
         if not there:
             wrong += 1
             continue
-        place = next((one for one in there if one > last), there[0])
-        given[place], last = True, max(last, place)
+        place = min(there, key=lambda one: abs(one - last - 1))
+        given[place], last = True, place
     entries = whole[sent.rows]  # (sample,), the entry of each
     invisible = int(ledger.column("invisible").sum())
     first, final = int(given.argmax()), len(given) - 1 - int(given[::-1].argmax())

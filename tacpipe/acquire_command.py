@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import DONE, FAILED, DeviceError, TacpipeError, UsageError
 
 if TYPE_CHECKING:
-    from tacpipe.recording.rig import Rig, Stream
+    from tacpipe.recording.rig import Rig
     from tacpipe.recording.trials import Recorded
-    from tacpipe.sensors.framing import Chunks
     from tacpipe.stage import Attribute
     from tacpipe.store import Store
 
 SCHEMA_VERSION = 1
 DRY_RUN_S = 3.0
+NAME = re.compile(r"[\w-][\w.-]*")
 RATE_OFF = 0.1  # share by which a rate may differ from what the rig file says before it is told
 
 
@@ -76,10 +76,10 @@ def add(program: typer.Typer, summary: str) -> None:
         if found is not None and output is None and not recover:
             raise UsageError("acquire needs -o: the dataset of recordings to append to.")
         began_s = time.monotonic()
-        sealed = _recovered(store, quiet=quiet)
+        sealed, left = _recovered(store, quiet=quiet)
         if found is None or output is None or recover:
             _tell(output, sealed, began_s, as_json=as_json)
-            return
+            raise typer.Exit(FAILED if left else DONE)
         plan = trials_of.Plan(
             output,
             name or time.strftime("%Y%m%d-%H%M%S", time.gmtime()),
@@ -91,10 +91,13 @@ def add(program: typer.Typer, summary: str) -> None:
             trials > 1 if tare is None else tare,
             _attributes(label or [], note),
         )
-        _tell(output, _record(found, store, plan, quiet=quiet), began_s, as_json=as_json)
+        recorded, lost = _record(found, store, plan, quiet=quiet)
+        _tell(output, recorded, began_s, as_json=as_json)
+        if lost:
+            raise DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
 
 
-def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> list[Recorded]:
+def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe import directory
     from tacpipe.recording import appending, trials, triggers
     from tacpipe.recording.recorder import Recorder
@@ -103,6 +106,8 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> list[Recorded]
     for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
         if value not in known:
             raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
+    if not NAME.fullmatch(plan.name):
+        raise UsageError(f"--name {plan.name!r} names no file; take letters, digits, _, - and dots, no dot in front.")
     if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
         raise UsageError("--trials and --duration must be above 0.")
     if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
@@ -112,28 +117,36 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> list[Recorded]
     appending.existing(plan.output)
     recorder = Recorder(rig)
     with trials.Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
-        recorder.await_first(_instead, ended)
-        return trials.run(recorder, store, plan, view, ended)
+        recorder.await_first(ended)
+        recorded, lost = trials.run(recorder, store, plan, view, ended)
+    for one in recorded if not quiet else ():
+        print(one.line(), file=sys.stderr)
+    return recorded, lost
 
 
-def _recovered(store: Store, *, quiet: bool) -> list[Recorded]:
-    """Seal what earlier processes left behind; what cannot be sealed is told and stays."""
+def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
+    """Seal what earlier processes left behind; what cannot be sealed is told and stays, and keeps nobody from recording."""
     from tacpipe.recording import spool, trials
     from tacpipe.recording.appending import NothingError
 
-    sealed = []
+    sealed, left = [], 0
     for folder in spool.abandoned(store.root):
-        try:
-            one = trials.recover(store, folder)
-        except NothingError:
-            continue  # it ended before a sample came
-        except TacpipeError as error:
-            print(f"tacpipe: the spool {folder} stays as it is: {error}", file=sys.stderr)
-            continue
+        with spool.claimed(folder) as ours:
+            if not ours:
+                continue
+            try:
+                one = trials.recover(store, folder)
+            except NothingError:
+                continue  # it ended before a sample came
+            except Exception as error:  # whatever a damaged spool or another version's driver may raise
+                why = error if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+                print(f"tacpipe: The spool {folder} stays as it is. {why}", file=sys.stderr)
+                left += 1
+                continue
         sealed.append(one)
         if not quiet:
             print(f"recovered {one.line()}", file=sys.stderr)
-    return sealed
+    return sealed, left
 
 
 def _dry_run(rig: Rig, *, as_json: bool) -> str:
@@ -146,7 +159,7 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
 
     recorder = Recorder(rig)
     with Ended() as ended, recorder.open():
-        recorder.await_first(_instead, ended)
+        recorder.await_first(ended)
         until_s = time.monotonic() + DRY_RUN_S
         recorder.run(lambda: ended() or time.monotonic() > until_s)
         figures = {name: watch.figures(time.monotonic_ns()) for name, watch in recorder.watches.items()}
@@ -160,31 +173,13 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     return "\n".join(lines)
 
 
-def _instead(stream: Stream, heard: Iterable[Chunks]) -> str:
-    """Return a sentence on what else the bytes of a stream may be."""
-    import numpy as np
-
-    from tacpipe.links.recognition import recognise
-    from tacpipe.sensors.framing import Chunks
-
-    several = list(heard)
-    joined = Chunks(
-        np.concatenate([one.t_ns for one in several]),
-        np.concatenate([one.size for one in several]),
-        b"".join(one.data for one in several),
-    )
-    found = recognise(joined, stream.address.scheme)
-    if found and found[0].candidate.sensor != stream.sensor:
-        return f"They are those of {found[0].candidate}: tell the rig file so, or plug in the other device."
-    baud = getattr(stream.sensor, "baud", None)
-    at = f" is set to another rate than {baud} baud, or" if baud and stream.address.scheme == "serial" else ""
-    return f"Either the device{at} it speaks another protocol; `tacpipe sensors probe {stream.address}` tries them all."
-
-
 def _attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
     from tacpipe import labels as labels_of
 
-    attributes = labels_of.parse(labels, None, include=False) if labels else {}
+    try:
+        attributes = labels_of.parse(labels, None, include=False) if labels else {}
+    except UsageError as error:
+        raise UsageError(str(error).replace("--set", "--label")) from error
     return {**attributes, **({"note": note} if note else {})}
 
 
@@ -205,7 +200,5 @@ def _tell(output: Path | None, recorded: list[Recorded], began_s: float, *, as_j
         }
         print(json.dumps(value))
         return
-    for one in recorded:
-        print(one.line(), file=sys.stderr)
     if output is not None:
         print(output)

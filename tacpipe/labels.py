@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
+from math import isfinite
 from pathlib import Path
 
 from tacpipe import directory as directory_of
@@ -23,7 +24,8 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
         if not equals or not name.isidentifier():
             raise UsageError(f"--set {text} should read name=value, as in --set material=foam.")
         labels[name] = yaml.safe_load(value) if value else ""
-        if not isinstance(labels[name], str | int | float | bool | None):
+        found = labels[name]
+        if not isinstance(found, str | int | float | bool | None) or (isinstance(found, float) and not isfinite(found)):
             labels[name] = value
     if exclude is not None and include:
         raise UsageError("--exclude and --include contradict each other; give one.")

@@ -85,7 +85,7 @@ def _row(name: str) -> dict[str, Any]:
     try:
         kind = registry.load_sensor(name)
     except TacpipeError as error:  # a plug-in's, which must not hide the others
-        return {"name": name, "links": [], "rate_hz": None, "baud": None, "summary": str(error)}
+        return {"name": name, "links": [], "rate_hz": None, "baud": None, "summary": str(error), "exclusive": ""}
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
     told = {key: value for key, value in defaults.items() if value is not dataclasses.MISSING}
     baud = told.get("baud") if "serial" in kind.links else None
@@ -95,6 +95,7 @@ def _row(name: str) -> dict[str, Any]:
         "rate_hz": told.get("rate_hz"),
         "baud": baud,
         "summary": kind.summary,
+        "exclusive": kind.exclusive,
     }
 
 

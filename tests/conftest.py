@@ -30,6 +30,9 @@ halves = toy_stages:halves
 
 [tacpipe.formats]
 numbers = toy_stages:read
+
+[tacpipe.sensors]
+pulse = toy_sensor:Pulse
 """
 
 settings.register_profile("tacpipe", deadline=None)  # nothing is timed in tests
@@ -81,7 +84,8 @@ def sample_data() -> Path:
 def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an installed plug-in with small stages."""
     folder = tmp_path_factory.mktemp("plugin")
-    shutil.copy(Path(__file__).parent / "plugin" / "toy_stages.py", folder)
+    for name in ("toy_stages.py", "toy_sensor.py"):
+        shutil.copy(Path(__file__).parent / "plugin" / name, folder)
     (folder / "toy.egg-info").mkdir()
     (folder / "toy.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
     return folder

@@ -5,24 +5,45 @@ from __future__ import annotations
 import time
 
 OLDEST_NS = 60_000_000_000  # what seems older than that was stamped before the wall clock was set
+LOOKS = 3  # at both clocks, of which the quickest counts: another program may run between two readings
 
 
 class Arrivals:
-    """Maps wall-clock stamps of arrivals to the monotonic clock; what is given out never goes back."""
+    """Maps wall-clock stamps of arrivals to the monotonic clock; what is given out never goes back.
+
+    How far apart two stamps are stays as it was told, because the distance of the clocks is changed only when it must be.
+    """
 
     def __init__(self) -> None:
-        self._wall_ns = self._now_ns = self._last_ns = 0
+        self._ahead_ns: int | None = None  # the monotonic clock's lead on the wall clock
+        self._now_ns = self._wall_ns = 0
+        self._last_ns = self._last_wall_ns = 0
 
     def look(self) -> None:
-        """Read both clocks anew: call it once for all that lies ready now."""
-        self._now_ns, self._wall_ns = time.monotonic_ns(), time.time_ns()
+        """Read both clocks anew: call it once for all that was fetched, and after it, so that no stamp lies ahead.
+
+        The wall clock may be set at any time: the distance moves just so far that it agrees with the readings.
+        """
+        before_ns, self._wall_ns, self._now_ns = min((_readings() for _ in range(LOOKS)), key=lambda r: r[2] - r[0])
+        least_ns, most_ns = before_ns - self._wall_ns, self._now_ns - self._wall_ns
+        known_ns = (least_ns + most_ns) // 2 if self._ahead_ns is None else self._ahead_ns
+        self._ahead_ns = min(max(known_ns, least_ns), most_ns)
 
     def of(self, wall_ns: int) -> int:
         """Return the monotonic time in ns of a stamp; one from the future, or far back, arrived just now.
 
-        The wall clock may be set at any time, so its distance is taken anew at every look, and only ages are believed.
+        A later stamp gives a later time, if only by 1 ns where the clocks' distance shrank meanwhile.
         """
-        age_ns = self._wall_ns - wall_ns
-        t_ns = self._now_ns - (age_ns if 0 <= age_ns <= OLDEST_NS else 0)
-        self._last_ns = max(self._last_ns, t_ns)
+        assert self._ahead_ns is not None, "look first"
+        is_believed = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
+        t_ns = wall_ns + self._ahead_ns if is_believed else self._now_ns
+        self._last_ns = max(t_ns, self._last_ns + (wall_ns > self._last_wall_ns))
+        self._last_wall_ns = wall_ns
         return self._last_ns
+
+
+def _readings() -> tuple[int, int, int]:
+    """Return the wall clock between two readings of the monotonic clock."""
+    before_ns = time.monotonic_ns()
+    wall_ns = time.time_ns()
+    return before_ns, wall_ns, time.monotonic_ns()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any
 
@@ -86,4 +87,5 @@ class CameraLink(Opened):
             time.sleep(PAUSE_S)
 
     def _release(self) -> None:
-        self.camera.stop_capture()
+        with contextlib.suppress(RuntimeError):  # of a camera that was unplugged
+            self.camera.stop_capture()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
+import termios
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,10 +127,11 @@ class CanLink(Opened):
 
         try:
             self.bus.shutdown()
-        except (can.CanError, OSError):  # an adapter that is gone cannot be told to stop
+        except (can.CanError, OSError, ValueError, termios.error):  # an adapter that is gone cannot be told to stop
             port = getattr(self.bus, "serialPortOrig", None)  # of slcan, which stays open then
             if port is not None:
-                port.close()
+                with contextlib.suppress(OSError):
+                    port.close()
 
 
 def packed(message: can.Message) -> bytes:

@@ -47,7 +47,7 @@ def hold(link: Link, dialogue: Dialogue, stream: str) -> Arrived:
 
 
 def _reply(link: Link, ask: Ask, since: Arrived, stream: str) -> tuple[bytes, Arrived]:
-    """Return the reply and the packets before it, which are none; what is behind stays in ``since``."""
+    """Return the reply and what came before it, which is none; what is behind stays in ``since``."""
     until = time.monotonic() + ask.timeout_s
     seen = 0
     while True:
@@ -62,25 +62,31 @@ def _reply(link: Link, ask: Ask, since: Arrived, stream: str) -> tuple[bytes, Ar
 
 
 def _found(ask: Ask, since: Arrived, seen: int, *, packets: bool) -> tuple[bytes, Arrived] | None:
-    """Return the reply as `_reply` does, taken out of ``since``: a packet by itself, else from the first byte on."""
-    assert ask.until is not None
+    """Return the reply as `_reply` does, taken out of ``since``: of packets one by itself, if that has it, else all."""
     for row in range(seen, len(since)) if packets else ():
-        size = ask.until(since[row][1])
-        if size:
-            before, (t_ns, data) = since[:row], since[row]
-            since[: row + 1] = [(t_ns, data[size:])] if size < len(data) else []
-            return data[:size], before
-    whole = b"".join(data for _, data in since)
-    size = ask.until(whole) if whole else 0
-    if not size:
-        return None
-    left = size
-    while left:
+        place = ask.found(since[row][1])
+        if place is not None:
+            return _taken(since, sum(len(data) for _, data in since[:row]), *place)
+    place = ask.found(b"".join(data for _, data in since))
+    return None if place is None else _taken(since, 0, *place)
+
+
+def _taken(since: Arrived, base: int, start: int, stop: int) -> tuple[bytes, Arrived]:
+    """Take bytes ``start`` to ``stop``, counted from ``base`` on, and those before out of ``since``; return both."""
+    before = _cut(since, base + start)
+    return b"".join(data for _, data in _cut(since, stop - start)), before
+
+
+def _cut(since: Arrived, count: int) -> Arrived:
+    """Cut the first ``count`` bytes off and return them, each with its arrival."""
+    front: Arrived = []
+    while count:
         t_ns, data = since.pop(0)
-        if len(data) > left:
-            since.insert(0, (t_ns, data[left:]))
-        left -= min(left, len(data))
-    return whole[:size], []
+        front.append((t_ns, data[:count]))
+        if len(data) > count:
+            since.insert(0, (t_ns, data[count:]))
+        count -= len(front[-1][1])
+    return front
 
 
 def _pause(link: Link, pause_s: float) -> Arrived:

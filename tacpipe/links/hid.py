@@ -23,7 +23,7 @@ def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
     the first. Raises `DeviceError` for a device that is missing, there twice, or not permitted.
     """
     module = ports.hid_module()
-    told = chosen(place, module.enumerate(), getattr(sensor, "usage_page", None), name)
+    told = chosen(place, module.enumerate(), sensor.usage_page, name)
     path: bytes = told["path"]
     device = module.device()
     try:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import select
 import socket
 import time
-from collections.abc import Mapping
-from typing import Any
 
 from tacpipe.links import network, udp
+from tacpipe.links.link import LinkLostError
 from tacpipe.links.opened import Arrived, Descriptor
 from tacpipe.sensors.sensor import Sensor
 
@@ -60,17 +59,12 @@ class ControlledLink(udp.UdpLink):
         self.control = control
         self._poll.register(control.socket.fileno(), select.POLLIN)
 
-    @property
-    def local(self) -> Mapping[str, Any]:
-        """The ``host`` and ``port`` that datagrams are awaited on."""
-        host, port = self.socket.getsockname()[:2]
-        return {"host": host, "port": port}
-
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         if any(fileno == self.control.socket.fileno() for fileno, _ in ready):
-            self.control.read(0)  # beyond a dialogue nothing is said there but that it ends
-            if len(ready) == 1:
-                return []
+            try:
+                self.control.read(0)  # beyond a dialogue nothing is said there but that it ends
+            except LinkLostError as error:
+                self._failed = error
         return super()._fetch(ready)
 
     def _send(self, data: bytes) -> None:

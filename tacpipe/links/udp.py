@@ -12,6 +12,7 @@ from typing import Any
 from tacpipe.errors import DeviceError
 from tacpipe.links import holders, network
 from tacpipe.links.arrival import Arrivals
+from tacpipe.links.link import LinkLostError
 from tacpipe.links.opened import Arrived, Descriptor
 from tacpipe.sensors.sensor import Sensor
 
@@ -29,7 +30,7 @@ def open_udp(place: str, sensor: Sensor, name: str) -> UdpLink:
     Raises `DeviceError` for a local port that is taken, and for a host that is unknown or unreachable.
     """
     host, port = network.place("udp", place)
-    if not host or getattr(sensor, "listens", False):
+    if not host or sensor.listens:
         return UdpLink(name, bound(host, port, name), prompt=hurries(sensor))
     made = None
     try:
@@ -89,6 +90,7 @@ class UdpLink(Descriptor):
         self._arrivals = Arrivals()
         self._overruns = 0
         self._sender: Any = None  # of the last datagram
+        self._failed: LinkLostError | None = None  # why the link is lost, until that is told
 
     @property
     def local(self) -> Mapping[str, Any]:
@@ -101,24 +103,39 @@ class UdpLink(Descriptor):
         """How many datagrams the kernel dropped because its queue was full."""
         return self._overruns
 
+    def _receive(self, timeout_s: float) -> Arrived:
+        found = super()._receive(timeout_s) if self._failed is None else []
+        if self._failed is not None and not found:  # else what had arrived comes first, and the loss at the next read
+            failed, self._failed = self._failed, None
+            raise failed
+        return found
+
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         if not self._prompt:
             time.sleep(LINGER_S)
+        queued = self._queued()
         self._arrivals.look()
+        return [(self._arrivals.of(wall_ns), data) for wall_ns, data in queued]
+
+    def _queued(self) -> Arrived:
+        """Return the datagrams that wait, with their arrivals on the wall clock; an error is kept for `_receive`."""
         found: Arrived = []
         while True:
             try:
-                data, told, _, sender = self.socket.recvmsg(MOST, ROOM)
+                data, told, _, self._sender = self.socket.recvmsg(MOST, ROOM)
             except BlockingIOError:
                 return found
             except OSError as error:
-                if isinstance(error, ConnectionRefusedError):
-                    raise self.lost(
-                        "the host is there, but refuses the port", "the port, and that it streams"
-                    ) from error
-                raise self.lost(error.strerror or str(error)) from error
+                if self._failed is not None:
+                    return found
+                self._failed = self._refused(error)  # which the kernel tells once, before what waits
+                continue
             found.append((self._arrival(told), data))
-            self._sender = sender
+
+    def _refused(self, error: OSError) -> LinkLostError:
+        if isinstance(error, ConnectionRefusedError):
+            return self.lost("the host is there, but refuses the port", "the port, and that it streams")
+        return self.lost(error.strerror or str(error))
 
     def _arrival(self, told: list[tuple[int, int, bytes]]) -> int:
         """Return the arrival that the ancillary messages of a datagram tell, and take note of drops."""
@@ -129,7 +146,7 @@ class UdpLink(Descriptor):
                 wall_ns = seconds * 1_000_000_000 + nanoseconds
             elif level == socket.SOL_SOCKET and kind == DROPS:
                 self._overruns = int.from_bytes(data[:4], "little")
-        return self._arrivals.of(time.time_ns() if wall_ns is None else wall_ns)
+        return time.time_ns() if wall_ns is None else wall_ns
 
     def _send(self, data: bytes) -> None:
         if not self._talks and self._sender is None:

@@ -75,9 +75,10 @@ class WebsocketLink(Opened):
         from websockets.exceptions import ConnectionClosed
 
         try:
-            self.connection.send(data.decode())  # servers of sensors take text
-        except UnicodeDecodeError:
-            self.connection.send(data)
+            try:
+                self.connection.send(data.decode())  # servers of sensors take text
+            except UnicodeDecodeError:
+                self.connection.send(data)
         except ConnectionClosed as error:
             raise self.lost(f"the other end closed the websocket ({error})") from error
 

@@ -6,7 +6,9 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
 
 from tacpipe import directory, provenance
 from tacpipe import manifest as manifest_of
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
+BYTES = "bytes"  # and under this one its spool, where a driver could not read all of it
 RIG = "rig.toml"  # under this name the rig file goes along with a recording
 
 
@@ -34,22 +37,22 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     """Append a recording to the dataset at ``output`` and return its name.
 
     Its shards are durable, and read again and compared, before the manifest names them. Raises `NothingError` if no stream
-    gave anything, and `DamagedError` if what was written is not what is read.
+    gave anything (`TacpipeError` if they gave no sample), and `DamagedError` if what was written is not what is read.
     """
     began_s = time.perf_counter()
     tables = {name: one.table for name, one in sealed.items() if one.table.num_rows}
     if not tables:
-        raise NothingError(
-            f"No stream gave a single sample ({', '.join(sealed)}), so there is no recording. "
-            f"`tacpipe acquire --dry-run` tells what each device sends."
-        )
+        _refuse(spooled, sealed)
     events = events_table(sealed, spooled)
     if events.num_rows:
         tables["events"] = events
     shards = {name: _shard(store, name, table) for name, table in sorted(tables.items())}
     text = vars(store.put(rig.text.encode(), durable=True))
     entry: Entry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
-    result = {"recordings": {"": entry}, "files": {RIG: text}}
+    files = {RIG: text}
+    if any(one.undecoded for one in sealed.values()):  # what no driver could read today, a better one may
+        files[BYTES] = vars(store.put((spooled.folder / "bytes").read_bytes(), durable=True))
+    result = {"recordings": {"": entry}, "files": files}
     identity = {
         "stage": ACQUIRE,
         "version": VERSION,
@@ -70,11 +73,25 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
         now = replace(
             now,
             recordings=dict(sorted({**now.recordings, name: entry}.items())),
+            files=dict(sorted({**now.files, f"rig-{text['digest'][:8]}.toml": text}.items())),
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
         store.put(now.content, durable=True)
         directory.publish(store, now, output)
     return name
+
+
+def _refuse(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
+    """Say that there is no recording; what holds no byte at all is removed."""
+    received = sum(one.received for one in sealed.values())  # what was read and never written is gone
+    if not received and not spooled.damage:
+        spooled.remove()
+        raise NothingError(f"No stream gave a single byte ({', '.join(sealed)}), so there is no recording.")
+    spoiled = sum(one.bytes for one in spooled.damage)
+    raise TacpipeError(
+        f"{received:,} bytes came from {', '.join(sealed)} and hold no sample; {spoiled:,} more are spoiled. "
+        f"`tacpipe acquire --dry-run` tells what each device sends."
+    )
 
 
 def existing(output: Path) -> Manifest | None:
@@ -105,12 +122,25 @@ def _shard(store: Store, stream: str, table: pa.Table) -> dict[str, Any]:
     from tacpipe.tables import from_parquet, to_parquet
 
     stored: Object = store.put(to_parquet(table), durable=True)
-    if not from_parquet(store.read(stored.digest)).equals(table):
-        raise DamagedError(
-            f"Stream {stream} does not read as it was written; the disk is not to be trusted. The spool is kept: "
-            f"`tacpipe acquire --recover` seals it once that is mended."
-        )
+    if not _same(from_parquet(store.read(stored.digest)), table):
+        raise DamagedError(f"Stream {stream} does not read as it was written: the disk is not to be trusted.")
     return {"digest": stored.digest, "rows": table.num_rows, "bytes": stored.bytes}
+
+
+def _same(read: pa.Table, written: pa.Table) -> bool:
+    """Return whether two tables are equal to the bit: NaN is equal to itself."""
+    import pyarrow as pa
+
+    if not read.schema.equals(written.schema):
+        return False
+    for ours, theirs in zip(read.columns, written.columns, strict=True):
+        if pa.types.is_floating(ours.type):
+            one, other = (column.to_numpy().view(f"u{ours.type.bit_width // 8}") for column in (ours, theirs))
+            if not np.array_equal(one, other):
+                return False
+        elif not ours.equals(theirs):
+            return False
+    return True
 
 
 def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dict[str, Attribute]:
@@ -122,6 +152,8 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
         attributes[f"{name}_lost"] = one.lost
         if not one.table.num_rows:
             attributes[f"{name}_missing"] = True
+        if one.undecoded:
+            attributes[f"{name}_undecoded_bytes"] = one.undecoded
         if one.crashed[0]:
             attributes |= {f"{name}_crash_lost_reads": one.crashed[0], f"{name}_crash_lost_bytes": one.crashed[1]}
     return attributes

@@ -62,6 +62,7 @@ class Reading:
         self._device_counting = _counting(sensor, sensor.device_counter)
         self._unexplained: list[Loss] = []  # losses before a sample that tells how many frames they cost
         self._last_ns: int | None = None
+        self._device_ns: tuple[int, int] | None = None  # the device's clock as it was sent last, and unrolled
         self._silence: Event | None = None  # that may still be made up for
 
     @property
@@ -79,6 +80,10 @@ class Reading:
     def broken(self) -> Batch:
         """Return what was left when the link was lost; what comes next is from a new one."""
         batch = self._batch(*self._framer.flush())
+        self._device_ns = None  # a device that was without power begins anew
+        for counting in (self._counting, self._device_counting):
+            if counting is not None:
+                counting.reopened()
         self._before = self.account
         self._framer = self.sensor.framer()
         return batch
@@ -100,6 +105,8 @@ class Reading:
         self.frames += sum(len(s) if s.rows is None else len(np.unique(s.rows)) for _, s in decoded)
         every = [samples for _, samples in decoded]
         seq, device_seq, t_device_ns = (_joined(every, name) for name in ("seq", "device_seq", "t_device_ns"))
+        if t_device_ns is not None and self.sensor.device_wrap_ns is not None:
+            t_device_ns = self._unrolled(t_device_ns, self.sensor.device_wrap_ns)
         events: list[Event] = []
         kept = np.ones(len(t_ns), dtype=bool)
         self._unexplained += losses
@@ -122,6 +129,14 @@ class Reading:
         blocks = tuple(np.concatenate(several) for several in zip(*(one.values for one in every), strict=True))
         batch = Batch(t_ns, blocks, seq, device_seq, t_device_ns, tuple(sorted(events)))
         return batch if kept.all() else _chosen(batch, kept)
+
+    def _unrolled(self, sent_ns: Times, wrap_ns: int) -> Times:
+        """Return device times (sample,) that go on where the clock begins at 0 again; a smaller step back stays one."""
+        last_sent_ns, last_ns = self._device_ns or (int(sent_ns[0]), int(sent_ns[0]))
+        steps_ns = np.diff(sent_ns, prepend=last_sent_ns)
+        unrolled: Times = last_ns + np.cumsum(np.where(steps_ns < -wrap_ns // 2, steps_ns + wrap_ns, steps_ns))
+        self._device_ns = int(sent_ns[-1]), int(unrolled[-1])
+        return unrolled
 
     def _explained(self, counted: Counted, t_ns: Times) -> list[Event]:
         """Return the events of a batch whose samples are counted: each loss costs what the counter says, and no more."""
@@ -152,10 +167,9 @@ class Reading:
 
     def _silences(self, t_ns: Times) -> list[Event]:
         """Return the silences that are over; what comes in a burst behind one was late and is not lost."""
-        rate_hz = self.sensor.rate_hz
-        if not rate_hz or not len(t_ns):
+        if not self.sensor.awaited or not len(t_ns):
             return []
-        period_ns = 1e9 / rate_hz
+        period_ns = 1e9 / self.sensor.rate_hz
         apart_ns = np.diff(t_ns, prepend=int(t_ns[0]) if self._last_ns is None else self._last_ns)
         silent = apart_ns > max(SILENT_NS, SILENT_PERIODS * period_ns)
         if self._silence is None and not silent.any():

@@ -7,23 +7,21 @@ import functools
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
 
-from tacpipe.errors import DeviceError, TacpipeError
-from tacpipe.recording.rig import Rig, Stream
+from tacpipe.errors import DeviceError
+from tacpipe.recording import stranger
+from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Note, Spool
-from tacpipe.recording.station import Station
+from tacpipe.recording.station import LOST, Station
 from tacpipe.recording.watch import Watch
 from tacpipe.sensors.framing import Chunks
 
 TICK_S = 0.05  # between two looks at what came; what a crash costs is about as long
 SYNC_S = 0.5  # between two syncs of the spool
-FIRST_S = 3.0  # in which every stream that has a rate must give its first sample
+FIRST_S = 3.0  # in which every stream that should send all the time must give its first sample
+SILENT_S = 2.0  # without a sample, after which such a stream counts as lost though its link is open
 PREROLL_S = 0.5  # before a trigger, that are recorded too
-
-Recognise = Callable[[Stream, Iterable[Chunks]], str]  # a sentence on what speaks there instead
 
 
 class Recorder:
@@ -56,11 +54,14 @@ class Recorder:
                 station.stop()
 
     def tick(self) -> None:
-        """Look at what came since the last tick."""
-        for name, station in self.stations.items():
-            self._took(name, station.take())
+        """Look at what came since the last tick: first it is spooled, then looked at."""
+        came = {name: station.take() for name, station in self.stations.items()}
         if self._spool is not None:
+            for name, blocks in came.items():
+                _spooled(self._spool, name, blocks)
             self._spool.write()
+        for name, blocks in came.items():
+            self._watched(name, blocks)
 
     def run(self, until: Callable[[], bool], each: Callable[[], None] = lambda: None) -> None:
         """Tick until ``until()``; ``each`` is called after every tick."""
@@ -71,10 +72,10 @@ class Recorder:
             due_s = max(due_s + TICK_S, time.monotonic())
             time.sleep(max(0.0, due_s - time.monotonic()))
 
-    def await_first(self, recognise: Recognise, stopped: Callable[[], bool]) -> None:
-        """Wait until every stream with a rate gave a sample. Raises `DeviceError` naming those that do not, and why."""
+    def await_first(self, stopped: Callable[[], bool]) -> None:
+        """Wait until every stream that should gave a sample. Raises `DeviceError` naming those that do not, and why."""
         deadline_s = time.monotonic() + FIRST_S
-        late = {name for name, watch in self.watches.items() if watch.stream.sensor.rate_hz}
+        late = {name for name, watch in self.watches.items() if watch.stream.sensor.awaited}
 
         def settled() -> bool:
             late.difference_update({name for name in late if self.watches[name].samples})
@@ -82,77 +83,95 @@ class Recorder:
 
         self.run(settled)
         if late and not stopped():
-            raise DeviceError("\n".join(self._silent(name, recognise) for name in sorted(late)))
+            raise DeviceError("\n".join(self._silent(name) for name in sorted(late)))
 
     @contextlib.contextmanager
-    def recording(self, store: Path, header: Mapping[str, Any], *, preroll: bool = False) -> Iterator[Spool]:
-        """Record what comes while in the block, and with ``preroll`` what came right before."""
-        spool = Spool(store, {**header, "rig": self.rig.text}, list(self.stations))
+    def recording(self, spool: Spool, *, preroll: bool = False) -> Iterator[None]:
+        """Spool what comes while in the block, and with ``preroll`` what came right before; then finish the spool."""
         ended = threading.Event()
         syncing = threading.Thread(target=_sync, args=(spool, ended), daemon=True)
+        since_ns = time.monotonic_ns() - round(PREROLL_S * 1e9)
         for name, station in self.stations.items():
-            number = spool.streams[name]
-            self._took(name, station.begin(functools.partial(spool.tally, number)))
-            for _, blocks in self._before[name] if preroll else ():
-                _spooled(spool, name, blocks)
+            self._watched(name, station.take())
+            early = _since(self._before[name], since_ns) if preroll else None
+            found = station.begin(functools.partial(spool.tally, spool.streams[name]), early)
+            if station.error is not None:  # of what happened before a recording nothing else would tell
+                spool.note(Note(time.monotonic_ns(), name, LOST, str(station.error)))
+            if early is not None:
+                _spooled(spool, name, [*early, *found])
+            self._watched(name, found)
         self._spool = spool
         syncing.start()
         try:
-            yield spool
+            yield
         finally:
             self._spool = None
-            for name, station in self.stations.items():
-                blocks = station.end()
-                self.watches[name].feed(blocks)
+            last = {name: station.end() for name, station in self.stations.items()}
+            for name, blocks in last.items():
                 _spooled(spool, name, blocks)
             ended.set()
             syncing.join()
-            spool.close()
+            spool.finish()
+            for name, blocks in last.items():
+                self._watched(name, blocks)  # the next recording may want what came right before it
 
     def lost(self) -> list[str]:
-        """Return the streams whose link is lost now, each with why."""
-        return [f"{name}: {station.error}" for name, station in self.stations.items() if station.error is not None]
+        """Return a sentence for each stream whose link is lost now, or open and silent where it should not be."""
+        sentences = []
+        for name, station in self.stations.items():
+            silent_s = (time.monotonic_ns() - (self.watches[name].last_ns or 0)) / 1e9
+            if station.error is not None:
+                sentences.append(str(station.error))
+            elif station.stream.sensor.awaited and silent_s > SILENT_S:
+                sentences.append(
+                    f"Stream {name} ({station.stream.address}): nothing came for {silent_s:.1f} s, though it is open. "
+                    f"The device hangs or is switched off: switch it off and on."
+                )
+        return sentences
 
-    def tare(self) -> list[str]:
-        """Have every device take its present reading for zero; return those streams that have no such command."""
-        none = [name for name, station in self.stations.items() if not station.tare()]
+    def tare(self) -> None:
+        """Have every device that knows how take its present reading for zero."""
+        for station in self.stations.values():
+            station.tare()
         for watch in self.watches.values():
             watch.tare()
-        return none
 
-    def _took(self, name: str, blocks: list[Chunks | Note]) -> None:
-        now_ns = time.monotonic_ns()
+    def _watched(self, name: str, blocks: list[Chunks | Note]) -> None:
+        """Look at what came, and keep it as long as a trigger may want it."""
         before = self._before[name]
         if blocks:
             self.watches[name].feed(blocks)
-            before.append((now_ns, blocks))
-        while before and before[0][0] < now_ns - PREROLL_S * 1e9:
+            before.append((time.monotonic_ns(), blocks))
+        while before and before[0][0] < time.monotonic_ns() - PREROLL_S * 1e9:
             before.popleft()
-        if self._spool is not None:
-            _spooled(self._spool, name, blocks)
 
-    def _silent(self, name: str, recognise: Recognise) -> str:
+    def _silent(self, name: str) -> str:
         station, watch = self.stations[name], self.watches[name]
-        stream = station.stream
         if station.error is not None:
             return str(station.error)
-        heard = sum(len(chunk.data) for chunk in watch.heard)
-        if not heard:
-            return (
-                f"Stream {name}: {stream.address} is open and silent: {stream.kind} sent nothing in {FIRST_S:g} s. "
-                f"Check its power and cable, and that its stream is on; `tacpipe sensors probe {stream.address}` listens at "
-                f"all rates."
-            )
-        return (
-            f"Stream {name}: {heard} bytes came from {stream.address} in {FIRST_S:g} s, and none make a frame of "
-            f"{stream.kind}. {recognise(stream, watch.heard)}"
+        if watch.error:
+            return f"Stream {name} ({station.stream.address}): {watch.error}"
+        return stranger.sentence(
+            station.stream, f"a frame of {station.stream.kind} was awaited for {FIRST_S:g} s", watch.heard
         )
 
 
 def _sync(spool: Spool, ended: threading.Event) -> None:
-    while not ended.wait(SYNC_S):
-        with contextlib.suppress(TacpipeError):  # the next write says so in the thread that can act on it
-            spool.sync()
+    while not ended.wait(SYNC_S) and spool.failed is None:
+        spool.sync()
+
+
+def _since(before: deque[tuple[int, list[Chunks | Note]]], since_ns: int) -> list[Chunks | Note]:
+    """Return what arrived since a moment, of blocks that were taken at any time after."""
+    blocks = [block for _, several in before for block in several]
+    kept: list[Chunks | Note] = []
+    for block in blocks:
+        if isinstance(block, Chunks):
+            block = block.since(since_ns)
+            kept += [block] if len(block.size) else []
+        elif block.t_ns >= since_ns:
+            kept.append(block)
+    return kept
 
 
 def _spooled(spool: Spool, name: str, blocks: list[Chunks | Note]) -> None:

@@ -14,6 +14,7 @@ options = { sensor = 1 }
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -86,13 +87,13 @@ def parse(text: str, where: str = "rig.toml") -> Rig:
             raise UsageError(f"{where} has two streams named {stream.name}; names must be unique.")
         streams[stream.name] = stream
     master = found.get("master", next(iter(streams)))
-    if master not in streams:
+    if not isinstance(master, str) or master not in streams:
         raise UsageError(f"{where}: the master is {master!r}; it must be one of the streams, {', '.join(streams)}.")
-    labels = found.get("labels", {})
+    labels = _table(found, "labels", where)
     for name, value in labels.items():
-        if not isinstance(value, str | int | float | bool):
-            raise UsageError(f"{where}: label {name} is {value!r}; it must be text, a number, true or false.")
-    return Rig(streams, master, labels, found.get("emulate", {}), text)
+        if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
+            raise UsageError(f"{where}: label {name} is {value!r}; it must be text, a finite number, true or false.")
+    return Rig(streams, master, labels, _table(found, "emulate", where), text)
 
 
 def _stream(table: Mapping[str, Any], where: str) -> Stream:
@@ -105,7 +106,7 @@ def _stream(table: Mapping[str, Any], where: str) -> Stream:
         raise UsageError(
             f"{where}: {name!r} cannot name a stream; take small letters, digits and _, and neither of {', '.join(TAKEN)}."
         )
-    kind, options = table["sensor"], table.get("options", {})
+    kind, options, emulate = table["sensor"], _table(table, "options", where), _table(table, "emulate", where)
     address = link.parse(table["transport"])
     sensor = make(kind, options, where)
     if address.scheme not in sensor.links:
@@ -113,7 +114,14 @@ def _stream(table: Mapping[str, Any], where: str) -> Stream:
             f"{where}: {kind} cannot be reached by {address}; it must be {' or '.join(sensor.links)}, as in "
             f"{' or '.join(link.SCHEMES[scheme] for scheme in sensor.links)}."
         )
-    return Stream(name, kind, sensor, address, options, table.get("emulate", {}))
+    return Stream(name, kind, sensor, address, options, emulate)
+
+
+def _table(found: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
+    value = found.get(key, {})
+    if not isinstance(value, dict):
+        raise UsageError(f"{where}: {key} is {value!r}; it must be a table, as in {key} = {{ … }}.")
+    return value
 
 
 def make(kind: str, options: Mapping[str, Any], where: str) -> Sensor:

@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.recording.reading import Batch, Event, Reading
+from tacpipe.errors import TacpipeError
+from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Note, Spooled
-from tacpipe.recording.station import LOST
-from tacpipe.sensors.framing import Account, Chunks
+from tacpipe.recording.station import LOST, OPENED, OVERRUN
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+END_S = 0.5  # by which a stream may end before the others without a word
+UNDECODED = "undecoded"  # bytes at which the driver gave up
 CRASH = "crash"  # what a process had read and not yet written when it ended
 MOST_BYTES = 8 << 20  # of a stream's chunks that are decoded in one go
 
 
 @dataclass(frozen=True)
 class Sealed:
-    """One stream of a spool as a table, and the account of its bytes."""
+    """One stream of a spool as a table, and what became of the rest of its bytes."""
 
     table: pa.Table
     events: list[Event]
-    account: Account
     lost: int  # frames, by counter where there is one
+    received: int = 0  # bytes
+    undecoded: int = 0  # of them, that the driver could not make sense of: its mistake, or another device
     crashed: tuple[int, int] = (0, 0)  # chunks and bytes that were read and never spooled
 
 
@@ -44,42 +49,74 @@ class _Parts:
             self.batches.append(batch)
 
 
-def seal(spooled: Spooled, rig: Rig, advance: Callable[[], None] = lambda: None) -> dict[str, Sealed]:
-    """Return every stream of a spool; ``advance`` is called after each."""
-    sealed = {}
-    for name in spooled.streams:
-        sealed[name] = stream(spooled, rig, name)
-        advance()
-    return sealed
+def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
+    """Return every stream of a spool."""
+    end_ns = max((one.last_ns for one in spooled.tallied().values()), default=0)
+    return {name: stream(spooled, rig, name, end_ns) for name in spooled.streams}
 
 
-def stream(spooled: Spooled, rig: Rig, name: str) -> Sealed:
-    """Return one stream of a spool: ``t_ns`` in UTC, the device's time and counters beside it, and the channels."""
+def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
+    """Return one stream of a spool: ``t_ns`` in UTC, the device's time and counters beside it, and the channels.
+
+    ``end_ns`` is when the last byte of any stream came: one that fell silent long before says so.
+    """
     sensor = rig.streams[name].sensor
     reading, parts = Reading(sensor), _Parts()
-    chunks = size = 0
-    for _, block in _gathered(spooled, name):
-        if isinstance(block, Chunks):
-            chunks += len(block.size)
-            size += len(block.data)
-            parts.add(reading.feed(block))
+    chunks = size = undecoded = 0
+    away = False
+    for block in _gathered(spooled, name):
+        if isinstance(block, Note):
+            away |= block.what == LOST
+            if block.what == LOST:
+                parts.add(reading.broken())
+            if block.what != OPENED or away:  # that it opened before it was recorded is no event
+                parts.events.append(_told(block, sensor))
             continue
-        if block.what == LOST:
-            parts.add(reading.broken())
-        if block.what != "opened" or parts.batches:
-            parts.events.append(Event(block.t_ns, block.what, detail=block.detail))
+        chunks += len(block.size)
+        size += len(block.data)
+        try:
+            parts.add(reading.feed(block))
+        except Exception as error:  # of a driver: the other streams, and what came before and after, are sealed
+            undecoded += len(block.data)
+            why = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+            parts.events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=why))
+            reading = Reading(sensor)
     parts.add(reading.finish())
-    tallied = spooled.tallied().get(name)
-    crashed = (0, 0)
-    if tallied is not None and tallied.chunks > chunks:
-        crashed = tallied.chunks - chunks, tallied.bytes - size
-        detail = f"{crashed[0]} reads were never written"
-        parts.events.append(Event(tallied.last_ns, CRASH, frames=0, bytes=crashed[1], detail=detail))
+    parts.events += _silent_end(sensor, parts.batches, end_ns)
+    crashed = _crashed(spooled, name, chunks, size)
+    if crashed[0]:
+        last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
+        parts.events.append(Event(last_ns, CRASH, bytes=crashed[1], detail=detail))
     events = [event._replace(t_ns=spooled.utc_ns(event.t_ns)) for event in parts.events]
-    return Sealed(table(sensor.fields(), parts.batches, spooled), events, reading.account, reading.lost, crashed)
+    lost = sum(event.frames for event in events)
+    made = table(sensor.fields(), parts.batches, spooled)
+    return Sealed(made, events, lost, received=size, undecoded=undecoded, crashed=crashed)
 
 
-def _gathered(spooled: Spooled, name: str) -> Any:
+def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
+    """Return how many chunks and bytes of a stream were read beyond those that were spooled."""
+    tallied = spooled.tallied().get(name)
+    return (0, 0) if tallied is None or tallied.chunks <= chunks else (tallied.chunks - chunks, tallied.bytes - size)
+
+
+def _told(note: Note, sensor: Sensor) -> Event:
+    """Return the event of a note; packets that this computer dropped are lost, where no counter says so itself."""
+    dropped = int(note.detail) if note.what == OVERRUN and sensor.counter is None else 0
+    return Event(note.t_ns, note.what, dropped, detail=note.detail)
+
+
+def _silent_end(sensor: Sensor, batches: Sequence[Batch], end_ns: int) -> list[Event]:
+    """Return the event of a stream that gave nothing any more well before the end; no counter tells of that."""
+    last_ns = int(batches[-1].t_ns[-1]) if batches else end_ns
+    apart_s = (end_ns - last_ns) / 1e9
+    if not sensor.awaited or apart_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
+        return []
+    return [
+        Event(end_ns, SILENT, round(apart_s * sensor.rate_hz), detail=f"{apart_s:.1f} s, up to the end, by the clock")
+    ]
+
+
+def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
     """Yield the blocks of a stream, those of chunks joined so that each is worth decoding."""
     waiting: list[Chunks] = []
     for _, block in spooled.blocks(name):
@@ -88,17 +125,12 @@ def _gathered(spooled: Spooled, name: str) -> Any:
             if sum(len(one.data) for one in waiting) < MOST_BYTES and len(waiting) < 512:
                 continue
         if waiting:
-            yield name, _together(waiting)
+            yield Chunks.joined(waiting)
             waiting = []
         if isinstance(block, Note):
-            yield name, block
+            yield block
     if waiting:
-        yield name, _together(waiting)
-
-
-def _together(several: Sequence[Chunks]) -> Chunks:
-    stamps, sizes = np.concatenate([one.t_ns for one in several]), np.concatenate([one.size for one in several])
-    return Chunks(stamps, sizes, b"".join(one.data for one in several))
+        yield Chunks.joined(waiting)
 
 
 def table(fields: Sequence[pa.Field], batches: Sequence[Batch], spooled: Spooled) -> pa.Table:

@@ -38,7 +38,8 @@ MARK = b"tacB"
 HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
 CHUNKS, NOTE = 0, 1  # kinds of blocks
 TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
-MOST_STREAMS = 256
+YOUNG_S = 60.0  # for which a spool without a header may be one that is being begun
+RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # after a full disk
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Spool:
             for folder in (self.folder, self.folder.parent):
                 sync_folder(str(folder))
         self._waiting: list[bytes] = []
-        self.bytes = 0
+        self.failed: OSError | None = None  # what the disk said to a sync: it says so once
 
     def tally(self, stream: int, chunks: int, size: int, last_ns: int) -> None:
         """Note how much a stream has received in all, before it is appended."""
@@ -115,26 +116,44 @@ class Spool:
     def write(self) -> None:
         """Hand over what was added to the operating system: it outlasts this process.
 
-        Raises `TacpipeError` when the disk is full.
+        Raises `TacpipeError` when the disk takes nothing more.
         """
         left = memoryview(b"".join(self._waiting))
         self._waiting = []
-        self.bytes += len(left)
-        with readable_errors(self.folder):
+        try:
+            if self.failed is not None:
+                raise self.failed
             while left:
                 left = left[os.write(self._file, left) :]
+        except OSError as error:
+            raise TacpipeError(
+                f"The disk takes nothing more of the recording ({error.strerror}), so it ended. What came until then is in "
+                f"{self.folder}; {RECOVER}."
+            ) from error
 
     def sync(self) -> None:
-        """Have what was written outlast a loss of power."""
-        with readable_errors(self.folder):
+        """Have what was written outlast a loss of power; a disk that fails is told by the next `write`."""
+        try:
             os.fdatasync(self._file)
+        except OSError as error:
+            self.failed = error
 
-    def close(self) -> None:
-        """Write and sync the rest."""
+    def finish(self) -> None:
+        """Write and sync the rest. Nobody else recovers it until `close`. Raises as `write`."""
         self.write()
         self.sync()
+        self.write()
         self._tally.flush()
-        os.close(self._file)
+
+    def close(self) -> None:
+        """Finish, and let go of it."""
+        if self._file < 0:
+            return
+        try:
+            self.finish()
+        finally:
+            os.close(self._file)
+            self._file = -1
 
 
 class Spooled:
@@ -202,35 +221,57 @@ class Spooled:
 
     def remove(self) -> None:
         """Remove the spool, whose content is sealed."""
-        for name in ("bytes", "tally", "header.json"):
-            with contextlib.suppress(FileNotFoundError):
-                (self.folder / name).unlink()
-        with contextlib.suppress(OSError):
-            self.folder.rmdir()
+        _remove(self.folder)
 
 
 def abandoned(store: Path) -> list[Path]:
-    """Return the folders of spools that no process writes any more, oldest first."""
+    """Return the folders of spools that no process writes or seals any more, oldest first."""
     found = []
     for folder in (store / FOLDER).glob("*"):
-        try:
-            handle = os.open(folder / "bytes", os.O_RDONLY)
-        except OSError:
-            continue
+        with claimed(folder) as ours:
+            if not ours:
+                continue
+            age_s = time.time() - (folder / "bytes").stat().st_mtime
+            if (folder / "header.json").exists():
+                found.append((-age_s, folder))
+            elif age_s > YOUNG_S:  # its process ended before it recorded
+                _remove(folder)
+    return [folder for _, folder in sorted(found)]
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[bool]:
+    """Hold a spool while in the block; yield False if it is gone, or if a process writes or seals it."""
+    try:
+        handle = os.open(folder / "bytes", os.O_RDONLY)
+    except OSError:
+        yield False
+        return
+    try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            found.append((os.fstat(handle).st_mtime, folder))
+            ours = os.fstat(handle).st_nlink > 0
         except BlockingIOError:
-            pass
-        finally:
-            os.close(handle)
-    return [folder for _, folder in sorted(found)]
+            ours = False
+        yield ours
+    finally:
+        os.close(handle)
+
+
+def _remove(folder: Path) -> None:
+    for name in ("bytes", "tally", "header.json", ".header.json"):
+        with contextlib.suppress(FileNotFoundError):
+            (folder / name).unlink()
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def _tally(folder: Path, streams: int) -> mmap.mmap:
     handle = os.open(folder / "tally", os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
     try:
-        os.ftruncate(handle, max(1, streams) * TALLY.size)
+        os.posix_fallocate(
+            handle, 0, max(1, streams) * TALLY.size
+        )  # a hole that a full disk cannot fill kills its writer
         return mmap.mmap(handle, max(1, streams) * TALLY.size)
     finally:
         os.close(handle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -9,15 +10,20 @@ from collections.abc import Callable
 
 from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
+from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError
+from tacpipe.recording import stranger
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool import Note
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
+TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
 READ_S = 0.1  # longest wait of a read, after which the thread looks whether it should end
 AGAIN_S = (0.1, 2.0)  # between two tries to open a lost link: first, and at most
+MUTE_S = 4.0  # after which a device that should send datagrams and does not is asked anew: nothing else tells its loss
+TARE_S = 5.0  # in which a device must have tared
 REPLY_S = 0.5  # after which a device that is asked for each frame is asked once more
 
 Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
@@ -45,7 +51,11 @@ class Station:
 
     def start(self) -> None:
         """Open the link and begin to read it. Raises `DeviceError` if that fails."""
-        self._open()
+        try:
+            self._open()
+        except NoReplyError as error:
+            heard = [Chunks.of(error.heard)] if error.heard else []
+            raise DeviceError(stranger.sentence(self.stream, error.awaited, heard, reply=True)) from error
         self._thread.start()
 
     def take(self) -> list[Chunks | Note]:
@@ -53,11 +63,16 @@ class Station:
         with self._keeping:
             return self._taken()
 
-    def begin(self, tally: Tally) -> list[Chunks | Note]:
-        """Return what came since the last call, and tell ``tally`` from now on how much came after that."""
+    def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
+        """Return what came since the last call, and tell ``tally`` from now on how much came after that.
+
+        ``early`` is what came before and is recorded too: it counts, and with it what this returns. None: neither.
+        """
         with self._keeping:
             found = self._taken()
-            self._chunks = self._bytes = 0
+            counted = [] if early is None else [block for block in (*early, *found) if isinstance(block, Chunks)]
+            self._chunks = sum(len(block.size) for block in counted)
+            self._bytes = sum(len(block.data) for block in counted)
             self._tally = tally
             return found
 
@@ -67,7 +82,7 @@ class Station:
             self._tally = None
             return self._taken()
 
-    def tare(self, timeout_s: float = 5.0) -> bool:
+    def tare(self) -> bool:
         """Have the device take its present reading for zero; return False if it has no such command.
 
         Raises `DeviceError` if the link is lost or the device does not reply.
@@ -85,7 +100,7 @@ class Station:
             done.set()
 
         self._orders.append(order)
-        if not done.wait(timeout_s):
+        if not done.wait(TARE_S):
             raise DeviceError(f"Stream {name} could not be tared: its link is lost. Wait until it is back.")
         if failed:
             raise failed[0]
@@ -98,13 +113,11 @@ class Station:
             self._thread.join(timeout=2.0)
         link, self._link = self._link, None
         if link is not None:
-            try:
+            with contextlib.suppress(Exception):  # whatever a device says to its end, the others are to be closed too
                 said = self.stream.sensor.closing()
                 if said:
                     link.write(said)
-            except LinkLostError:
-                pass
-            finally:
+            with contextlib.suppress(Exception):
                 link.close()
 
     def _open(self) -> None:
@@ -126,16 +139,19 @@ class Station:
                 if self._link is None:
                     self._open()
                 self._read()
-            except DeviceError as error:
+            except TacpipeError as error:
                 self._lose(error)
+            except Exception as error:  # of a driver: told as a loss, and no other stream suffers
+                self._lose(DeviceError(f"Stream {self.stream.name} failed: {type(error).__name__}: {error}"))
 
     def _lose(self, error: TacpipeError) -> None:
         link, self._link = self._link, None
+        self.error = error
         if link is not None:
-            link.close()
             self._notes.append(Note(time.monotonic_ns(), self.stream.name, LOST, str(error)))
             self._wait_s = AGAIN_S[0]
-        self.error = error
+            with contextlib.suppress(Exception):  # of a device that is gone; nothing may end this thread
+                link.close()
         self._ending.wait(self._wait_s)
         self._wait_s = min(2 * self._wait_s, AGAIN_S[1])
 
@@ -147,8 +163,10 @@ class Station:
         if asked:
             self._ask(link, asked)
             return
+        heard_s = time.monotonic()
         while not self._ending.is_set():
             came = link.read(READ_S)
+            heard_s = self._heard(heard_s, came)
             self._keep(came)
             self._obey(link)
             if answers:
@@ -158,6 +176,16 @@ class Station:
                         link.write(said)
             if link.overruns != self._overruns:
                 self._overran(link.overruns)
+
+    def _heard(self, before_s: float, came: list[tuple[int, bytes]]) -> float:
+        """Return when the device was heard last. Raises `LinkLostError` for one that is mute, where silence alone tells."""
+        sensor, address, now_s = self.stream.sensor, self.stream.address, time.monotonic()
+        if came or address.scheme not in TALKING or sensor.listens or not sensor.awaited:
+            return now_s
+        if now_s - before_s > MUTE_S:
+            told = f"Stream {self.stream.name} ({address}) is lost: nothing came for {MUTE_S:g} s. {sensor.exclusive}"
+            raise LinkLostError(told.strip())
+        return before_s
 
     def _ask(self, link: Link, asked: bytes) -> None:
         """Read a device that sends a frame when it is asked: at the sensor's rate, never before it replied."""

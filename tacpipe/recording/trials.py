@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
+import sys
 import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
-from tacpipe.errors import DeviceError
+from tacpipe.errors import TacpipeError
 from tacpipe.recording import appending, sealing, triggers
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import Spooled
+from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.recording.view import View
 from tacpipe.stage import Attribute
 from tacpipe.store import Store
@@ -78,29 +79,31 @@ class Ended:
         self._asked.set()
 
 
-def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> list[Recorded]:
-    """Record what ``plan`` asks for and return what was recorded; ``ended`` cuts it short.
+def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> tuple[list[Recorded], list[str]]:
+    """Record what ``plan`` asks for; ``ended`` cuts it short, and so does a stream that was lost and is not back.
 
-    Raises `DeviceError`, after what came was sealed, if a stream was lost and is not back.
+    Return what was recorded, and a sentence for each stream that was lost.
     """
-    recorded = []
-    with triggers.keys() as pressed:
+    recorded: list[Recorded] = []
+    tap = triggers.Tap(recorder.watches) if "tap" in (plan.start, plan.stop) else None
+    with _keys(plan) as pressed:
         for trial in range(plan.trials):
             if plan.tare:
                 recorder.tare()
-            starts, stops = _triggers(recorder, plan, pressed)
+            starts, stops = _triggers(recorder, plan, pressed, tap)
             _await(recorder, starts, ended, view, f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}")
             if ended():
                 break
             recorded.append(_record(recorder, store, plan, trial, stops, view, ended))
             lost = recorder.lost()
-            if lost:
-                raise DeviceError(
-                    f"{recorded[-1].line()}\nThis was recorded and kept, but lost on the way and not back: {'; '.join(lost)}"
-                )
-            if ended():
-                break
-    return recorded
+            if lost or ended():
+                return recorded, lost
+    return recorded, []
+
+
+def _keys(plan: Plan) -> contextlib.AbstractContextManager[triggers.Keys]:
+    """Listen to the keyboard if a key is asked for; else the terminal is left alone, and may be another program's."""
+    return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
 
 
 def _await(recorder: Recorder, starts: triggers.Trigger, ended: Ended, view: View, waiting: str) -> None:
@@ -108,11 +111,14 @@ def _await(recorder: Recorder, starts: triggers.Trigger, ended: Ended, view: Vie
 
 
 def recover(store: Store, folder: Path) -> Recorded:
-    """Seal what an abandoned spool holds and append it to the dataset that it was recorded for."""
+    """Seal what an abandoned spool holds and append it to the dataset that it was recorded for.
+
+    Raises `TacpipeError` with what keeps it from being sealed; it stays as it is then.
+    """
     from tacpipe.recording import rig as rig_of
 
     spooled = Spooled(folder)
-    rig = rig_of.parse(spooled.header["rig"], f"the rig file in {folder}")
+    rig = rig_of.parse(spooled.header["rig"], f"The rig file in {folder}")
     return _sealed(store, Path(spooled.header["output"]), spooled, rig)
 
 
@@ -122,25 +128,33 @@ def _record(
     name = plan.name if plan.trials == 1 else f"{plan.name}-{trial + 1:03d}"
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
     header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
+    spool = Spool(store.root, {**header, "rig": recorder.rig.text}, list(recorder.stations))
     began_s = time.monotonic()
 
     def over() -> bool:
         late = plan.duration_s is not None and time.monotonic() - began_s >= plan.duration_s
         return ended() or late or stops()
 
-    with recorder.recording(store.root, header, preroll=plan.start != "now") as spool:
-        recorder.run(over, lambda: view.show(f"recording {name}, {time.monotonic() - began_s:.0f} s"))
-    view.show(f"sealing {name}")
-    return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig)
+    with contextlib.closing(spool):  # held until it is sealed: nobody else may recover it meanwhile
+        with recorder.recording(spool, preroll=plan.start != "now"):
+            recorder.run(over, lambda: view.show(f"recording {name}, {time.monotonic() - began_s:.0f} s"))
+        view.show(f"sealing {name}")
+        kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
+        try:
+            return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig)
+        except TacpipeError as error:
+            raise type(error)(f"{error} {kept} once that is mended.") from error
+        except Exception as error:
+            error.add_note(f"{kept}.")
+            raise
+        except KeyboardInterrupt:
+            print(f"tacpipe: interrupted. {kept}.", file=sys.stderr)
+            raise
 
 
 def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     sealed = sealing.seal(spooled, rig)
-    try:
-        name = appending.append(store, output, spooled, rig, sealed)
-    except appending.NothingError:
-        spooled.remove()
-        raise
+    name = appending.append(store, output, spooled, rig, sealed)
     spooled.remove()
     rows = {stream: one.table.num_rows for stream, one in sealed.items()}
     stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
@@ -148,15 +162,18 @@ def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     return Recorded(name, (last - first) / 1e9, rows, {stream: one.lost for stream, one in sealed.items()})
 
 
-def _triggers(recorder: Recorder, plan: Plan, pressed: triggers.Trigger) -> tuple[triggers.Trigger, triggers.Trigger]:
+def _triggers(
+    recorder: Recorder, plan: Plan, pressed: triggers.Keys, tap: triggers.Tap | None
+) -> tuple[triggers.Trigger, triggers.Trigger]:
     """Return what starts the next trial, and what stops it beside its duration."""
-    asked = {plan.start, plan.stop}
-    contact = triggers.Contact(recorder.watches, plan.contact_count) if "contact" in asked else None
-    tap: Any = triggers.Tap(recorder.watches) if "tap" in asked else None
-    starts = {"now": lambda: True, "key": pressed}
-    stops = {"duration": lambda: False, "key": pressed}
+    contact = None
+    if "contact" in (plan.start, plan.stop):
+        contact = triggers.Contact(recorder.watches, plan.contact_count)
+    starts: dict[str, triggers.Trigger] = {"now": lambda: True, "key": lambda: pressed(must=True)}
+    stops: dict[str, triggers.Trigger] = {"duration": lambda: False, "key": pressed}
     if contact is not None:
         starts["contact"], stops["contact"] = contact.touched, contact.released
     if tap is not None:
         starts["tap"], stops["tap"] = (lambda: tap.said("start")), (lambda: tap.said("stop"))
+        stops["duration"] = lambda: tap.said("start") and False  # one that comes meanwhile begins no other trial
     return starts[plan.start], stops[plan.stop]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import select
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from typing import Protocol
 
 import numpy as np
 
@@ -21,34 +23,60 @@ TAP = "tap"  # the kind of the stream that hears the lab's own programs
 Trigger = Callable[[], bool]
 
 
+class Keys(Protocol):
+    """Tells whether a key was pressed."""
+
+    def __call__(self, *, must: bool = False) -> bool:
+        """Return whether it was since the last call. With ``must``, raises `UsageError` where none can be any more."""
+
+
 @contextlib.contextmanager
-def keys() -> Iterator[Trigger]:
-    """Yield a function that tells whether Enter or the space bar was pressed since the last call."""
-    if not sys.stdin or sys.stdin.closed:
-        yield lambda: False
-        return
+def keys() -> Iterator[Keys]:
+    """Yield what tells whether Enter or the space bar was pressed."""
+    try:
+        source = sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):  # there is none, or it is closed
+        source = -1
     settings = None
+    waiting, ended = b"", source < 0
     with contextlib.suppress(Exception):  # no terminal: lines of standard input stand for keys
         import termios
         import tty
 
-        settings = termios.tcgetattr(sys.stdin)
-        tty.setcbreak(sys.stdin)
-    ended = False
+        settings = termios.tcgetattr(source)
+        tty.setcbreak(source)
 
-    def pressed() -> bool:
-        nonlocal ended
-        if ended or not select.select([sys.stdin], [], [], 0)[0]:
-            return False
-        read = sys.stdin.read(1) if settings else sys.stdin.readline()
-        ended = not read
-        return bool(read) and (settings is None or read in " \n")
+    def pressed(*, must: bool = False) -> bool:
+        nonlocal waiting, ended
+        if not ended and select.select([source], [], [], 0)[0]:
+            read = os.read(source, 4096)  # not through sys.stdin, which keeps what select does not see
+            waiting, ended = waiting + read, not read
+        taken, found = _pressed(waiting, lines=settings is None)
+        waiting = waiting[taken:]
+        if must and ended and not found:
+            raise UsageError(
+                "No key can be pressed: standard input is closed or at its end. Run it in a terminal, or start by time, "
+                "contact or tap."
+            )
+        return found
 
     try:
         yield pressed
     finally:
         if settings is not None:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, settings)
+            termios.tcsetattr(source, termios.TCSADRAIN, settings)
+
+
+def _pressed(typed: bytes, *, lines: bool) -> tuple[int, bool]:
+    """Return how many bytes of what was typed are dealt with, and whether one of them is a key that counts.
+
+    >>> _pressed(b"ab  ", lines=False), _pressed(b"go", lines=True), _pressed(b"go\\n\\n", lines=True)
+    ((3, True), (0, False), (3, True))
+    """
+    found = [place for place in (typed.find(key) for key in ((b"\n",) if lines else (b"\n", b" "))) if place >= 0]
+    if found:
+        return min(found) + 1, True
+    return (0 if lines else len(typed)), False
 
 
 class Contact:
@@ -91,15 +119,17 @@ class Tap:
                 'This rig has no stream of sensor "tap" that could say when to start or stop. Add one to the rig file, or '
                 "start and stop by key, time or contact."
             )
-        self._since_ns = time.monotonic_ns()
+        self._since_ns = [time.monotonic_ns() for _ in self._watches]
 
     def said(self, word: str) -> bool:
-        """Return whether ``{"event": word}`` came since the last time it did, or since this was made."""
-        for watch in self._watches:
+        """Return whether ``{"event": word}`` came since this was made; what came up to it, or at all, is dealt with."""
+        for number, watch in enumerate(self._watches):
             for chunk in watch.heard:
                 for t_ns, packet in zip(chunk.t_ns.tolist(), chunk.packets(), strict=True):
-                    if t_ns > self._since_ns and word in _events(packet):
-                        self._since_ns = t_ns
+                    if t_ns <= self._since_ns[number]:
+                        continue
+                    self._since_ns[number] = t_ns
+                    if word in _events(packet):
                         return True
         return False
 

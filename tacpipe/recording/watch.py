@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.errors import TacpipeError
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool import Note
@@ -39,6 +40,7 @@ class Watch:
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
         self.samples = 0
+        self.error = ""  # what its driver could not make of what came
         self.newest: NDArray[np.float64] | None = None  # (channel,)
         self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to tell what speaks where no frame is found
         self.last_ns: int | None = None  # arrival of the newest sample
@@ -47,18 +49,19 @@ class Watch:
         self._rest: list[NDArray[np.float64]] = []
         self.rest: NDArray[np.float64] | None = None  # (channel,), once it is known
 
-    def feed(self, blocks: list[Chunks | Note]) -> list[Batch]:
-        """Take what came and return its samples."""
-        batches = []
+    def feed(self, blocks: list[Chunks | Note]) -> None:
+        """Take what came. What a driver raises is kept in ``error``: nothing that is looked at may end a recording."""
         for block in blocks:
             if isinstance(block, Chunks):
                 self.heard.append(block)
-                batches.append(self._reading.feed(block))
-            elif block.what == LOST:
-                batches.append(self._reading.broken())
-        for batch in batches:
-            self._look(batch)
-        return batches
+            try:
+                if isinstance(block, Chunks):
+                    self._look(self._reading.feed(block))
+                elif block.what == LOST:
+                    self._look(self._reading.broken())
+            except Exception as error:
+                self.error = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+                self._reading = Reading(self.stream.sensor)
 
     def figures(self, now_ns: int) -> Figures:
         """Return what the stream does at this moment of the monotonic clock."""

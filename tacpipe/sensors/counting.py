@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ Integers = NDArray[np.int64]
 
 RESET_TIMES = 3.0  # a gap longer than so many times what the clock allows is a device that began anew
 RESET_SLACK = 32  # samples beyond that which a burst may bring
+AGREES = 0.05  # beyond the slack, of what the clock estimates for an outage through which the device went on counting
 LATE_NS = 250_000_000  # a link that reorders does so within this; a count that goes back later is a device's restart
 
 
@@ -25,12 +26,23 @@ class Counted:
     reset: NDArray[np.bool_]  # the device began to count anew; ``missing`` is then what the clock says, or 0
 
 
+NAMES = tuple(field.name for field in fields(Counted))
+
+
 class Counting:
     """One counter through a recording: differences are taken modulo, those of over half its range are backward."""
 
     def __init__(self, modulus: int, rate_hz: float, step: int = 1) -> None:
         self.modulus, self.rate_hz, self.step = modulus, rate_hz, step
         self._last: tuple[int, int, int] | None = None  # highest count as sent, unrolled, and its arrival
+        self._doubted = False  # whether the device may have begun anew since
+
+    def reopened(self) -> None:
+        """Take note that the link was lost: the device may have been off, so the clock must confirm the next counter.
+
+        Where it does not, or the counter went back, the device began anew. Without a rate one that grew is believed.
+        """
+        self._doubted = self._last is not None
 
     def feed(self, raw: Integers, t_ns: Integers) -> Counted:
         """Return what counters (sample,) as sent say, with the arrival of each.
@@ -40,6 +52,9 @@ class Counting:
         if not len(raw):
             nothing = np.zeros(0, dtype=bool)
             return Counted(raw, raw, nothing, nothing, nothing)
+        if self._doubted and self._last is not None:
+            again, rest = self._again(int(raw[0]), int(t_ns[0]), *self._last), self.feed(raw[1:], t_ns[1:])
+            return Counted(*(np.concatenate([getattr(part, name) for part in (again, rest)]) for name in NAMES))
         first = self._last is None
         last_raw, last_seq, last_ns = self._last or (int(raw[0]), int(raw[0]) // self.step, int(t_ns[0]))
         delta = self._signed(np.diff(raw, prepend=last_raw))
@@ -56,6 +71,21 @@ class Counting:
         half = self.modulus // 2
         signed: Integers = (delta + half) % self.modulus - half
         return signed
+
+    def _again(self, raw: int, at_ns: int, last_raw: int, last_seq: int, last_ns: int) -> Counted:
+        """Return what the first counter after an outage says, if the clock agrees with it."""
+        half, rounds = self.modulus // 2, self.modulus // self.step
+        steps, off = divmod((raw - last_raw + half) % self.modulus - half, self.step)
+        expected = (at_ns - last_ns) * 1e-9 * self.rate_hz
+        if self.rate_hz:
+            steps += rounds * round((expected - steps) / rounds)
+        agrees = not self.rate_hz or abs(steps - expected) <= RESET_SLACK + AGREES * expected
+        reset = bool(off) or steps < 1 or not agrees
+        if reset:
+            steps = max(1, round(expected))
+        self._last, self._doubted = (raw, last_seq + steps, at_ns), False
+        nothing = np.zeros(1, dtype=bool)
+        return Counted(np.array([last_seq + steps]), np.array([steps - 1]), nothing, nothing, np.array([reset]))
 
     def _slowly(
         self, raw: Integers, t_ns: Integers, last_raw: int, last_seq: int, last_ns: int, *, first: bool

@@ -7,7 +7,7 @@ give packets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -40,6 +40,18 @@ class Chunks:
         stamps = np.array([t_ns for t_ns, _ in pairs], dtype=np.int64)
         sizes = np.array([len(data) for _, data in pairs], dtype=np.int64)
         return cls(stamps, sizes, b"".join(data for _, data in pairs))
+
+    @classmethod
+    def joined(cls, several: Sequence[Chunks]) -> Chunks:
+        """Return several as one."""
+        stamps = np.concatenate([one.t_ns for one in several]) if several else np.zeros(0, dtype=np.int64)
+        sizes = np.concatenate([one.size for one in several]) if several else np.zeros(0, dtype=np.int64)
+        return cls(stamps, sizes, b"".join(one.data for one in several))
+
+    def since(self, t_ns: int) -> Chunks:
+        """Return the chunks that arrived at a moment or later."""
+        first = int(np.searchsorted(self.t_ns, t_ns))
+        return Chunks(self.t_ns[first:], self.size[first:], self.data[int(self.size[:first].sum()) :])
 
     def packets(self) -> list[bytes]:
         """Return the chunks one by one."""

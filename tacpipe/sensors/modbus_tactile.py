@@ -178,10 +178,10 @@ def with_crc(body: bytes) -> bytes:
     return body + int(crc16_modbus(np.frombuffer(body, np.uint8)[None])[0]).to_bytes(2, "little")
 
 
-def _reply(address: int, function: int, size: int) -> Callable[[bytes], int]:
+def _reply(address: int, function: int, size: int) -> Callable[[bytes], int | tuple[int, int]]:
     """Return what finds a reply of ``size`` bytes, or a refusal of five, which raises `DeviceError`, among what came."""
 
-    def until(came: bytes) -> int:
+    def until(came: bytes) -> int | tuple[int, int]:
         for code, length in ((function, size), (function | REFUSED, 5)):
             head = bytes([address, code])
             start = came.find(head)
@@ -191,7 +191,7 @@ def _reply(address: int, function: int, size: int) -> Callable[[bytes], int]:
                     if code != function:
                         why = REFUSALS.get(told[2], f"error {told[2]}")
                         raise DeviceError(f"The module refused function {function:#04x}: {why}.")
-                    return start + length
+                    return start, start + length
                 start = came.find(head, start + 1)
         return 0
 

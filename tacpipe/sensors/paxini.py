@@ -167,7 +167,7 @@ class Paxini(Sensor):
         taken = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
         if _data(taken)[:1] not in (b"", b"\x00"):
             raise DeviceError(f'The board cannot push data = "{self.data}": error {_data(taken)[0]}. Choose another.')
-        yield Ask(write(PUSHING, b"\x01"), until=_pushed, what="the first frame")
+        yield Ask(write(PUSHING, b"\x01"), until=pushed, what="the first frame")
 
     def closing(self) -> bytes:
         """Stop the stream."""
@@ -223,13 +223,13 @@ def _writing(register: int, data: bytes, what: str) -> Ask:
     return Ask(write(register, data), until=_reply(WRITE_FUNCTION, register), what=f"that it took {what}")
 
 
-def _reply(function: int, register: int) -> Callable[[bytes], int]:
+def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:
     """Return what finds a reply among what came: an earlier stream may still run, and hold its first bytes by chance.
 
     The reply to a write may lack the data of which it tells the length.
     """
 
-    def until(came: bytes) -> int:
+    def until(came: bytes) -> int | tuple[int, int]:
         for code in (function, function | 0x80):
             head = REPLY + bytes([code]) + two(register)
             start = came.find(head)
@@ -242,15 +242,19 @@ def _reply(function: int, register: int) -> Callable[[bytes], int]:
                             raise DeviceError(
                                 f"The board refused function {function:#04x} of register {register:#06x}."
                             )
-                        return stop
+                        return start, stop
                 start = came.find(head, start + 1)
         return 0
 
     return until
 
 
-def _pushed(came: bytes) -> int:
-    """Return how many bytes end with the first frame that was pushed; raises `DeviceError` if it tells of an error."""
+def pushed(came: bytes) -> int | tuple[int, int]:
+    """Find the reply to the order to push, which is a frame without forces, or else forces, which are not taken.
+
+    Raises `DeviceError` if the reply tells of an error.
+    """
+    found: int | tuple[int, int] = 0
     start = came.find(PUSH)
     while start >= 0:
         length = number(came[start + 3 : start + 5])
@@ -258,17 +262,16 @@ def _pushed(came: bytes) -> int:
         if length and stop <= len(came) and sums(came[start:stop]):
             if length == 1 and came[start + 5]:
                 raise DeviceError(f"The board does not push its forces: error {came[start + 5]}. Switch it off and on.")
-            return stop
+            if length == 1:
+                return start, stop
+            found = (0, 0)
         start = came.find(PUSH, start + 1)
-    return 0
+    return found
 
 
 def _data(reply: bytes) -> bytes:
-    """Return the data of a reply that `_reply` found, which ends with it."""
-    start = reply.rfind(REPLY)
-    while start >= 0 and not sums(reply[start:]):
-        start = reply.rfind(REPLY, 0, start)
-    return reply[start + REPLY_HEADER : -1]
+    """Return the data of a reply that `_reply` found."""
+    return reply[REPLY_HEADER:-1]
 
 
 def _modules(active: bytes, counts: bytes) -> dict[str, int]:

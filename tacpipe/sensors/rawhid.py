@@ -37,6 +37,7 @@ class RawHid(Sensor):
     links: ClassVar[tuple[str, ...]] = ("hid",)
     counter: ClassVar[int | None] = 1 << 16
     usb_ids: ClassVar[tuple[str, ...]] = ("16c0:0486",)
+    usage_page: ClassVar[int | None] = 0xFFAB  # another interface of a Teensy is its console
 
     rate_hz: float = 1000.0  # reports a second, at most 1000
 

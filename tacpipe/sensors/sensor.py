@@ -1,7 +1,7 @@
 """What a sensor is to tacpipe: bytes in, samples out, what it must be told, and the device's side of it for the emulator.
 
 A product is one file with one frozen dataclass, a `Sensor`. Its fields are the options of the rig file, each with a
-comment that is its help. Nothing here does input or output: a link carries the bytes, see `tacpipe.sensors.links`.
+comment that is its help. Nothing here does input or output: a link carries the bytes, see `tacpipe.links`.
 """
 
 from __future__ import annotations
@@ -41,15 +41,22 @@ class Samples:
 class Ask:
     """What is written to a device while a stream is opened or tared, and the reply that is waited for.
 
-    ``until`` is given what came since and returns how many of these bytes the reply takes, 0 while it is not whole; without
-    it nothing is waited for but ``pause_s``. It may raise `TacpipeError` for a reply that means no.
+    ``until`` is given what came since and returns where the reply is: how many bytes it takes, or (start, stop) where
+    samples may come before it, which are then no part of it and are kept; 0 while it is not whole. With (0, 0) the reply is
+    there and nothing is taken: it is a sample itself. Without ``until`` nothing is waited for but ``pause_s``. It may raise
+    `TacpipeError` for a reply that means no.
     """
 
     send: bytes
-    until: Callable[[bytes], int] | None = None
+    until: Callable[[bytes], int | tuple[int, int]] | None = None
     timeout_s: float = 2.0
     pause_s: float = 0.0
     what: str = "a reply"  # for the sentence when none comes
+
+    def found(self, came: bytes) -> tuple[int, int] | None:
+        """Return where the reply is in what came since, (start, stop), None while it is not whole or none is awaited."""
+        told = self.until(came) if self.until is not None and came else 0
+        return told if isinstance(told, tuple) else (0, told) if told else None
 
 
 Dialogue = Generator[Ask, bytes, None]  # yields what is asked, is sent the reply
@@ -92,11 +99,19 @@ class Sensor:
     device_counter: ClassVar[int | None] = None  # modulus of ``device_seq``
     step: ClassVar[int] = 1  # by which ``seq`` grows from a sample to the next
     device_wrap_ns: ClassVar[int | None] = None  # after which the device's clock begins at 0 again
+    listens: ClassVar[bool] = False  # by UDP the device sends of itself to an address that is set at its end
+    steady: ClassVar[bool] = True  # it sends at its rate all the time; False: only when something happens
     exclusive: ClassVar[str] = ""  # what else cannot use the device meanwhile; a sentence, empty: nothing
     usb_ids: ClassVar[tuple[str, ...]] = ()  # "16d0:14cc": vendor and product, where the product has its own
+    usage_page: ClassVar[int | None] = None  # of the HID interface that samples come by, where a device has several
 
-    rate_hz: float  # samples a second
+    rate_hz: float  # samples a second; 0: none is known
     baud: int  # of a serial port
+
+    @property
+    def awaited(self) -> bool:
+        """Whether samples should come all the time, so that silence says that something is wrong."""
+        return self.steady and self.rate_hz > 0
 
     def fields(self) -> list[pa.Field]:
         """Return the arrow field of each channel: name, native type, unit, quantity and layout."""

@@ -40,6 +40,7 @@ class SpaceMouse(Sensor):
     summary: ClassVar[str] = "3Dconnexion SpaceMouse on HID: six axes and buttons, a row an event."
     links: ClassVar[tuple[str, ...]] = ("hid",)
     usb_ids: ClassVar[tuple[str, ...]] = ("256f:c635",)
+    steady: ClassVar[bool] = False
 
     rate_hz: float = 125.0  # events a second while the cap is moved; none come while it rests
     split: bool = False  # rotation comes in a report of its own, as from older devices

@@ -173,18 +173,20 @@ def _asked(number: int, said: bytes = b"") -> Ask:
     return Ask(command(number, said), until=_reply(number, said), what=f"the reply to command {number:#04x}")
 
 
-def _reply(number: int, said: bytes) -> Callable[[bytes], int]:
-    """Return what tells how many bytes there are up to the end of the reply, frames before it included."""
+def _reply(number: int, said: bytes) -> Callable[[bytes], int | tuple[int, int]]:
+    """Return what finds the reply among frames, which may hold its first bytes by chance."""
     size = 5 if number == SAVE else len(said) + 4
     head = bytes([0x5A, size, number])
 
-    def until(data: bytes) -> int:
-        found = data.find(head)
-        if found < 0 or len(data) < found + size:
+    def until(data: bytes) -> int | tuple[int, int]:
+        start = data.find(head)
+        while start >= 0 and command(number, data[start + 3 : start + size - 1]) != data[start : start + size]:
+            start = data.find(head, start + 1)
+        if start < 0:
             return 0
-        if number == SAVE and data[found + 3]:
+        if number == SAVE and data[start + 3]:
             raise DeviceError("The TFmini did not save its settings; set save = false to do without.")
-        return found + size
+        return start, start + size
 
     return until
 

@@ -118,13 +118,14 @@ class UrRtde(Sensor):
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
         """Agree on the version, ask for the outputs, start. Raises `DeviceError` where the controller refuses."""
         reply = yield _ask(VERSION, PROTOCOL.to_bytes(2, "big"))
-        if _payload(reply) != b"\1":
+        if reply[HEADER.size :] != b"\1":
             raise DeviceError(
                 "The controller does not speak RTDE version 2. Update it to CB3 3.10, e-Series 5.4 or later."
             )
         names = (STAMP, *self.outputs)
         reply = yield _ask(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(names).encode())
-        recipe, kinds = _payload(reply)[:1], _payload(reply)[1:].decode("latin-1").split(",")
+        said = reply[HEADER.size :]
+        recipe, kinds = said[:1], said[1:].decode("latin-1").split(",")
         for name, kind in zip(names, kinds, strict=False):
             if kind != type_of(name):
                 raise DeviceError(
@@ -134,7 +135,7 @@ class UrRtde(Sensor):
         if len(kinds) != len(names) or recipe in (b"", b"\0"):
             raise DeviceError(f"The controller refused the outputs {', '.join(names)}. Ask for fewer, or less often.")
         reply = yield _ask(START, b"")
-        if _payload(reply) != b"\1":
+        if reply[HEADER.size :] != b"\1":
             raise DeviceError("The controller refused to start sending. Is another RTDE client using up its time?")
 
     def closing(self) -> bytes:
@@ -199,9 +200,9 @@ def _taken(data: bytearray) -> Iterator[tuple[int, bytes]]:
 
 
 def _ask(kind: int, payload: bytes) -> Ask:
-    """Return the question of a type, whose reply is of the same type; texts may come before it and are part of it."""
+    """Return the question of a type, whose reply is of the same type; texts may come before it."""
 
-    def until(data: bytes) -> int:
+    def until(data: bytes) -> int | tuple[int, int]:
         place = 0
         while len(data) >= place + HEADER.size:
             size, found = HEADER.unpack_from(data, place)
@@ -209,18 +210,12 @@ def _ask(kind: int, payload: bytes) -> Ask:
                 raise DeviceError(
                     f"Bytes {data[place : place + 8].hex(' ')} came, which are no RTDE. Is the port 30004?"
                 )
-            place += size
             if found == kind:
-                return place if len(data) >= place else 0
+                return (place, place + size) if len(data) >= place + size else 0
+            place += size
         return 0
 
     return Ask(packed(kind, payload), until, what=f"the controller's reply to RTDE package {chr(kind)}")
-
-
-def _payload(reply: bytes) -> bytes:
-    """Return the payload of the last package of a reply."""
-    packages = list(_taken(bytearray(reply)))
-    return packages[-1][1] if packages else b""
 
 
 def _sizes(heads: Bytes) -> NDArray[np.integer[Any]]:

@@ -141,7 +141,7 @@ class WeissWts(Sensor):
         """
         yield Ask(message(STOP), until=_reply(STOP, refusable=True), what="the reply to stop")
         found = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
-        said = next(said for number, _, said in messages(found) if number == MATRIX)
+        said = found[HEADER:-2]
         columns, rows = (int.from_bytes(said[start : start + 2], "little") for start in (2, 4))
         if (rows, columns) != (self.rows, self.columns):
             raise DeviceError(
@@ -229,10 +229,10 @@ def run_lengths(cells: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return (counts << 12 | np.repeat(cells[starts], pieces)).astype(np.uint16)
 
 
-def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int]:
-    """Return what tells how many bytes there are up to the end of the reply, frames before it included."""
+def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int | tuple[int, int]]:
+    """Return what finds the reply among frames."""
 
-    def until(data: bytes) -> int:
+    def until(data: bytes) -> int | tuple[int, int]:
         for told, stop, said in messages(data):
             if told == number:
                 code = int.from_bytes(said[:2], "little")
@@ -240,7 +240,7 @@ def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int]:
                     raise DeviceError(
                         f"The WTS refused command {number:#04x} with error {code}; its manual lists the errors."
                     )
-                return stop
+                return stop - HEADER - len(said) - 2, stop
         return 0
 
     return until

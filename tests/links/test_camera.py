@@ -81,6 +81,19 @@ def test_a_camera_that_is_unplugged_is_lost() -> None:
 
 
 @pytest.mark.usefixtures("connected")
+def test_a_camera_that_is_gone_can_still_be_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = made("camera:0", Quiet())
+
+    def gone(camera: RealSense) -> None:
+        raise RuntimeError("device disconnected")
+
+    monkeypatch.setattr(RealSense, "stop_capture", gone)
+    link.close()
+    with pytest.raises(LinkLostError, match="was closed"):
+        link.read(0)
+
+
+@pytest.mark.usefixtures("connected")
 def test_a_camera_that_is_not_there_lists_those_that_are() -> None:
     with pytest.raises(DeviceError, match="no RealSense camera 2 is connected; there are 831612070000, 831612071111"):
         made("camera:2", Quiet())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import threading
@@ -13,9 +14,11 @@ import pytest
 from tacpipe.errors import DeviceError
 from tacpipe.links.dialogue import hold
 from tacpipe.links.link import Link
+from tacpipe.recording import rig
 from tacpipe.sensors.sensor import Ask, Dialogue
 from tests.links import peers
 from tests.links.peers import Quiet, made
+from tests.sensors.made import pieces, samples
 
 Talk = Callable[[bytes, list[bytes]], None]
 
@@ -67,6 +70,72 @@ def test_replies_reach_the_sensor_and_the_stream_behind_them_is_kept(device: tup
     assert heard == [b"1.2\n", b"serial 7\n"]
     assert b"".join(data for _, data in kept) + b"".join(data for _, data in link.read(0.2)) == b"frameframe2"
     assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
+
+
+def marked(data: bytes) -> int | tuple[int, int]:
+    start = data.find(b"<")
+    stop = data.find(b">", start) + 1
+    return (start, stop) if 0 <= start < stop else 0
+
+
+def test_samples_before_and_after_a_reply_among_them_are_kept_with_their_arrivals(device: tuple[Link, Talk]) -> None:
+    link, talk = device
+    heard = []
+
+    def dialogue() -> Dialogue:
+        heard.append((yield Ask(b"tare", marked)))
+        heard.append((yield Ask(b"", marked)))
+        heard.append((yield Ask(b"", lambda data: (0, 0) if b"4" in data else 0)))  # it is there, and stays there
+
+    arrived: list[tuple[int, bytes]] = []
+    read = link.read
+
+    def noted(timeout_s: float) -> list[tuple[int, bytes]]:
+        arrived.extend(read(timeout_s))
+        return arrived[-1:]
+
+    link.read = noted  # type: ignore[method-assign]
+    talk(b"tare", [b"sample1 sam", b"ple2 <do", b"ne>sample3 <ok>sample4 ", b"sample5 "])
+    kept = hold(link, dialogue(), "probe") + read(0.2)
+
+    assert heard == [b"<done>", b"<ok>", b""]
+    assert b"".join(data for _, data in kept) == b"sample1 sample2 sample3 sample4 sample5 "
+    stamps = {t_ns for t_ns, _ in arrived}
+    assert {t_ns for t_ns, _ in kept[:2]} <= stamps and kept[0][0] == arrived[0][0]
+    assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
+
+
+@pytest.mark.parametrize("kind", ["paxini", "weiss-wts", "tfmini"])
+def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
+    kind: str, device: tuple[Link, Talk]
+) -> None:
+    link, talk = device
+    sensor = rig.make(kind, {}, "stream")
+    sent = iter(pieces(sensor, sensor.encode(samples(kind, sensor, 40, seed=4))))
+    end = sensor.device()
+    end.streaming = True  # an earlier session left it so
+    written: list[bytes] = []
+
+    def streamed() -> list[bytes]:
+        frames = [next(sent) for _ in range(3 * end.streaming)]
+        written.extend(frames)
+        return frames
+
+    def dialogue() -> Dialogue:
+        """Open and tare; while the device streams it sends frames before and behind each reply that is awaited."""
+        for part in (sensor.opening({}), sensor.taring()):
+            reply = None
+            with contextlib.suppress(StopIteration):
+                while True:
+                    ask = next(part) if reply is None else part.send(reply)
+                    before, replies = streamed(), end.hear(ask.send)
+                    talk(ask.send, [b"".join([*before, *(replies if ask.until is not None else []), *streamed()])])
+                    reply = yield ask
+
+    kept = hold(link, dialogue(), "probe") + link.read(0.2)
+
+    assert len(written) > 5
+    assert b"".join(data for _, data in kept) == b"".join(written)
 
 
 def test_packets_before_and_after_a_reply_are_no_replies() -> None:

@@ -128,6 +128,12 @@ def test_of_the_interfaces_of_one_device_the_right_one_is_taken(
     assert hid.chosen(place, TEENSY, usage_page, "probe")["path"] == path
 
 
+def test_of_a_teensy_s_interfaces_raw_hid_takes_the_one_of_its_usage_page() -> None:
+    keyboard_first = [interface(0, 0x0001), interface(1, 0xFFAB)]
+
+    assert hid.chosen("16c0:0486", keyboard_first, RAW.usage_page, "probe")["path"] == b"/dev/hidraw1"
+
+
 def test_two_devices_of_one_kind_must_be_told_apart() -> None:
     two = [*TEENSY, interface(0, 0xFFAB, "2", "/dev/hidraw4")]
 

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
+from can import CanError
+from websockets.exceptions import ConnectionClosedOK
 
+from tacpipe.links.can import CanLink
 from tacpipe.links.link import LinkLostError
+from tacpipe.links.websocket import WebsocketLink
 from tests.links import peers
 from tests.links.peers import Peer
 
@@ -84,7 +91,9 @@ def test_a_device_that_went_away_is_lost_and_the_error_names_the_stream(peer: Pe
     peer.came(len(FRAMES[0]))
     peer.leave()
 
-    with pytest.raises(LinkLostError, match=r"^Stream probe \(.+\) is lost: .+ Check its cable and its power\.$"):
+    with pytest.raises(
+        LinkLostError, match=r"^Stream probe \(.+\) is lost: .+ Check (its cable and its power|the port, .+)\.$"
+    ):
         for _ in range(50):
             peer.link.read(0.1)
 
@@ -98,6 +107,34 @@ def test_a_link_may_be_closed_twice_and_not_read_again(peer: Peer) -> None:
         peer.link.read(0.01)
     with pytest.raises(LinkLostError, match="was closed; open it again"):
         peer.link.write(b"late")
+
+
+@pytest.mark.parametrize("error", [termios.error(5, "Input/output error"), ValueError("port is not open")])
+def test_an_adapter_that_is_gone_can_still_be_closed(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    with peers.can_slcan(monkeypatch) as peer:
+        bus = cast("CanLink", peer.link).bus
+        port = bus.serialPortOrig  # type: ignore[attr-defined]  # of slcan alone
+
+        def gone() -> None:
+            raise error
+
+        monkeypatch.setattr(bus, "shutdown", gone)
+        peer.link.close()
+
+        assert not port.is_open
+        monkeypatch.undo()
+        with contextlib.suppress(CanError):
+            bus.shutdown()
+
+
+@pytest.mark.parametrize("data", [b"text", b"\xff\x00"])
+def test_what_is_written_to_a_websocket_that_closed_says_that_it_is_lost(data: bytes) -> None:
+    def closed(_: str | bytes) -> None:
+        raise ConnectionClosedOK(None, None)
+
+    link = WebsocketLink("Stream probe", cast("Any", SimpleNamespace(send=closed)))
+    with pytest.raises(LinkLostError, match="Stream probe is lost: the other end closed the websocket"):
+        link.write(data)
 
 
 @pytest.mark.parametrize("peer", ["serial", "tcp", "udp", "tcp+udp", "ws", "folder"], indirect=True)

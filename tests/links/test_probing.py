@@ -186,6 +186,8 @@ def test_the_list_names_every_sensor_with_what_it_is(lab: Lab) -> None:
         "rate_hz": 1000.0,
         "baud": 1_000_000,
         "summary": "OptoForce 3-axis, 6-axis and 4 x 3-axis force sensors behind their USB DAQ.",
+        "exclusive": "",
     }
+    assert "one program" in rows["ati-netft"]["exclusive"]
     assert rows["xela"]["links"] == ["ws"] and rows["xela"]["baud"] is None
     assert all(row["summary"].endswith(".") for row in rows.values())

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
+import struct
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import udp
 from tacpipe.links.arrival import OLDEST_NS, Arrivals
+from tacpipe.links.link import LinkLostError
+from tests.links import peers
 from tests.links.peers import Listened, Quiet, made
+
+SENT = [b"one", b"two", b"three"]
+WALL_NS = 1_700_000_000_000_000_000  # by which the clock on the wall is ahead
 
 
 def free_port() -> int:
@@ -105,4 +116,102 @@ def test_stamps_survive_a_wall_clock_that_is_set(monkeypatch: pytest.MonkeyPatch
     clocks["monotonic_ns"] += 500
     arrivals.look()
     assert arrivals.of(5_000_000_000_000) == 1_000_000_000_500
-    assert arrivals.of(clocks["time_ns"] - 1_000) == 1_000_000_000_500  # never back
+    assert arrivals.of(clocks["time_ns"] - 1_000) == 1_000_000_000_501  # never back, and after what it came after
+
+
+class Clocks:
+    """Both clocks, between two readings of which time passes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, passing: Iterator[int]) -> None:
+        self.now_ns, self.passing = 1_000_000_000, passing
+        monkeypatch.setattr("tacpipe.links.arrival.time", self)
+
+    def monotonic_ns(self) -> int:
+        """Return the time since the computer started."""
+        self.now_ns += next(self.passing)
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        """Return what the clock on the wall says."""
+        return self.monotonic_ns() + WALL_NS
+
+
+class Flooded(socket.socket):
+    """A port at which a datagram arrives whenever it is looked for one, until there are no more."""
+
+    clocks: Clocks
+    left = 50
+
+    def recvmsg(self, *_: int) -> Any:
+        """Return a datagram with the stamp of its arrival, which is now."""
+        if not self.left:
+            raise BlockingIOError
+        self.left -= 1
+        self.clocks.now_ns += 700
+        stamp = struct.pack("@ll", *divmod(self.clocks.now_ns + WALL_NS, 1_000_000_000))
+        return str(self.clocks.now_ns).encode(), [(socket.SOL_SOCKET, udp.STAMPS, stamp)], 0, None
+
+
+def test_datagrams_that_come_while_others_are_fetched_bear_their_own_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Flooded(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.clocks = Clocks(monkeypatch, itertools.repeat(0))
+        link = udp.UdpLink("flood", port, prompt=True)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+            port.bind(("127.0.0.1", 0))
+            device.sendto(b"", port.getsockname())  # which makes it ready
+        found = link.read(peers.SOON_S)
+        link.close()
+
+    assert [t_ns for t_ns, _ in found] == [int(data) for _, data in found]
+
+
+@given(
+    batches=st.lists(st.lists(st.integers(0, 2_000), min_size=1, max_size=8), min_size=1, max_size=8),
+    passing=st.lists(st.integers(1, 400_000), min_size=60, max_size=60),
+)
+def test_stamps_are_as_far_apart_as_the_kernel_s_and_equal_only_where_those_are(
+    batches: list[list[int]], passing: list[int]
+) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        clocks = Clocks(monkeypatch, itertools.cycle(passing))
+        arrivals = Arrivals()
+        told, true = [], []
+        for batch in batches:
+            moments = []
+            for apart_ns in batch:
+                clocks.now_ns += apart_ns
+                moments.append(clocks.now_ns)
+            arrivals.look()
+            told += [arrivals.of(t_ns + WALL_NS) for t_ns in moments]
+            true += moments
+
+    assert [later > earlier for earlier, later in itertools.pairwise(told)] == [
+        later > earlier for earlier, later in itertools.pairwise(true)
+    ]
+    assert max(abs(one - other) for one, other in zip(told, true, strict=True)) <= 2 * max(passing) + len(true)
+
+
+def test_datagrams_that_came_before_the_control_connection_closed_are_given_out_first() -> None:
+    with peers.both() as peer:
+        for data in SENT:
+            peer.send(data)
+        peer.leave()
+        found = peer.link.read(peers.SOON_S)
+        with pytest.raises(LinkLostError, match="the other end closed the connection"):
+            peer.link.read(0)
+
+    assert [data for _, data in found] == SENT
+
+
+def test_datagrams_that_came_before_the_port_refused_are_given_out_first() -> None:
+    with peers.udp_talking() as peer:
+        peer.link.write(b"hello")
+        assert peer.heard(5) == b"hello"
+        for data in SENT:
+            peer.send(data)
+        peer.leave()
+        found = peer.link.read(peers.SOON_S)
+        with pytest.raises(LinkLostError, match="refuses the port"):
+            peer.link.read(0)
+
+    assert [data for _, data in found] == SENT

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tacpipe.recording import rig as rig_of
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.sensors import framing
 from tacpipe.sensors.framing import Chunks
@@ -133,3 +134,17 @@ def test_the_same_bytes_give_the_same_samples_however_they_are_cut(sizes: list[i
     assert joined == [row for row in range(100) if row not in dropped]
     assert whole[0].seq is not None and whole[0].seq.tolist() == joined
     assert first.lost == reading.lost == len(dropped)
+
+
+def test_a_device_s_clock_goes_on_where_it_begins_at_zero_again() -> None:
+    numbers = ({"name": "t", "type": "u32"}, {"name": "force", "type": "i16", "unit": "N", "quantity": "force"})
+    options = {"marker": "AA 55", "rate_hz": 1000, "clock": {"number": "t", "unit": "us"}, "numbers": numbers}
+    rig = rig_of.make("generic", options, "test")
+    taken_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
+    values = (np.arange(len(taken_us), dtype=np.int16)[:, None],)
+    sent = rig.encode(Samples(values, t_device_ns=taken_us % 2**32 * 1000))
+    reading = Reading(rig)
+    parts = [reading.feed(chunks([(row, bytes(frame))])) for row, frame in enumerate(sent)]
+
+    stamps = [int(t_ns) for part in parts if part.t_device_ns is not None for t_ns in part.t_device_ns]
+    assert stamps == (taken_us[: len(stamps)] * 1000).tolist() and len(stamps) > 90

@@ -62,9 +62,9 @@ def held(dialogue: Dialogue, device: Device, between: bytes = b"", size: int = 7
         came = between + b"".join(device.hear(ask.send))
         reply = b""
         if ask.until is not None:
-            taken = next((n for stop in range(0, len(came) + size, size) if (n := ask.until(came[:stop]))), 0)
-            assert taken, f"no {ask.what} among {came.hex(' ')}"
-            reply = came[:taken]
+            found = next((n for stop in range(0, len(came) + size, size) if (n := ask.found(came[:stop]))), None)
+            assert found is not None, f"no {ask.what} among {came.hex(' ')}"
+            reply = came[slice(*found)]
 
 
 def streams(device: Device) -> bool:

@@ -5,28 +5,36 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tacpipe.sensors.sensor import Device, Dialogue, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Sensor
 
 
 def carried_out(dialogue: Dialogue, device: Device, greeting: bytes = b"") -> bytes:
     """Carry out a dialogue; ``greeting`` came before any reply. Return what came that was no reply."""
-    came, reply = greeting, None
+    came, other, reply = greeting, b"", None
     while True:
         try:
             ask = dialogue.send(reply) if reply is not None else next(dialogue)
         except StopIteration:
-            return came
+            return other + came
         came += b"".join(device.hear(ask.send))
         if ask.until is None:
             reply = b""
             continue
-        taken = ask.until(came)
-        assert taken, f"no reply to {ask.send.hex(' ')}, only {came.hex(' ')}"
-        reply, came = came[:taken], came[taken:]
+        found = ask.found(came)
+        assert found is not None, f"no reply to {ask.send.hex(' ')}, only {came.hex(' ')}"
+        other += came[: found[0]]
+        reply, came = came[slice(*found)], came[found[1] :]
+
+
+def reply_of(ask: Ask, came: bytes) -> bytes:
+    """Return the reply that a question finds in what came."""
+    found = ask.found(came)
+    assert found is not None
+    return came[slice(*found)]
 
 
 def opened(sensor: Sensor, local: Mapping[str, Any] | None = None, greeting: bytes = b"") -> Device:
     """Return the device of a sensor after the stream was opened."""
     device = sensor.device()
-    assert carried_out(sensor.opening(local or {}), device, greeting) == b""
+    assert carried_out(sensor.opening(local or {}), device, greeting) == greeting
     return device

@@ -12,7 +12,7 @@ from paxini_sdk import protocol, registers, sensor_registry
 from paxini_sdk.boards.high_speed import AutoPushConfig, AutoPushFrame, HighSpeedHandBoard
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors.paxini import SLOTS, VARIANTS, Paxini
+from tacpipe.sensors.paxini import SLOTS, VARIANTS, Paxini, pushed
 from tacpipe.sensors.paxini_board import REPLY, message, write
 from tacpipe.sensors.paxini_board import read as asked
 from tacpipe.sensors.sensor import Samples
@@ -21,6 +21,7 @@ from tests.sensors.serial_lab import held, read, rows_of, served, stream, stream
 HAND = Paxini(
     modules=("thumb_tip", "index_tip", "palm1"), variants=("DP-S2015-Elite", "DP-S1813-Elite", "MC-M2020-Elite")
 )
+DONE = b"\xaa\x56\x00\x01\x00"  # the reply to the order to push, before its error code
 DATA = pytest.mark.parametrize("data", ["both", "resultant", "distributed"])
 
 
@@ -155,14 +156,23 @@ def test_a_refusal_and_a_write_without_data_are_understood() -> None:
     with pytest.raises(DeviceError, match='The board cannot push data = "both": error 1'):
         opening.send(message(0x10, 0x16, b"\x01", REPLY))
     taring = HAND.taring()
-    until = next(taring).until
-    assert until is not None
+    ask = next(taring)
     with pytest.raises(DeviceError, match="The board did not calibrate: error 3"):
         taring.send(message(0x17, 0x02, b"\x03", REPLY))
     with pytest.raises(DeviceError, match="refused function 0x17 of register 0x0002"):
-        until(message(0x97, 0x02, b"\x03", REPLY))
+        ask.found(message(0x97, 0x02, b"\x03", REPLY))
     head = b"\xaa\x55\x00\x17\x02\x00\x01\x00"
-    assert until(head + bytes([protocol.lrc(head)])) == 9
+    assert ask.found(head + bytes([protocol.lrc(head)])) == (0, 9)
+
+
+def test_the_first_forces_that_are_pushed_are_looked_at_and_stay_a_sample() -> None:
+    frame = stream(HAND.encode(made(HAND, 1, 6)))
+    done, error = (head + bytes([protocol.lrc(head)]) for head in (DONE + b"\x00", DONE + b"\x05"))
+    assert pushed(frame[:-1]) == 0
+    assert pushed(frame) == (0, 0)
+    assert pushed(frame[9:] + done + frame) == (len(frame) - 9, len(frame) - 9 + len(done))
+    with pytest.raises(DeviceError, match="does not push its forces: error 5"):
+        pushed(error)
 
 
 def test_the_vendors_client_is_served() -> None:

@@ -74,9 +74,10 @@ def test_the_device_answers_the_opening_and_takes_the_rate() -> None:
 
 def test_a_save_that_failed_is_an_error() -> None:
     ask = next(ask for ask in TfMini().opening({}) if ask.send == command(0x11))
-    assert ask.until is not None
+    assert ask.found(PLUS + bytes.fromhex("5A 05 11 00 70") + PLUS) == (9, 14)
+    assert ask.found(bytes.fromhex("5A 05 11 01 70")) is None  # by chance, in a frame
     with pytest.raises(DeviceError, match="did not save"):
-        ask.until(bytes.fromhex("5A 05 11 01 70"))
+        ask.found(bytes.fromhex("5A 05 11 01 71"))
 
 
 def test_the_original_is_told_nothing() -> None:

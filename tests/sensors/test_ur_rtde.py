@@ -21,7 +21,7 @@ from tacpipe.recording.reading import Reading
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.ur_rtde import UrRtde
-from tests.sensors.talking import opened
+from tests.sensors.talking import opened, reply_of
 
 ALL_KINDS = (
     "actual_TCP_pose",
@@ -171,8 +171,7 @@ def test_a_controller_that_refuses_is_told_in_a_sentence(replies: list[str], sen
             reply = bytes.fromhex(told)
             if b"DOUBLE" in reply:
                 reply = struct.pack(">HB", 3 + len(reply), ord("O")) + reply
-            assert ask.until is not None
-            ask = dialogue.send(reply[: ask.until(reply)])
+            ask = dialogue.send(reply_of(ask, reply))
 
 
 def test_the_client_of_ur_rtde_reads_what_our_controller_sends() -> None:

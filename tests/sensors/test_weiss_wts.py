@@ -85,11 +85,11 @@ def test_a_sensor_with_another_matrix_is_named() -> None:
 
 def test_a_refusal_is_an_error() -> None:
     ask = next(WeissWts().taring())
-    assert ask.until is not None
-    assert ask.until(message(0x23, b"\0\0")) == 10
-    assert ask.until(PLAIN) == 0
+    assert ask.found(message(0x23, b"\0\0")) == (0, 10)
+    assert ask.found(PLAIN + message(0x23, b"\0\0") + PLAIN) == (len(PLAIN), len(PLAIN) + 10)
+    assert ask.found(PLAIN) is None
     with pytest.raises(DeviceError, match="error 14"):
-        ask.until(PLAIN + message(0x23, b"\x0e\0"))
+        ask.found(PLAIN + message(0x23, b"\x0e\0"))
 
 
 def test_a_tare_is_answered_and_a_closing_stops() -> None:

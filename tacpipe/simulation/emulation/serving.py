@@ -54,7 +54,7 @@ def _udp(stream: Stream) -> Endpoint:
     from tacpipe.simulation.emulation.udp import HOST, Udp, free_port
 
     host, _, _ = stream.address.place.rpartition(":")
-    if getattr(stream.sensor, "listens", False) or not host:
+    if stream.sensor.listens or not host:
         return Udp(stream.sensor, (HOST if host else "", free_port()))
     return Udp(stream.sensor)
 

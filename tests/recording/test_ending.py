@@ -1,0 +1,105 @@
+"""Ctrl-C ends a recording and keeps it; a second one while it is sealed leaves it to `acquire --recover`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tacpipe.recording import sealing
+from tacpipe.simulation.emulation.emulator import Emulator
+from tests.conftest import Lab
+from tests.recording import live
+
+Interrupt = Callable[[int], None]
+
+
+@pytest.fixture
+def rig(lab: Lab) -> Iterator[Emulator]:
+    with live.served(lab.folder, live.FORCE, live.SKIN) as emulator:
+        yield emulator
+
+
+@pytest.fixture
+def while_sealing() -> Iterator[Interrupt]:
+    """A function that has the next recording interrupted so many times while it is sealed."""
+    patch, real = pytest.MonkeyPatch(), sealing.seal
+
+    def interrupt(times: int) -> None:
+        def seal(*given: Any) -> Any:
+            patch.undo()
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+            return real(*given)
+
+        patch.setattr(sealing, "seal", seal)
+
+    yield interrupt
+    patch.undo()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_recording_and_it_is_sealed(lab: Lab, rig: Emulator, number: signal.Signals) -> None:
+    process = live.started(lab.folder, "--name one --json")
+    (spool,) = live.awaited(lambda: live.spools(lab.folder))
+    live.awaited(lambda: (spool / "bytes").stat().st_size > 4000)
+    process.send_signal(number)
+    out, err = process.communicate()
+
+    assert process.returncode == 0, err
+    (told,) = json.loads(out)["recordings"]
+    shard = live.only(lab.folder)
+    assert told["name"] == "one" and not live.spools(lab.folder)
+    for name in ("force", "skin"):
+        rows = live.recorded(shard, name)
+        live.place(rows, live.sent(rig, name))
+        assert told["rows"][name] == len(rows) and shard.attributes[f"{name}_lost"] == 0
+
+
+def test_a_signal_ends_the_trials_that_are_left(lab: Lab, rig: Emulator) -> None:
+    process = live.started(lab.folder, "--name press --trials 50 --duration 0.5")
+    live.awaited(lambda: (lab.folder / "rec/manifest.json").exists())
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
+    names = list(live.shards(lab.folder))
+
+    assert process.returncode == 0, err
+    assert names == [f"press-{number:03d}" for number in range(1, len(names) + 1)] and len(names) < 50
+
+
+def test_a_signal_before_the_first_trial_records_nothing(lab: Lab, rig: Emulator) -> None:
+    process = live.started(lab.folder, "--start contact --contact-count 1e9 --duration 1")
+    live.awaited(lambda: len(rig.ledger["skin"]))
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
+
+    assert process.returncode == 0, err
+    assert not (lab.folder / "rec").exists() and not live.spools(lab.folder)
+
+
+def test_one_signal_while_sealing_changes_nothing(lab: Lab, rig: Emulator, while_sealing: Interrupt) -> None:
+    while_sealing(1)
+    lab.run("acquire rig.toml -o rec --duration 0.5")
+
+    live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
+
+
+def test_a_second_signal_while_sealing_leaves_the_spool_and_it_is_recovered(
+    lab: Lab, rig: Emulator, while_sealing: Interrupt
+) -> None:
+    while_sealing(2)
+    ended = lab.call("acquire rig.toml -o rec --duration 0.5 --name one")
+    (spool,) = live.spools(lab.folder)
+
+    assert ended.code == 130 and not (lab.folder / "rec").exists()
+    assert ended.err == (
+        f"tacpipe: interrupted. What was recorded is kept in {spool}; `tacpipe acquire --recover` seals it.\n"
+    )
+    told = lab.run("acquire --recover")
+    assert told.err.startswith("recovered one: ") and told.err.count("\n") == 1
+    live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
+    assert not live.spools(lab.folder)

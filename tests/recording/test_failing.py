@@ -1,0 +1,254 @@
+"""What fails while a rig records ends neither the recording of other streams nor what came before."""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.links.link import LinkLostError
+from tacpipe.recording import rig as rig_of
+from tacpipe.recording import sealing, station, triggers
+from tacpipe.recording.recorder import Recorder
+from tacpipe.recording.spool import Note, Spool, Spooled
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.optoforce import OptoForce
+from tacpipe.sensors.sensor import Samples
+from tests.conftest import Lab
+
+RIG = """
+[[stream]]
+name = "a"
+sensor = "optoforce"
+transport = "serial:/dev/a"
+options = { axes = 3 }
+
+[[stream]]
+name = "b"
+sensor = "optoforce"
+transport = "serial:/dev/b"
+options = { axes = 3 }
+"""
+PERIOD_NS = 1_000_000
+
+
+def frames(count: int) -> list[bytes]:
+    values = (np.zeros((count, 1), np.uint16), np.arange(3 * count).reshape(count, 3).astype(np.int16))
+    return [bytes(frame) for frame in OptoForce(axes=3).encode(Samples(values, seq=np.arange(count)))]
+
+
+def chunks(rows: range, every: list[bytes], since_ns: int = 0) -> Chunks:
+    return Chunks.of([(since_ns + row * PERIOD_NS, every[row]) for row in rows])
+
+
+def spooled(folder: Path, **streams: list[Chunks | Note]) -> Spooled:
+    made = Spool(folder, {"rig": RIG, "output": str(folder / "rec"), "recording": "r", "attributes": {}}, list(streams))
+    for name, blocks in streams.items():
+        count = size = 0
+        for block in blocks:
+            if isinstance(block, Note):
+                made.note(block)
+                continue
+            made.append(name, block)
+            count, size = count + len(block.size), size + len(block.data)
+            made.tally(made.streams[name], count, size, int(block.t_ns[-1]))
+    made.close()
+    return Spooled(made.folder)
+
+
+class Link:
+    """A link that gives what it is told to, and raises what it is told to."""
+
+    packets, overruns = False, 0
+    local: dict[str, Any] = {}  # noqa: RUF012
+
+    def __init__(self, came: list[Any], closing: Exception | None = None, pace_s: float = 0.0) -> None:
+        self.came, self.closing, self.pace_s = came, closing, pace_s
+
+    def read(self, timeout_s: float) -> list[tuple[int, bytes]]:
+        if not self.came:
+            time.sleep(0.01)
+            return []
+        time.sleep(self.pace_s)
+        found = self.came.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return [(time.monotonic_ns(), found)]
+
+    def write(self, data: bytes) -> None:
+        return None
+
+    def close(self) -> None:
+        if self.closing is not None:
+            raise self.closing
+
+
+def opened(monkeypatch: pytest.MonkeyPatch, links: dict[str, list[Link]]) -> Recorder:
+    def open_link(address: Any, sensor: Any, name: str) -> Link:
+        if not links[name]:
+            raise LinkLostError(f"Stream {name} is not there.")
+        return links[name].pop(0)
+
+    monkeypatch.setattr("tacpipe.links.opening.open_link", open_link)
+    return Recorder(rig_of.parse(RIG))
+
+
+def until(what: Any, recorder: Recorder) -> None:
+    deadline_s = time.monotonic() + 20
+    recorder.run(lambda: what() or time.monotonic() > deadline_s)
+    assert what()
+
+
+def test_a_link_that_cannot_even_be_closed_is_lost_told_and_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = frames(100)
+    broken = Link([b"".join(sent[:50]), LinkLostError("gone")], closing=RuntimeError("capture"))
+    recorder = opened(monkeypatch, {"a": [broken, Link([b"".join(sent[50:])])], "b": [Link([])]})
+
+    with recorder.open():
+        until(lambda: recorder.watches["a"].samples == 100, recorder)
+
+    assert recorder.stations["a"].error is None
+
+
+def test_a_driver_that_fails_ends_no_recording_and_other_streams_are_sealed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = frames(300)
+    decode = OptoForce.decode
+
+    def fail(self: OptoForce, found: Any) -> Samples:
+        samples = decode(self, found)
+        if fail_on[0] and np.any(samples.seq == 150):
+            raise RuntimeError("no sense")
+        return samples
+
+    fail_on = [True]
+    monkeypatch.setattr(OptoForce, "decode", fail)
+    recorder = opened(monkeypatch, {"a": [Link(list(sent), pace_s=0.003)], "b": [Link([])]})
+    header = {"rig": RIG, "output": "", "recording": "r", "attributes": {}}
+    with recorder.open():
+        spool = Spool(tmp_path, header, ["a", "b"])
+        with recorder.recording(spool):
+            until(lambda: recorder.watches["a"].error != "", recorder)
+            until(lambda: not recorder.stations["a"]._link.came, recorder)  # type: ignore[union-attr]
+        spool.close()
+
+    found = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"]
+
+    assert found.received > 200 * 16  # what came after the driver failed is there
+    assert found.undecoded and [event.cause for event in found.events].count(sealing.UNDECODED) == 1
+    fail_on[0] = False
+    again = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"].table
+    assert again.num_rows == found.received // 16 and again.column("seq")[-1].as_py() == 299
+
+
+def test_a_stream_that_falls_silent_before_the_end_says_so(tmp_path: Path) -> None:
+    sent = frames(4000)
+    read = spooled(tmp_path, a=[chunks(range(1000), sent)], b=[chunks(range(4000), sent)])
+
+    sealed = sealing.seal(read, rig_of.parse(RIG))
+
+    assert [(event.cause, event.frames) for event in sealed["a"].events] == [("silent", 3000)]
+    assert sealed["a"].lost == 3000 and not sealed["b"].events
+
+
+def test_a_stream_that_was_lost_when_the_recording_began_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recorder = opened(monkeypatch, {"a": [Link([LinkLostError("unplugged")])], "b": [Link([])]})
+    with recorder.open():
+        until(lambda: recorder.stations["a"].error is not None, recorder)
+        spool = Spool(tmp_path, {"rig": RIG}, ["a", "b"])
+        with recorder.recording(spool):
+            pass
+        spool.close()
+
+    notes = [block for _, block in Spooled(spool.folder).blocks("a") if isinstance(block, Note)]
+    assert [note.what for note in notes] == [station.LOST]
+
+
+def test_what_is_recorded_before_a_trigger_arrived_within_half_a_second(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recorder = opened(monkeypatch, {"a": [Link([])], "b": [Link([])]})
+    now_ns = time.monotonic_ns()
+    sent = frames(3000)
+    late = chunks(
+        range(3000), sent, now_ns - 3000 * PERIOD_NS
+    )  # three seconds in one block, as while a trial is sealed
+    recorder._watched("a", [late])
+    spool = Spool(tmp_path, {"rig": RIG}, ["a", "b"])
+    with recorder.recording(spool, preroll=True):
+        pass
+    spool.close()
+
+    (block,) = [block for _, block in Spooled(spool.folder).blocks("a") if isinstance(block, Chunks)]
+    assert 300 < len(block.size) <= 501 and int(block.t_ns[-1]) == int(late.t_ns[-1])
+
+
+def test_a_disk_that_fails_a_sync_ends_the_recording_with_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    spool = Spool(tmp_path, {"rig": RIG}, ["a"])
+
+    def fail(handle: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+    spool.sync()
+    spool.append("a", chunks(range(2), frames(2)))
+    with pytest.raises(TacpipeError, match=r"Input/output error.*--recover"):
+        spool.write()
+    monkeypatch.undo()
+    spool.failed = None
+    spool.close()
+
+
+def test_bytes_of_which_no_sample_comes_are_not_removed(lab: Lab) -> None:
+    noise = Chunks.of([(row, os.urandom(50)) for row in range(100)])
+    folder = spooled(lab.folder / ".tacpipe", a=[noise], b=[]).folder
+
+    ran = lab.call("acquire --recover")
+
+    assert ran.code == 1 and "5,000 bytes" in ran.err and str(folder) in ran.err
+    assert (folder / "bytes").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("labels = 3\n" + RIG, "labels is 3"),
+        ("[labels]\nx = nan\n" + RIG, "label x is nan"),
+        ("master = ['a']\n" + RIG, "the master is"),
+        (RIG + "emulate = 3\n", "emulate is 3"),
+        (RIG.replace("{ axes = 3 }", "3"), "options is 3"),
+        ("", "lists no stream"),
+        ("stream = 3", "lists no stream"),
+        ("a = [", "not valid TOML"),
+        (RIG.replace('"b"', '"a"', 1), "two streams named a"),
+        (RIG.replace('"a"', '"events"', 1), "cannot name a stream"),
+        (RIG.replace("optoforce", "optoforte", 1), "no sensor optoforte"),
+        (RIG.replace("axes", "axis", 1), "no option axis"),
+        (RIG.replace("serial:", "ws:", 1), "cannot be reached by"),
+        (RIG.replace("serial:", "parallel:", 1), "no address of a device"),
+        (RIG.replace("options", "optoins", 1), "no key optoins"),
+    ],
+)
+def test_a_rig_file_that_is_wrong_is_refused_with_its_place(text: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        rig_of.parse(text)
+
+
+def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with open(os.devnull) as nothing:
+        monkeypatch.setattr("sys.stdin", nothing)
+        with triggers.keys() as pressed:
+            assert pressed() is False
+            with pytest.raises(UsageError, match="No key can be pressed"):
+                pressed(must=True)

@@ -1,0 +1,262 @@
+"""What a crash or a full disk leaves behind is sealed later, once, with what was lost told."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe import store as store_of
+from tacpipe.recording import appending, spool
+from tacpipe.recording import rig as rig_of
+from tacpipe.recording.recorder import Recorder
+from tacpipe.recording.sealing import seal
+from tacpipe.recording.spool import Spool, Spooled
+from tacpipe.sensors.framing import Chunks
+from tacpipe.simulation.emulation.emulator import Emulator
+from tests.conftest import Lab
+from tests.recording import killing, live
+from tests.recording.test_reading import SENSOR, frames
+
+RIG = live.stream("force", "optoforce", "serial:/dev/there-is-none", "{ axes = 3 }")
+PERIOD_NS = 1_000_000
+
+
+@pytest.fixture
+def rig(lab: Lab) -> Iterator[Emulator]:
+    with live.served(lab.folder, live.FORCE) as emulator:
+        yield emulator
+
+
+def spooled(lab: Lab, name: str = "one", text: str = RIG, unread: int = 0, count: int = 100) -> Path:
+    """Write a spool as a process leaves it that was killed, ``unread`` chunks short of what it had received."""
+    header = {"output": str(lab.folder / "rec"), "recording": name, "attributes": {"material": "cork"}, "rig": text}
+    made = Spool(lab.folder / ".tacpipe", header, ["force"])
+    sent = [(row * PERIOD_NS, frame) for row, frame in enumerate(frames(count))]
+    size = sum(len(frame) for _, frame in sent)
+    made.tally(0, count, size, sent[-1][0])
+    if sent[: count - unread]:
+        made.append("force", Chunks.of(sent[: count - unread]))
+    made.close()
+    return made.folder
+
+
+def _is_spool(handle: int) -> bool:
+    return Path(f"/proc/self/fd/{handle}").readlink().name == "bytes"
+
+
+def seqs(lab: Lab) -> dict[str, list[int]]:
+    """Return the counter of each recording of the dataset."""
+    return {name: shard.table("force").column("seq").to_pylist() for name, shard in live.shards(lab.folder).items()}
+
+
+def test_killed_recordings_lose_less_than_a_second_and_tell_what_was_read_and_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TACPIPE_STORE", str(tmp_path / "store"))
+    with killing.emulated(tmp_path) as emulator:
+        found = [killing.kill(emulator, tmp_path, after_s, 3.0) for after_s in (2.5, 3.0, 3.5)]
+        costs = [cost for several in found for cost in several or []]
+
+        assert costs, "no recording had begun when it was killed"
+        assert max(cost.lost_s for cost in costs) < 1
+        assert all(cost.recovered > 0 for cost in costs)
+        assert all(cost.unread >= 0 for cost in costs)  # no more is told than was sent and is missing
+
+
+def test_what_was_read_and_never_written_is_told(lab: Lab) -> None:
+    spooled(lab, unread=7)
+    lab.run("acquire --recover")
+    shard = live.only(lab.folder)
+
+    assert seqs(lab) == {"one": list(range(93))}
+    (event,) = shard.table("events").to_pylist()
+    assert (event["stream"], event["cause"], event["bytes"]) == ("force", "crash", 7 * 16)
+    told = {name: shard.attributes[name] for name in ("force_crash_lost_reads", "force_crash_lost_bytes", "material")}
+    assert told == {"force_crash_lost_reads": 7, "force_crash_lost_bytes": 112, "material": "cork"}
+
+
+def test_what_came_before_the_trigger_counts_as_read(lab: Lab, rig: Emulator) -> None:
+    found = rig_of.read(lab.folder / "rig.toml")
+    recorder, store = Recorder(found), lab.folder / ".tacpipe"
+    with recorder.open():
+        recorder.run(lambda: recorder.watches["force"].samples > 150)
+        made = Spool(store, {"output": "", "recording": "", "attributes": {}, "rig": ""}, ["force"])
+        with recorder.recording(made, preroll=True):
+            recorder.run(lambda: recorder.watches["force"].samples > 250)
+        made.close()
+    sealed = seal(Spooled(made.folder), found)["force"]
+    chunks = sum(len(block.size) for _, block in Spooled(made.folder).blocks() if isinstance(block, Chunks))
+
+    assert sealed.table.num_rows > 100 and sealed.crashed == (0, 0)
+    assert Spooled(made.folder).tallied()["force"].chunks == chunks
+
+
+def test_recovering_twice_does_nothing_the_second_time(lab: Lab) -> None:
+    spooled(lab)
+    first = lab.run("acquire --recover --json")
+    manifest = (lab.folder / "rec/manifest.json").read_bytes()
+    second = lab.run("acquire --recover --json")
+
+    assert [one["name"] for one in json.loads(first.out)["recordings"]] == ["one"]
+    assert json.loads(second.out)["recordings"] == [] and second.err == ""
+    assert (lab.folder / "rec/manifest.json").read_bytes() == manifest and not live.spools(lab.folder)
+
+
+def test_the_next_recording_recovers_first(lab: Lab, rig: Emulator) -> None:
+    spooled(lab, "before")
+    ran = lab.run("acquire rig.toml -o rec --duration 0.3 --name after")
+
+    assert ran.err.splitlines()[0] == "recovered before: 0.1 s, force 100 samples"
+    assert list(live.shards(lab.folder)) == ["after", "before"]
+
+
+def test_a_process_that_was_killed_after_it_published_is_not_appended_twice(lab: Lab) -> None:
+    folder = spooled(lab)
+    kept = lab.folder / "kept"
+    shutil.copytree(folder, kept)
+    lab.run("acquire --recover")
+    manifest = (lab.folder / "rec/manifest.json").read_bytes()
+    shutil.copytree(kept, folder)
+    told = lab.run("acquire --recover")
+
+    assert told.err == "recovered one: 0.1 s, force 100 samples\n"
+    assert (lab.folder / "rec/manifest.json").read_bytes() == manifest and not live.spools(lab.folder)
+
+
+def test_a_spool_whose_rig_file_no_longer_parses_stays_and_is_told(lab: Lab) -> None:
+    stays = spooled(lab, "old", text=RIG.replace("axes", "axles"))
+    spooled(lab, "new")
+    for _ in range(2):
+        ran = lab.call("acquire --recover")
+        line = next(one for one in ran.err.splitlines() if one.startswith("tacpipe: "))
+
+        assert ran.code == 1 and stays.exists()
+        assert (
+            line.startswith(f"tacpipe: The spool {stays} stays as it is. The rig file in {stays}") and "axles" in line
+        )
+    assert list(live.shards(lab.folder)) == ["new"]
+
+
+def test_a_spool_that_makes_a_driver_stumble_keeps_nobody_from_recording(
+    lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stays = spooled(lab, "old")
+    header = json.loads((stays / "header.json").read_text())
+    del header["clock"]
+    (stays / "header.json").write_text(json.dumps(header))
+    ran = lab.run("acquire rig.toml -o rec --duration 0.3 --name new")
+
+    assert f"The spool {stays} stays as it is. KeyError: 'clock'" in ran.err
+    assert list(live.shards(lab.folder)) == ["new"] and stays.exists()
+
+
+def test_a_spool_without_a_sample_is_no_recording(lab: Lab) -> None:
+    folder = spooled(lab, unread=100)
+    ran = lab.run("acquire --recover")
+
+    assert not folder.exists() and not (lab.folder / "rec").exists() and ran.err == ""
+
+
+def test_a_spool_that_was_begun_and_has_no_header_is_removed_when_it_is_old(lab: Lab) -> None:
+    folder = lab.folder / ".tacpipe/spool/0123"
+    folder.mkdir(parents=True)
+    (folder / "bytes").touch()
+    lab.run("acquire --recover")
+    assert folder.exists()  # it may be one that a process is about to begin
+
+    os.utime(folder / "bytes", (0, 0))
+    lab.run("acquire --recover")
+    assert not folder.exists()
+
+
+def test_a_spool_that_is_being_sealed_is_left_to_the_process_that_does_it(
+    lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    real = appending.append
+
+    def append(store: store_of.Store, *more: Any) -> str:
+        seen.append((live.spools(lab.folder), spool.abandoned(store.root)))
+        return real(store, *more)
+
+    monkeypatch.setattr(appending, "append", append)
+    lab.run("acquire rig.toml -o rec --duration 0.3")
+
+    ((there, abandoned),) = seen
+    assert len(there) == 1 and abandoned == []
+
+
+def test_a_spool_that_another_process_holds_is_not_recovered(lab: Lab) -> None:
+    folder = spooled(lab)
+    with (folder / "bytes").open("rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert json.loads(lab.run("acquire --recover --json").out)["recordings"] == []
+    assert json.loads(lab.run("acquire --recover --json").out)["rows"] == 100
+
+
+def test_a_disk_that_is_full_while_it_records_ends_it_with_a_sentence_and_what_came_is_recovered(
+    lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.write
+
+    def full(handle: int, data: Any) -> int:
+        if _is_spool(handle) and os.fstat(handle).st_size > 3000:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(handle, data[:1000] if _is_spool(handle) else data)  # the last write gets as far as it can
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        ended = lab.call("acquire rig.toml -o rec --name one")
+    (folder,) = live.spools(lab.folder)
+
+    assert ended.code == 1 and not (lab.folder / "rec").exists()
+    assert ended.err == (
+        f"tacpipe: The disk takes nothing more of the recording (No space left on device), so it ended. What came until "
+        f"then is in {folder}; free some space, and `tacpipe acquire --recover` seals it.\n"
+    )
+    assert lab.run("acquire --recover").err.startswith("recovered one: ")
+    rows = live.recorded(live.only(lab.folder), "force")
+    assert len(rows) > 50
+    live.place(rows, live.sent(rig, "force"))
+
+
+def test_a_disk_that_is_full_while_it_seals_keeps_the_spool_and_it_is_recovered(
+    lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.write
+
+    def full(handle: int, data: Any) -> int:
+        if len(data) > 2000 and not _is_spool(handle):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(handle, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        ended = lab.call("acquire rig.toml -o rec --duration 1 --name one")
+    (folder,) = live.spools(lab.folder)
+
+    assert ended.code == 1 and not (lab.folder / "rec").exists()
+    assert ended.err.startswith("tacpipe: The disk under ") and ended.err.count("\n") == 1
+    kept = f"What was recorded is kept in {folder}; `tacpipe acquire --recover` seals it once that is mended.\n"
+    assert ended.err.endswith(kept)
+    lab.run("acquire --recover")
+    live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
+    assert not live.spools(lab.folder)
+
+
+def test_what_a_driver_makes_of_a_spool_is_what_was_sent(lab: Lab) -> None:
+    spooled(lab, count=50)
+    lab.run("acquire --recover")
+
+    sent = SENSOR.decode(np.frombuffer(b"".join(frames(50)), "u1").reshape(50, 16))
+    columns = [column.tolist() for block in sent.values for column in block.T]
+    assert live.recorded(live.only(lab.folder), "force") == [repr(row) for row in zip(*columns, strict=True)]

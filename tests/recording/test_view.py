@@ -1,0 +1,138 @@
+"""What is seen while a rig records: rates and losses as lines, and as a table with a map of the taxels on a terminal."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tacpipe import progress
+from tacpipe.links.link import Address
+from tacpipe.recording import rig
+from tacpipe.recording import view as view_of
+from tacpipe.recording.rig import Stream
+from tacpipe.recording.view import View
+from tacpipe.recording.watch import Watch
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.optoforce import OptoForce
+from tests.recording.test_reading import frames
+
+TAXELS = 20
+NUMBERS = {"name": "taxel", "type": "u16", "count": TAXELS, "unit": "count", "quantity": "tactile"}
+
+
+@pytest.fixture
+def force(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    """A force sensor of 1 kHz of which 7 samples of 400 were lost, at the end of these 0.4 s."""
+    watch = Watch(Stream("force", "optoforce", OptoForce(axes=3), Address("serial", "/dev/ttyACM0")))
+    sent = list(enumerate(frames(400)))
+    watch.feed([Chunks.of([(row * 1_000_000, frame) for row, frame in sent[:100] + sent[107:]])])
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 400_000_000)
+    return watch
+
+
+def pad(touched: int | None = None) -> Watch:
+    """Return a pad that was at rest for a second, then had a taxel pressed."""
+    sensor = rig.make("generic", {"rate_hz": 100, "packets": True, "numbers": [NUMBERS]}, "here")
+    watch = Watch(Stream("pad", "generic", sensor, Address("udp", ":4000")))
+    rest = np.full(TAXELS, 100, "<u2")
+    for tick in range(20):
+        watch.feed([Chunks.of([(tick * 10_000_000, rest.tobytes())])])
+    pressed = rest.copy()
+    if touched is not None:
+        pressed[touched] = 900
+    watch.feed([Chunks.of([(200_000_000, pressed.tobytes())])])
+    return watch
+
+
+def rendered(view: View, watches: dict[str, Watch], *, colours: bool = False) -> str:
+    """Return what the view draws on a terminal."""
+    console = Console(file=io.StringIO(), width=100, force_terminal=colours, color_system="256" if colours else None)
+    figures = {name: watch.figures(time.monotonic_ns()) for name, watch in watches.items()}
+    console.print(view._picture("recording one, 3 s", figures))
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return text
+
+
+def test_lines_tell_rates_and_losses(
+    force: Watch, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(view_of, "LINE_S", 0.0)
+    View({"force": force}).show("recording one, 3 s")
+
+    # 393 samples in 399 ms; one step of 8 ms among 391 of 1 ms
+    jitter_ms = np.std([8.0] + [1.0] * 391)
+    rate_hz = 392 / 0.399
+    expected = f"force {rate_hz:.1f} Hz, jitter {jitter_ms:.1f} ms, 393 samples, 7 lost"
+    assert capsys.readouterr().err == f"recording one, 3 s: {expected}\n"
+
+
+def test_lines_come_now_and_then_and_not_at_all_if_asked(
+    force: Watch, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    loud, quiet = View({"force": force}), View({"force": force}, quiet=True)
+    for step in range(12):
+        now_s[0] = 100.0 + step
+        loud.show(f"{step}")
+        quiet.show(f"quiet {step}")
+
+    assert re.findall(r"(?m)^(.+?):", capsys.readouterr().err) == ["5", "10"]
+
+
+def test_the_table_tells_every_stream_and_marks_the_ones_that_lose(force: Watch) -> None:
+    watches = {"force": force, "pad": pad()}
+    text = rendered(View(watches), watches)
+
+    assert "recording one, 3 s" in text
+    (row,) = [line for line in text.splitlines() if line.startswith("│ force")]
+    assert [cell.strip() for cell in row.strip("│").split("│")] == [
+        "force",
+        f"{392 / 0.399:.1f}",
+        "0.35",
+        "",
+        "393",
+        "7",
+        "0",
+    ]
+    coloured = rendered(View(watches), watches, colours=True)
+    assert re.search(r"\x1b\[31m *force", coloured) and not re.search(r"\x1b\[31m *pad", coloured)
+
+
+def test_the_map_shows_the_taxel_that_is_pressed(force: Watch) -> None:
+    for touched in (0, 5, TAXELS - 1):
+        watches = {"pad": pad(touched)}
+        text = rendered(View(watches), watches, colours=True)
+        cells = re.findall(r"\x1b\[(4[0-7]|48;5;\d+)m((?:  )+)\x1b\[0m", text)
+        colours = [colour for colour, blanks in cells for _ in range(len(blanks) // 2)]
+
+        assert len(colours) == TAXELS
+        assert [place for place, colour in enumerate(colours) if colour != colours[touched]] == [
+            place for place in range(TAXELS) if place != touched
+        ]
+
+
+def test_a_map_has_rows_of_sixteen(force: Watch) -> None:
+    watches = {"pad": pad(3)}
+    lines = rendered(View(watches), watches).splitlines()
+    start = next(number for number, line in enumerate(lines) if line.strip() == "pad")
+
+    assert [len(line) for line in lines[start + 1 :]] == [2 * 16, 2 * (TAXELS - 16)]
+
+
+def test_a_terminal_shows_the_view_and_is_left_clean(force: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(progress, "wanted", lambda: True)
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setattr(view_of, "FRAMES_HZ", 1000.0)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    with View({"force": force}).open() as view:
+        view._shown_s = 0.0
+        view.show("recording one, 3 s")
+
+    assert "recording one, 3 s" in screen.getvalue() and "force" in screen.getvalue()

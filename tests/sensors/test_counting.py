@@ -1,0 +1,99 @@
+"""Counters that wrap, lose, restart and are interrupted are made sense of as arithmetic and the clock say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tacpipe.sensors.counting import Counted, Counting
+
+WRAP = 1 << 16
+RATE_HZ = 1000.0
+PERIOD_NS = 1_000_000
+
+
+def counted(counting: Counting, first: int, count: int, at_s: float) -> Counted:
+    """Feed counters from ``first`` on, one a period from ``at_s`` on, as a device sends them that wraps."""
+    rows: NDArray[np.int64] = np.arange(count, dtype=np.int64)
+    return counting.feed((first + rows) * counting.step % counting.modulus, round(at_s * 1e9) + rows * PERIOD_NS)
+
+
+def interrupted(first: int, outage_s: float, after: int, modulus: int = WRAP, rate_hz: float = RATE_HZ) -> Counted:
+    """Return what is made of 10 counters from ``after`` on, behind one of ``first`` and an outage."""
+    counting = Counting(modulus, rate_hz)
+    counted(counting, first, 1, 0)
+    counting.reopened()
+    return counted(counting, after, 10, outage_s)
+
+
+def test_a_device_that_began_anew_while_it_was_away_is_reset_and_the_clock_tells_the_loss() -> None:
+    found = interrupted(60_000, outage_s=10, after=0)
+
+    assert found.missing.tolist() == [9_999] + [0] * 9
+    assert found.reset.tolist() == [True] + [False] * 9
+    assert found.seq.tolist() == list(range(70_000, 70_010))
+
+
+@given(first=st.integers(0, WRAP - 1), gone=st.integers(1, 1_000_000), drift=st.floats(-0.04, 0.04))
+def test_a_device_that_went_on_counting_while_the_link_was_away_loses_what_its_counter_says(
+    first: int, gone: int, drift: float
+) -> None:
+    found = interrupted(first, outage_s=gone * (1 + drift) / RATE_HZ, after=first + gone)
+
+    # beyond 5 % of 655 s the clock no longer tells how often a counter of 65 s went round
+    if gone * abs(drift) < WRAP / 2 - 100:
+        assert found.missing.tolist() == [gone - 1] + [0] * 9
+        assert not found.reset.any()
+
+
+@given(first=st.integers(0, WRAP - 1), after=st.integers(0, WRAP - 1), outage_s=st.floats(0.1, 600))
+def test_whatever_a_device_begins_with_the_loss_is_about_what_the_clock_says(
+    first: int, after: int, outage_s: float
+) -> None:
+    found = interrupted(first, outage_s, after)
+
+    expected = outage_s * RATE_HZ
+    assert abs(int(found.missing[0]) + 1 - expected) <= 33 + 0.05 * expected
+    assert np.diff(found.seq).tolist() == [1] * 9
+    assert not found.duplicate.any() and not found.late.any()
+
+
+@pytest.mark.parametrize("after", [95, 100])
+def test_a_counter_that_stands_or_is_a_little_back_after_an_outage_began_anew(after: int) -> None:
+    found = interrupted(100, outage_s=0.005, after=after)
+
+    assert found.reset[0] and found.missing[0] == 4
+    assert not found.duplicate.any() and not found.late.any()
+
+
+def test_only_the_first_sample_after_an_outage_is_doubted() -> None:
+    counting = Counting(WRAP, RATE_HZ)
+    counting.reopened()  # before anything came there is nothing to doubt
+    assert not counted(counting, 500, 3, 0).reset.any()
+    counting.reopened()
+    assert len(counted(counting, 0, 0, 1).seq) == 0  # nothing came yet
+    assert counted(counting, 0, 3, 1).reset.tolist() == [True, False, False]
+    lost = counted(counting, 38, 2, 1.004)  # 36 in 2 ms: a burst may bring so many, but no outage was before
+
+    assert lost.missing.tolist() == [35, 0] and not lost.reset.any()
+
+
+def test_where_no_rate_is_known_a_counter_that_grew_is_believed() -> None:
+    assert interrupted(10, 5, after=30, rate_hz=0).missing.tolist() == [19] + [0] * 9
+    found = interrupted(10, 5, after=0, rate_hz=0)
+    assert found.reset[0] and found.missing[0] == 0
+
+
+def test_a_counter_that_grows_by_more_than_one_is_doubted_in_samples() -> None:
+    counting = Counting(1 << 16, RATE_HZ, step=4)
+    counted(counting, 0, 1, 0)
+    counting.reopened()
+    went_on = counted(counting, 3_000, 2, 3)
+    counting.reopened()
+    off = counting.feed(np.array([(6_000 * 4 + 1) % WRAP]), np.array([6_001_000_000]))
+
+    assert went_on.missing.tolist() == [2_999, 0] and not went_on.reset.any()
+    assert off.reset.tolist() == [True] and off.missing.tolist() == [2_999]
