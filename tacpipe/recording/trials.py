@@ -94,8 +94,8 @@ def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) 
             _await(recorder, starts, ended, view, f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}")
             if ended():
                 break
-            recorded.append(_record(recorder, store, plan, trial, stops, view, ended))
-            lost = recorder.lost()
+            one, lost = _record(recorder, store, plan, trial, stops, view, ended)
+            recorded.append(one)
             if lost or ended():
                 return recorded, lost
     return recorded, []
@@ -124,7 +124,7 @@ def recover(store: Store, folder: Path) -> Recorded:
 
 def _record(
     recorder: Recorder, store: Store, plan: Plan, trial: int, stops: triggers.Trigger, view: View, ended: Ended
-) -> Recorded:
+) -> tuple[Recorded, list[str]]:
     name = plan.name if plan.trials == 1 else f"{plan.name}-{trial + 1:03d}"
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
     header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
@@ -138,10 +138,11 @@ def _record(
     with contextlib.closing(spool):  # held until it is sealed: nobody else may recover it meanwhile
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {time.monotonic() - began_s:.0f} s"))
+        lost = recorder.lost()  # now: while it is sealed nobody looks at what comes
         view.show(f"sealing {name}")
         kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
         try:
-            return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig)
+            return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig), lost
         except TacpipeError as error:
             raise type(error)(f"{error} {kept} once that is mended.") from error
         except Exception as error:

@@ -21,6 +21,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples
 from tests.conftest import Lab
+from tests.recording import live
 
 RIG = """
 [[stream]]
@@ -252,3 +253,16 @@ def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch)
             assert pressed() is False
             with pytest.raises(UsageError, match="No key can be pressed"):
                 pressed(must=True)
+
+
+def test_a_long_sealing_is_no_silence_of_the_devices(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    seal = sealing.seal
+
+    def slowly(*given: Any) -> Any:
+        time.sleep(1.0)
+        return seal(*given)
+
+    monkeypatch.setattr(sealing, "seal", slowly)
+    monkeypatch.setattr("tacpipe.recording.recorder.SILENT_S", 0.5)
+    with live.served(lab.folder, live.FORCE):
+        lab.run("acquire rig.toml -o rec --duration 1 --quiet")
