@@ -156,14 +156,15 @@ def table(fields: Sequence[pa.Field], batches: Sequence[Batch], spooled: Spooled
 
 
 def _columns(fields: Sequence[pa.Field], batches: Sequence[Batch]) -> list[NDArray[Any]]:
-    """Return the values of each channel (sample,), block by block so that each is joined once."""
+    """Return the values of each channel (sample,), each copied once: a recording of hours is large."""
     if not batches:
         return [np.zeros(0, dtype=kind.type.to_pandas_dtype()) for kind in fields]
-    found: list[NDArray[Any]] = []
-    for number in range(len(batches[0].values)):
-        block = np.concatenate([batch.values[number] for batch in batches])  # (sample, channel)
-        found += [np.ascontiguousarray(column) for column in block.T]
-    return found
+    widths = [block.shape[1] for block in batches[0].values]
+    return [
+        np.concatenate([batch.values[number][:, column] for batch in batches])
+        for number, width in enumerate(widths)
+        for column in range(width)
+    ]
 
 
 def _joined(parts: Sequence[Any], kind: Any) -> NDArray[Any]:
