@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 MOST = 1 << 24  # bytes of the largest message
+SILENT = logging.getLogger("tacpipe.links.websocket")  # a lost connection is told as such, not by a traceback
+SILENT.addHandler(logging.NullHandler())
+SILENT.propagate = False
 CLOSE_S = 1.0  # that the other end is given to say goodbye
 
 
@@ -37,6 +41,7 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
             max_size=MOST,
             open_timeout=network.CONNECT_S,
             close_timeout=CLOSE_S,
+            logger=SILENT,
         ).__enter__()
     except (WebSocketException, TimeoutError, OSError, EOFError) as error:
         wire.close()

@@ -40,6 +40,7 @@ CHUNKS, NOTE = 0, 1  # kinds of blocks
 TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
 YOUNG_S = 60.0  # for which a spool without a header may be one that is being begun
 RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # after a full disk
+PASSED_BYTES = 1 << 25  # whole pages
 
 
 @dataclass(frozen=True)
@@ -184,8 +185,11 @@ class Spooled:
         if not path.stat().st_size:
             return
         with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            place = 0
+            place = passed = 0
             while place < len(content):
+                if place - passed >= PASSED_BYTES:  # what was read need not stay mapped: spools are larger than memory
+                    content.madvise(mmap.MADV_DONTNEED, passed, PASSED_BYTES)
+                    passed += PASSED_BYTES
                 stop = _end(content, place)
                 if stop is None:
                     found = content.find(MARK, place + 1)

@@ -79,7 +79,8 @@ def _beside(placed: Placed, other: Shape, up: Floats, camera_m: float, rng: np.r
         x, y = centre + (placed.shape.bound_m + other.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
         found = depth_camera.put(other, rest, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m)
         rows, columns = depth_camera.window(found)
-        if min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < depth_camera.HEIGHT:
+        seen = len(rows) and len(columns)  # it may lie beside the picture
+        if seen and min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < depth_camera.HEIGHT:
             break
     assert found is not None
     return found
