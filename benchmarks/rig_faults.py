@@ -23,7 +23,7 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
-from tacpipe.simulation.emulation import byte_faults, serving
+from tacpipe.simulation.emulation import byte_faults, matching, serving
 from tacpipe.simulation.emulation.byte_faults import Faults, Item
 from tacpipe.simulation.emulation.emulator import UNPACED_HZ, Emulator, pace
 from tacpipe.simulation.emulation.ledger import Ledger
@@ -137,21 +137,11 @@ def _held(name: str, ledger: Ledger, batches: list[Batch], reading: Reading, har
 def _keys(samples: Samples | Batch, reading: Reading) -> list[bytes]:
     """Return for each sample all that it says, its counter as the frame holds it."""
     modulus = reading.sensor.counter
-    texts = [
-        np.array([[hash(cell)] for cell in map(str, block.tolist())])
-        for block in samples.values
-        if block.dtype.kind == "O"
-    ]
-    parts = texts + [block for block in samples.values if block.dtype.kind != "O"]
+    columns = [column for block in samples.values for column in block.T]
     if samples.seq is not None and modulus is not None:
-        parts.append(
-            (samples.seq * reading.sensor.step % modulus)[:, None]
-            if isinstance(samples, Batch)
-            else samples.seq[:, None]
-        )
-    rows = [np.ascontiguousarray(part).view(np.uint8).reshape(len(part), -1) for part in parts]
-    joined = np.hstack(rows)
-    return [row.tobytes() for row in joined]
+        unrolled = isinstance(samples, Batch)
+        columns.append(samples.seq * reading.sensor.step % modulus if unrolled else samples.seq)
+    return matching.keys(columns)
 
 
 def _longest(ledger: Ledger, given: np.ndarray) -> int:

@@ -16,14 +16,12 @@ import tempfile
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 import tacpipe
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import byte_faults, rig_file
+from tacpipe.simulation.emulation import byte_faults, matching, rig_file
 from tacpipe.simulation.emulation.emulate_command import SWITCH_S
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
@@ -31,25 +29,13 @@ from tacpipe.simulation.emulation.ledger import Ledger
 BIN = Path(sys.executable).parent
 RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"
 USUAL = "noise=0.2,cut=0.2,flip=0.2,burst=0.2,drop=0.001,duplicate=0.001,reorder=0.001,stall=0.05,unplug=0.02,wrap_s=30"
-NOT_CHANNELS = ("t_ns", "t_device_ns", "seq", "device_seq")
-
-
-def keys(columns: list[Any]) -> list[bytes]:
-    """Return all that each sample says, as bytes (sample,)."""
-    parts = [
-        np.array([hash(str(cell)) for cell in column.tolist()]) if column.dtype.kind == "O" else column
-        for column in columns
-    ]
-    rows = [np.ascontiguousarray(part).view(np.uint8).reshape(len(part), -1) for part in parts]
-    return [row.tobytes() for row in np.hstack(rows)]
 
 
 def held(table: pa.Table, ledger: Ledger) -> str:
     """Return how many samples were sent, recorded, wrong, and wrong beyond what the protocol can tell."""
     sent = ledger.samples()
-    wanted = set(keys([column for block in sent.values for column in block.T]))
-    channels = [name for name in table.column_names if name not in NOT_CHANNELS]
-    found = keys([table.column(name).to_numpy(zero_copy_only=False) for name in channels])
+    wanted = set(matching.keys(matching.sent_columns(sent)))
+    found = matching.keys(matching.recorded_columns(table))
     wrong = sum(key not in wanted for key in found)
     invisible = int(ledger.column("invisible").sum())
     a_frame = max(1, round(len(sent) / max(1, len(ledger.whole))))

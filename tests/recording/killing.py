@@ -22,17 +22,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import tacpipe
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import rig_file
+from tacpipe.simulation.emulation import matching, rig_file
 from tacpipe.simulation.emulation.emulate_command import SWITCH_S
 from tacpipe.simulation.emulation.emulator import Emulator
 
 BIN = Path(sys.executable).parent
 RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"
-NOT_CHANNELS = ("t_ns", "t_device_ns", "seq", "device_seq")
 
 
 @dataclass(frozen=True)
@@ -92,23 +89,16 @@ def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, whole: b
     sent_ns = ledger.column("sent_ns")[rows]
     sent = ledger.samples(rows[sent_ns > killed_ns - 20_000_000_000])
     sent_ns = sent_ns[sent_ns > killed_ns - 20_000_000_000]
-    counts = table.column("seq").to_numpy()
-    assert sent.seq is not None
-    values = [column for block in sent.values for column in block.T]
-    recorded = [table.column(column).to_numpy() for column in table.column_names if column not in NOT_CHANNELS]
-    for start in np.flatnonzero(sent.seq == counts[0]):
-        stop = start + len(counts)
-        if all(np.array_equal(a, b[start:stop], equal_nan=True) for a, b in zip(recorded, values, strict=True)):
-            break
-    else:
-        raise AssertionError(f"{name}: what was recovered is not what was sent")
+    start = matching.start_of(table, sent)
+    assert start is not None, f"{name}: what was recovered is not what was sent"
+    stop = start + table.num_rows
     missed = int((sent_ns[stop:] < killed_ns).sum())
     lost_reads = int(shard.attributes.get(f"{name}_crash_lost_reads", 0))
     lost_bytes = int(shard.attributes.get(f"{name}_crash_lost_bytes", 0))
     frame = len(ledger.frames(rows[-1:])[0])
     told = lost_bytes // frame if emulator.rig.streams[name].address.scheme == "serial" else lost_reads
     lost_s = 0.0 if whole else (killed_ns - int(sent_ns[stop - 1])) / 1e9
-    return Cost(name, len(counts), lost_s, 0 if whole else missed - told, told)
+    return Cost(name, table.num_rows, lost_s, 0 if whole else missed - told, told)
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.simulation.emulation import rig_file
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
-from tests.recording.killing import NOT_CHANNELS
+from tacpipe.simulation.emulation.matching import STAMPS
 from tests.simulation.emulation.rigs import awaited
 
 __all__ = ["awaited"]
@@ -74,7 +74,7 @@ def only(folder: Path, output: str = "rec") -> Any:
 def recorded(shard: Any, name: str) -> list[str]:
     """Return the values of every sample of a recorded stream, without stamps and counters."""
     table = shard.table(name)
-    columns = [table.column(column).to_pylist() for column in table.column_names if column not in NOT_CHANNELS]
+    columns = [table.column(column).to_pylist() for column in table.column_names if column not in STAMPS]
     return [repr(row) for row in zip(*columns, strict=True)]
 
 
