@@ -10,6 +10,7 @@ value.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import subprocess
 import sys
@@ -41,29 +42,36 @@ class Look:
     at_s: float
     processor_s: float
     resident_mb: float
+    most_mb: float  # resident, ever
 
 
 def look(process: int) -> Look:
     """Return the processor time and the resident memory of a process."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    resident = next(
-        line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line.startswith("VmRSS")
-    )
-    return Look(time.monotonic(), (int(fields[11]) + int(fields[12])) / TICKS, int(resident.split()[1]) / 1024)
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    memory_mb = {
+        line.split(":")[0]: int(line.split()[1]) / 1024 for line in lines if line.startswith(("VmRSS", "VmHWM"))
+    }
+    processor_s = (int(fields[11]) + int(fields[12])) / TICKS
+    return Look(time.monotonic(), processor_s, memory_mb["VmRSS"], memory_mb["VmHWM"])
 
 
-def watched(command: list[str], seconds: float, store: Path) -> list[Look]:
-    """Run a command that records for ``seconds`` and return looks at it while it does."""
+def watched(command: list[str], seconds: float, store: Path) -> tuple[list[Look], Look]:
+    """Run a command that records for ``seconds`` and return looks at it while it does, and the last while it seals."""
     process = subprocess.Popen(command, env={**os.environ, "TACPIPE_STORE": str(store)})
     looks = []
     until_s = time.monotonic() + seconds
+    last = None
     while process.poll() is None:
-        if time.monotonic() < until_s:
-            looks.append(look(process.pid))
+        with contextlib.suppress(OSError, KeyError, IndexError):  # it ended at this moment
+            last = look(process.pid)
+        if last is not None and time.monotonic() < until_s:
+            looks.append(last)
         time.sleep(LOOK_S if time.monotonic() < until_s else 0.2)
     if process.returncode:
         raise SystemExit(f"acquire ended with {process.returncode}.")
-    return looks
+    assert last is not None
+    return looks, last
 
 
 def accounted(table: pa.Table, ledger: Ledger) -> str:
@@ -88,7 +96,7 @@ def main() -> None:
             rig.write_text(rig_file.text(emulator.rig))
             seconds = 60 * chosen.minutes
             words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration", str(seconds), "--quiet"]
-            looks = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")
+            looks, sealed = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")
         os.environ["TACPIPE_STORE"] = str(folder / "store")
         recordings = tacpipe.open(folder / "rec")
         (shard,) = recordings.shards.values()
@@ -98,6 +106,8 @@ def main() -> None:
         print(f"recorded {seconds:g} s: {100 * share:.1f} % of one core")
         told = f"{max(settled):.0f} MB at most, {settled[-1]:.0f} MB at the end"
         print(f"resident memory: {settled[0]:.0f} MB after {SETTLED_S:g} s, {told}")
+        sealing_s = sealed.at_s - first.at_s - seconds
+        print(f"sealing: about {sealing_s:.0f} s more, {sealed.most_mb:.0f} MB at most, pages of the spool included")
         for stream in shard.streams:
             if stream == "events":
                 print(f"events: {shard.table(stream).to_pylist()}")
