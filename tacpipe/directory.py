@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
+import uuid
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.files import write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import NAME, Manifest, parse
-from tacpipe.store import Store
+from tacpipe.store import MissingError, Store
 
 _DRAFT = ".draft"
 
@@ -25,21 +26,68 @@ def publish(store: Store, manifest: Manifest, directory: Path) -> None:
     """
     directory = directory.absolute()
     check_output(store, directory)
+    if not shown(store, manifest, directory):
+        with changing(store, directory):
+            publish_alone(store, manifest, directory)
+    store.set_root(directory, bytes_digest(manifest.content))
+
+
+def shown(store: Store, manifest: Manifest, directory: Path) -> bool:
+    """Return whether ``directory`` shows ``manifest`` already, with all that it names."""
+    return _current(directory, manifest.content) and not _stale(store, manifest, directory)
+
+
+@contextlib.contextmanager
+def changing(store: Store, directory: Path) -> Iterator[None]:
+    """Change what ``directory`` shows while nobody else does, whoever reads its manifest first to change it included."""
+    directory = directory.absolute()
+    with store.leases.hold(digest(["output", *store.named(directory)]), f"the output {directory}"):
+        yield
+
+
+def publish_alone(store: Store, manifest: Manifest, directory: Path) -> None:
+    """Do as `publish` does, in the block of `changing`."""
+    directory = directory.absolute()
+    check_output(store, directory)
     wanted = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    stale = [path for path, name in wanted.items() if not (current and _matches(directory / path, store, name))]
-    if current and not stale:
-        store.set_root(directory, bytes_digest(manifest.content))
-        return
-    with store.leases.hold(digest(["output", str(directory)])):
+    stale = _stale(store, manifest, directory) if current else list(wanted)
+    gone = _named(directory) - set(wanted)
+    refuse_links(directory, {*stale, *gone})
+    with writing(directory):
         store.set_root(directory, bytes_digest(manifest.content))
         for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
-            draft.unlink()  # of a process that was killed
+            draft.unlink(missing_ok=True)  # of a process that was killed
         for path in stale:
             place(store, wanted[path], directory / path, copy=manifest.recorded)
-        _remove(directory, _named(directory) - set(wanted))
+        _remove(directory, gone)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the file system says of an output into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise TacpipeError(
+            f"{path} cannot be written: {error.strerror or error}. The result is kept in the store: run the same command "
+            f"again when that is mended."
+        ) from error
+
+
+def _stale(store: Store, manifest: Manifest, directory: Path) -> list[str]:
+    return [path for path, name in manifest.objects() if not _matches(directory / path, store, name)]
+
+
+def refuse_links(directory: Path, paths: Iterable[str]) -> None:
+    """Refuse folders within a dataset that are links: what is written or removed there may be anybody's."""
+    for folder in {folder for path in paths for folder in list(Path(path).parents)[:-1]}:
+        if (directory / folder).is_symlink():
+            raise UsageError(
+                f"{directory / folder} is a symbolic link out of its dataset. Remove it, or give -o another directory."
+            )
 
 
 def _remove(directory: Path, paths: set[str]) -> None:
@@ -67,22 +115,22 @@ def check_output(store: Store, directory: Path) -> None:
 
 
 def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
-    """Put the object ``name`` at ``path``: by reflink, hard link or copy, in this order; only by copy if ``copy``."""
+    """Put the object ``name`` at ``path``: by reflink, hard link or copy, in this order; only by copy if ``copy``.
+
+    It is verified first. Raises `MissingError` if it is not in the store, or was damaged there.
+    """
+    content = store.read(name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}{_DRAFT}")
+    draft = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex[:12]}{_DRAFT}")
     source = store.object_path(name)
-    with contextlib.suppress(FileNotFoundError):
-        draft.unlink()
     try:
         if copy or not _link(source, draft):
-            shutil.copyfile(source, draft)
+            draft.write_bytes(content)
         draft.replace(path)
     except FileNotFoundError:
-        raise DamagedError(
-            f"Object {name[:12]} vanished from the store while it was linked; run the same command again."
-        ) from None
+        raise MissingError(f"Object {name[:12]} vanished from the store; run the same command again.") from None
     finally:
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):  # one that stays is swept up by the next who writes here
             draft.unlink()
 
 
@@ -104,9 +152,10 @@ def _matches(path: Path, store: Store, name: str) -> bool:
     try:
         there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
         stored = os.stat(store.object_path(name))  # noqa: PTH116
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
-    return there.st_ino == stored.st_ino or (there.st_size == stored.st_size and file_digest(path) == name)
+    same = (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino)
+    return same or (there.st_size == stored.st_size and file_digest(path) == name)
 
 
 def _current(directory: Path, content: bytes) -> bool:

@@ -33,6 +33,7 @@ class Task:
     beside: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
+    run: str = ""  # the lease of the run that it is part of
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,11 @@ class Done:
 
 def compute(task: Task) -> Done:
     """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
-    store, key = Store(task.store), digest(task.identity)
+    store, key = Store(task.store, task.run), digest(task.identity)
     try:
         if task.dry:
             return Done(task.recording, {"result": execute(task, store, _Scratch())})
-        with store.leases.hold(key):
+        with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
             record = store.record(key)
             if record is not None and complete(store, record):
                 return Done(task.recording, record, made=False)
@@ -108,17 +109,20 @@ def stage_of(name: str) -> Stage:
 
 
 def complete(store: Store, record: Mapping[str, Any]) -> bool:
-    """Return whether every object that the record names is in the store; those that are there are freshened."""
-    return all(store.keep(name) for name in named(record["result"]))
+    """Return whether every object that the record names is in the store, whole; they are announced first."""
+    store.announce(named(record["result"]))
+    return all(store.has(one["digest"], one["bytes"]) for one in _objects(record["result"]))
 
 
 def named(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the digests of all shards and files of a record's ``result`` (or of a manifest)."""
+    return (one["digest"] for one in _objects(result))
+
+
+def _objects(result: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     for entry in result["recordings"].values():
-        for shard in entry["shards"].values():
-            yield shard["digest"]
-    for file in result["files"].values():
-        yield file["digest"]
+        yield from entry["shards"].values()
+    yield from result["files"].values()
 
 
 def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> list[str]:
@@ -166,6 +170,7 @@ def _adopt(store: Store, name: str, path: str, beside: tuple[str, ...]) -> bytes
 
 
 def _remake(store: Store, name: str, path: str, why: str) -> bytes:
+    other = ""
     for identity in _makers(store, name):
         acquired = identity["stage"] == ACQUIRE
         if acquired or stage_of(identity["stage"]).source:
@@ -175,12 +180,17 @@ def _remake(store: Store, name: str, path: str, why: str) -> bytes:
             )
         stage = stage_of(identity["stage"])
         if stage.version != identity["version"]:
+            other = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
             continue
-        execute(Task(str(store.root), identity["stage"], identity), store, store)
+        with store.leases.hold(digest(identity), f"{identity['stage']}, for {path}"):
+            if not store.has(name):  # else another process has made it again
+                execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
         if store.has(name):
             return store.read(name)
+        other = f"{identity['stage']} gave something else when it was run again: other libraries, or chance"
+    reason = other or f"nothing in the store says how {path} was made"
     raise DamagedError(
-        f"{why} Nothing in the store says how {path} was made: bring it with `tacpipe store pull`, or run the stage again."
+        f"{why} It cannot be made again: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
     )
 
 

@@ -12,11 +12,14 @@ from typing import Any
 
 from tacpipe.errors import TacpipeError
 
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
 
-def write_whole(path: str, content: bytes, draft: str, *, mode: int = 0o644, exclusive: bool = False) -> bool:
+
+def write_whole(path: str, content: bytes, draft: str, *, mode: int = 0o666, exclusive: bool = False) -> bool:
     """Write ``content`` to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost the race.
 
-    Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made.
+    Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made. ``mode`` is less
+    what the umask takes.
     """
     try:
         _write_synced(draft, content, mode)
@@ -28,6 +31,13 @@ def write_whole(path: str, content: bytes, draft: str, *, mode: int = 0o644, exc
     finally:
         with contextlib.suppress(OSError):  # a draft that stays is swept up later
             os.unlink(draft)  # noqa: PTH108
+
+
+def write_all(handle: int, content: bytes) -> None:
+    """Write all of ``content``, however little of it the system takes at a time."""
+    view = memoryview(content)
+    while view:
+        view = view[os.write(handle, view) :]
 
 
 def sync_folder(path: str) -> None:
@@ -43,28 +53,38 @@ def read_json(path: Path) -> dict[str, Any] | None:
     """Return the mapping that a file holds; None if it is not there or holds none."""
     try:
         value = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, ValueError, RecursionError):
         return None
     return value if isinstance(value, dict) else None
 
 
 @contextlib.contextmanager
 def readable_errors(root: Path) -> Iterator[None]:
-    """Turn what the file system says into a sentence."""
+    """Turn what the file system says into a sentence; what is looked for and not there stays what it is."""
     try:
         yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise TacpipeError(
-                f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
-                f"shows what the store could give back) and run the same command again."
-            ) from error
-        if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-            raise TacpipeError(
-                f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
-                f"TACPIPE_STORE."
-            ) from error
+    except (FileNotFoundError, FileExistsError):
         raise
+    except OSError as error:
+        raise sentence(root, error) from error
+
+
+def sentence(root: Path | str, error: OSError) -> TacpipeError:
+    """Return in words what the file system said of something under the store ``root``."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return TacpipeError(
+            f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
+            f"shows what the store could give back) and run the same command again."
+        )
+    if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+        return TacpipeError(
+            f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
+            f"TACPIPE_STORE."
+        )
+    return TacpipeError(
+        f"The store {root} cannot be used: {error.strerror or error}, says the system of {error.filename or 'it'}. "
+        f"Look after the disk, then run the same command again."
+    )
 
 
 def _write_synced(path: str, content: bytes, mode: int) -> None:
@@ -74,9 +94,7 @@ def _write_synced(path: str, content: bytes, mode: int) -> None:
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
-        view = memoryview(content)
-        while view:
-            view = view[os.write(handle, view) :]
+        write_all(handle, content)
         os.fsync(handle)
     finally:
         os.close(handle)
@@ -90,4 +108,10 @@ def _move(draft: str, path: str, exclusive: bool) -> bool:
         os.link(draft, path)
     except FileExistsError:
         return False
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        if os.path.exists(path):  # noqa: PTH110
+            return False
+        os.replace(draft, path)  # noqa: PTH105  (of two that come here at once the later one stays: both are complete)
     return True

@@ -1,25 +1,29 @@
-"""What in a store is still needed, and removing the rest."""
+"""What in a store is still needed, and removing the rest.
+
+No clock decides what is needed: who uses an object announces it before it looks whether the object is there, and a
+collection moves objects aside before it reads the announcements. So either sees the other.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import json
+import os
 import shutil
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tacpipe import manifest as manifest_of
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
+from tacpipe.files import readable_errors
 from tacpipe.hashing import bytes_digest
-from tacpipe.store import Store
+from tacpipe.store import ASIDE, PUSHED, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
-_SLACK_S = 60.0  # clocks of file servers
+_YOUNG_S = 60.0  # what was just written is left alone, whoever wrote it
 
 
 @dataclass
@@ -34,66 +38,129 @@ class Collected:
     kept_recordings: int = 0  # ingested or acquired ones that nothing names any more
 
 
-def live(store: Store, grace_days: float = GRACE_DAYS) -> tuple[set[str], set[str], float]:
-    """Return the digests of needed objects, those of needed manifests, and the time from which everything is kept.
+@dataclass
+class Live:
+    """What is needed: by roots, by what lies at their paths, by running processes, and by what these descend from."""
 
-    Needed is what roots name, what their paths hold now, what running processes leased, and all that these descend from.
+    objects: set[str] = field(default_factory=set)  # digests, of manifests too
+    runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
+
+
+def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False) -> Live:
+    """Return what is needed.
+
+    Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
     """
+    found, wanted = Live(), []
+    for run in store.leases.runs():  # before the roots: a run that ends meanwhile has written its root by then
+        found.runs.add(run.path.stem)
+        found.objects |= run.objects
+        wanted += run.manifests
     contents: dict[str, bytes] = {}
-    wanted: list[str] = []
     for root in store.roots():
         path = Path(root["path"])
-        here = _content(path)
+        here = None if root["kind"] == PUSHED else _content(path)
         if here is not None:
             contents[bytes_digest(here)] = here
             wanted.append(bytes_digest(here))
-        reached = here is not None or path.is_file()  # a report: its manifest lies in the store alone
-        expired = _expired(store, root, grace_days, reached=reached)
+            reached = True
+        else:
+            reached = path.is_file() or root["kind"] == PUSHED  # a report: its manifest lies in the store alone
+        expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
-    begun_s = time.time()
-    for note, started_s in store.leases.runs():
-        wanted += note["manifests"]
-        begun_s = min(begun_s, started_s)
-    objects, manifests = _closure(store, wanted, contents)
-    return objects, manifests, begun_s - _SLACK_S
+    damaged = store.damaged_roots()
+    if damaged:
+        raise DamagedError(
+            f"{damaged} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
+            f"removed. Run the commands that wrote them again (whose are not in `tacpipe store status`)."
+        )
+    found.objects |= _closure(store, wanted, contents)
+    return found
 
 
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
     """Remove what nothing needs, records before the objects they name; with ``dry_run`` only count.
 
-    Raises `LockedError` if another collection runs.
+    Raises `LockedError` if another collection runs, and `DamagedError` as `live` does.
     """
-    with store.leases.alone("gc") if not dry_run else contextlib.nullcontext():
+    with store.leases.alone("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
+        if not dry_run:
+            _put_back(store)
         return _collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    objects, manifests, kept_from_s = live(store, grace_days)
-    objects |= manifests
+    needed = live(store, grace_days, dry_run=dry_run)
     collected = Collected()
     kept: set[str] = set()
     for key, record in list(store.records()):
         names = set(named(record["result"]))
-        if names <= objects:
+        if names <= needed.objects:
             continue
         if record["provenance"].get("irreplaceable") and not recordings:
-            kept |= names - objects
+            kept |= names - needed.objects
             continue
-        path = Path(store.record_path(key))
-        if path.stat().st_mtime < kept_from_s:
-            collected.records += 1
-            if not dry_run:
-                path.unlink(missing_ok=True)
+        collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
     collected.kept_recordings = len(kept)
+    aside = []
     for path in store.root.glob("objects/*/*"):
-        if path.name not in objects and path.name not in kept:
-            _remove(path, kept_from_s, collected, dry_run=dry_run)
-    _sweep(store, collected, grace_days, dry_run=dry_run)
+        if path.name in needed.objects or path.name in kept or _young(path):
+            continue
+        if dry_run:
+            _count(collected, path)
+        else:
+            with contextlib.suppress(FileNotFoundError):
+                os.rename(path, store.aside(path.name))  # noqa: PTH104
+                aside.append(path.name)
+    if aside:
+        _remove(store, aside, live(store, grace_days).objects, collected)
+    _sweep(store, needed, collected, grace_days, dry_run=dry_run)
     return collected
 
 
-def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> tuple[set[str], set[str]]:
+def _remove(store: Store, aside: list[str], needed: set[str], collected: Collected) -> None:
+    """Remove the objects that were moved aside, but for those that somebody needed in the meantime."""
+    for name in aside:
+        if name in needed:
+            store.has(name)  # which puts it back
+            continue
+        path = Path(store.aside(name))
+        with contextlib.suppress(FileNotFoundError):  # put back by who needs it
+            _count(collected, path)
+            path.unlink()
+
+
+def _put_back(store: Store) -> None:
+    """Put back what a collection that was killed had moved aside."""
+    for path in store.root.glob(f"tmp/{ASIDE}*"):
+        with contextlib.suppress(DamagedError):
+            if store.has(path.name.removeprefix(ASIDE)):
+                path.unlink(missing_ok=True)
+
+
+def _count(collected: Collected, path: Path) -> None:
+    collected.bytes += path.stat().st_size
+    collected.objects += 1
+
+
+def _young(path: Path) -> bool:
+    """Return whether a file was written just now, by a clock that may have been set since."""
+    with contextlib.suppress(FileNotFoundError):
+        return abs(time.time() - path.stat().st_mtime) < _YOUNG_S
+    return True
+
+
+def _remove_record(path: Path, *, dry_run: bool) -> bool:
+    if _young(path):
+        return False
+    if not dry_run:
+        path.unlink(missing_ok=True)
+    return True
+
+
+def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> set[str]:
+    """Return the digests of manifests, of those they descend from, and of all objects that these name."""
     objects: set[str] = set()
     manifests: set[str] = set()
     while wanted:
@@ -103,11 +170,16 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> tup
         manifests.add(name)
         try:
             manifest = manifest_of.parse(contents.get(name) or store.read(name), name, verified=True)
-        except TacpipeError:
-            continue
+        except TacpipeError as error:
+            if store.quarantined(name):
+                raise DamagedError(
+                    f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is not "
+                    f"known what it needs; nothing was removed. `tacpipe store repair` may bring it back."
+                ) from error
+            continue  # it never came here: of a dataset that was copied or pulled without what it descends from
         objects |= {found for _, found in manifest.objects()}
         wanted += ancestors(manifest)
-    return objects, manifests
+    return objects | manifests
 
 
 def ancestors(manifest: manifest_of.Manifest) -> list[str]:
@@ -123,37 +195,31 @@ def _content(path: Path) -> bytes | None:
         return None
 
 
-def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool) -> bool:
+def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
     """Return whether a root's path has been out of reach for the whole grace.
 
     The first look that does not reach it starts the clock, and one that reaches it stops the clock.
     """
-    since_s = None if reached else root.get("missing_since_s", int(time.time()))
-    if since_s != root.get("missing_since_s"):
+    now_s = int(time.time())
+    since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # a clock may have been set back
+    if since_s != root.get("missing_since_s") and not dry_run:
         kept = {key: value for key, value in root.items() if key != "missing_since_s"}
-        noted = kept if since_s is None else {**kept, "missing_since_s": since_s}
         with contextlib.suppress(TacpipeError):
-            store.write_file(store.root_path(Path(root["path"])), json.dumps(noted, sort_keys=True).encode())
+            store.write_root(kept if since_s is None else {**kept, "missing_since_s": since_s})
     if since_s is None:
         return False
-    return grace_days <= 0 or time.time() - since_s > grace_days * 86400
+    return grace_days <= 0 or now_s - since_s > grace_days * 86400
 
 
-def _remove(path: Path, kept_from_s: float, collected: Collected, *, dry_run: bool) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        status = path.stat()  # asked for again right before: a run that reuses an object freshens it
-        if status.st_mtime >= kept_from_s:
-            return
-        collected.objects += 1
-        collected.bytes += status.st_size
-        if not dry_run:
-            path.unlink()
-
-
-def _sweep(store: Store, collected: Collected, grace_days: float, *, dry_run: bool) -> None:
+def _sweep(store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool) -> None:
     now_s = time.time()
-    collected.drafts += _drop(store.root.glob("tmp/*"), now_s - _DRAFT_S, dry_run=dry_run)
-    _drop(store.root.glob("quarantine/*"), now_s - grace_days * 86400, dry_run=dry_run)
+    for path in store.root.glob("tmp/*"):
+        if path.name.startswith(ASIDE) or path.name.partition(".")[0] in needed.runs:
+            continue
+        dead = path.name.startswith("run-")  # its run is over; of who told no run an old draft is swept up
+        collected.drafts += _drop(path, _YOUNG_S if dead else _DRAFT_S, now_s, dry_run=dry_run)
+    for path in store.root.glob("quarantine/*"):
+        _drop(path, grace_days * 86400, now_s, dry_run=dry_run)
     for folder in store.root.glob("checkpoints/*"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1
@@ -161,12 +227,10 @@ def _sweep(store: Store, collected: Collected, grace_days: float, *, dry_run: bo
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def _drop(paths: Iterable[Path], before_s: float, *, dry_run: bool) -> int:
-    count = 0
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            if path.stat().st_mtime < before_s:
-                count += 1
-                if not dry_run:
-                    path.unlink()
-    return count
+def _drop(path: Path, older_s: float, now_s: float, *, dry_run: bool) -> bool:
+    with contextlib.suppress(FileNotFoundError):
+        if abs(now_s - path.stat().st_mtime) >= older_s:
+            if not dry_run:
+                path.unlink()
+            return True
+    return False

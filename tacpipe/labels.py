@@ -10,6 +10,7 @@ from pathlib import Path
 from tacpipe import directory as directory_of
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import UsageError
+from tacpipe.manifest import Found, Manifest
 from tacpipe.stage import Attribute
 from tacpipe.store import locate
 
@@ -44,23 +45,32 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
     Raises `UsageError` if a pattern matches no recording.
     """
     found = manifest_of.find(path)
-    manifest, directory = found.manifest, found.directory
+    store, directory = locate(found.directory), found.directory
+    _refuse_made(found.manifest, directory)
+    with store.at_work([found.digest]), directory_of.changing(store, directory):
+        found = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
+        changed = found.manifest.labelled({name: dict(labels) for name in _matching(found, patterns)})
+        store.put(found.content)
+        store.put(changed.content)
+        directory_of.publish_alone(store, changed, directory)
+    return directory
+
+
+def _refuse_made(manifest: Manifest, directory: Path) -> None:
     if manifest.inputs:
         raise UsageError(
             f"{directory} was made by {manifest.stage} from other datasets, and the next run would undo its labels. "
             f"Label the recordings that it comes from; `tacpipe explain {directory}` names them."
         )
+
+
+def _matching(found: Found, patterns: Sequence[str]) -> list[str]:
+    recordings = found.manifest.recordings
     names: set[str] = set()
     for pattern in patterns:
-        matching = {name for name in manifest.recordings if fnmatchcase(name, pattern)}
+        matching = {name for name in recordings if fnmatchcase(name, pattern)}
         if not matching:
-            some = ", ".join(sorted(manifest.recordings)[:5])
-            raise UsageError(f"{directory} has no recording {pattern}; it has {len(manifest.recordings)}: {some} …")
+            some = ", ".join(sorted(recordings)[:5])
+            raise UsageError(f"{found.directory} has no recording {pattern}; it has {len(recordings)}: {some} …")
         names |= matching
-    store = locate(directory)
-    store.prepare()
-    store.put(found.content)
-    changed = manifest.labelled({name: dict(labels) for name in sorted(names)})
-    store.put(changed.content)
-    directory_of.publish(store, changed, directory)
-    return directory
+    return sorted(names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,6 +17,10 @@ from tacpipe.stage import Attribute
 FORMAT = 1
 NAME = "manifest.json"
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
+NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add to it
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_PART = r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*"
+_PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
 
 
@@ -83,6 +88,14 @@ class Manifest:
         for name, file in self.files.items():
             yield name, file["digest"]
 
+    def sizes(self) -> Iterable[tuple[str, int]]:
+        """Yield digest and size in bytes of every shard and file."""
+        for entry in self.recordings.values():
+            for shard in entry["shards"].values():
+                yield shard["digest"], shard["bytes"]
+        for file in self.files.values():
+            yield file["digest"], file["bytes"]
+
     @property
     def rows(self) -> int:
         """How many rows all shards have together."""
@@ -102,7 +115,8 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
         manifest = Manifest(**value)
         manifest.__dict__["content"] = content  # primes the cached property: the bytes are at hand
         computed = stored if verified else manifest.digest
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        check(manifest)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(
             f"{where} is not a manifest of tacpipe ({error}). Restore it, or run the stage that made it again."
         ) from None
@@ -112,6 +126,70 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     return manifest
+
+
+def safe_path(path: str) -> bool:
+    """Return whether a path stays within the directory that it is relative to, and every file system takes it.
+
+    >>> [safe_path(path) for path in ("trial-01/xela1.parquet", "../x", "/x", ".git/x", "a//b", "a\\nb", "")]
+    [True, False, False, False, False, False, False]
+    """
+    try:
+        short = all(len(part.encode()) <= NAME_BYTES for part in path.split("/"))
+    except UnicodeEncodeError:  # half a character: no file has such a name
+        return False
+    return short and _PATH.fullmatch(path) is not None
+
+
+def check(manifest: Manifest) -> None:
+    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: a stranger may have written it."""
+    _check_lineage(manifest)
+    for entry in manifest.recordings.values():
+        for name, value in entry["attributes"].items():
+            if not isinstance(value, str | int | float | None):
+                raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
+        for shard in entry["shards"].values():
+            _expect_count(shard["rows"], "rows")
+            _expect_count(shard["bytes"], "bytes")
+    for file in manifest.files.values():
+        _expect_count(file["bytes"], "bytes")
+    paths = set()
+    for path, name in manifest.objects():
+        if not safe_path(path) or path == NAME or path in paths:
+            raise ValueError(f"the path {path[:80]!r} leads out of the dataset, is there twice, or is none")
+        _expect_digest(name)
+        paths.add(path)
+
+
+def _check_lineage(manifest: Manifest) -> None:
+    for several in manifest.inputs.values():
+        for given in several:
+            _expect_digest(given["manifest"])
+            _expect_digest(given["dataset"])
+    for step in ({"stage": manifest.stage, "version": manifest.version, "params": manifest.params}, *manifest.chain):
+        if not isinstance(step["stage"], str) or not isinstance(step["version"], int):
+            raise TypeError("a stage or its version is not named")
+        _expect_mapping(step["params"], "params")
+        _expect_mapping(step.get("fitted") or {}, "fitted")
+    for labels in manifest.labels.values():
+        _expect_mapping(labels, "labels")
+    _expect_mapping(manifest.skipped, "skipped")
+    _expect_mapping(manifest.sources, "sources")
+
+
+def _expect_mapping(value: object, what: str) -> None:
+    if not isinstance(value, Mapping):
+        raise TypeError(f"its {what} are a {type(value).__name__}")
+
+
+def _expect_digest(name: object) -> None:
+    if not isinstance(name, str) or not _DIGEST.fullmatch(name):
+        raise ValueError(f"{str(name)[:80]!r} is no digest")
+
+
+def _expect_count(value: object, what: str) -> None:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(f"{what} {str(value)[:80]!r} is no count")
 
 
 def shard_path(recording: str, stream: str) -> str:
@@ -146,7 +224,11 @@ def find(path: Path | str) -> Found:
     given = Path(path)
     file = given if given.name == NAME else given / NAME
     try:
+        if file.exists() and not file.is_file():
+            raise UsageError(f"{file} is no regular file, so there is no dataset.")
         return Found(file.parent, file.read_bytes())
+    except PermissionError as error:
+        raise UsageError(f"{file} cannot be read ({error.strerror}). Ask its owner for leave to read it.") from None
     except (FileNotFoundError, NotADirectoryError):
         what = "is empty or not there" if not given.exists() else f"has no {NAME}"
         raise UsageError(

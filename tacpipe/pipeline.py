@@ -45,25 +45,44 @@ def open_dataset(path: Path | str) -> Dataset:
 def run(request: Request) -> Outcome:
     """Make the dataset that ``request`` asks for, doing only what was not done before."""
     started = time.perf_counter()
-    store, inputs = locate(), Inputs(request)
+    store = locate()
+    inputs = Inputs(request, store)
     identity = inputs.identity()
     outcome = Outcome(request.output, digest(identity))
     hit = None if request.compare else _answer(store, outcome.key)
-    if hit is None:
-        made = _Run(request, store, inputs, outcome).make()
-        outcome.notes = sorted(set(inputs.notes))
+    if hit is not None and (request.check or _shown(store, request, hit)):
+        made, outcome.reused = _keep_labels(request, hit), len(hit.recordings) or 1
+    elif request.check or request.compare:
+        made = _keep_labels(request, _Run(request, store, inputs, outcome).make())
     else:
-        made, outcome.reused = hit, len(hit.recordings) or 1
-    made = _keep_labels(request, made)
+        with store.at_work([found.digest for found in inputs.used]):
+            made = _make(request, store, inputs, identity, outcome)
+    outcome.notes = sorted(set(inputs.notes))
     outcome.rows = made.rows
     if request.check:
         _check(store, request, made)
-    elif not request.compare:
-        if hit is None:
-            _remember(store, identity, made, outcome)
-        _publish(store, request, made)
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome
+
+
+def _make(request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any], outcome: Outcome) -> Manifest:
+    """Return the manifest that the output shows afterwards, answered by the store or made; nothing of it is collected."""
+    if not request.single_file:
+        directory.check_output(store, request.output)
+    for first in (True, False):
+        made = _answer(store, outcome.key)
+        if made is None:
+            made = _Run(request, store, inputs, outcome).make()
+            _remember(store, identity, made, outcome)
+        else:
+            outcome.reused = len(made.recordings) or 1
+        try:
+            return _publish(store, request, made)
+        except MissingError:  # damaged in the store, which shows when it is linked: then it is made again
+            if not first:
+                raise
+            outcome.ran = outcome.reused = 0
+    raise AssertionError
 
 
 def _answer(store: Store, key: str) -> Manifest | None:
@@ -71,12 +90,32 @@ def _answer(store: Store, key: str) -> Manifest | None:
     record = store.record(key)
     if record is None:
         return None
+    name = record["result"]["files"][manifest.NAME]["digest"]
+    store.announce([name])
     try:
-        content = store.read(record["result"]["files"][manifest.NAME]["digest"])
+        content = store.read(name)
     except MissingError:
         return None
     found = manifest.parse(content, "the stored manifest", verified=True)
-    return found if all(store.has(name) for _, name in found.objects()) else None
+    store.announce(wanted for _, wanted in found.objects())
+    return found if all(store.has(name, size) for name, size in found.sizes()) else None
+
+
+def _shown(store: Store, request: Request, hit: Manifest) -> bool:
+    """Return whether the output holds the answer already and nothing is to be written; a dataset's root too is known."""
+    root = store.get_root(request.output.absolute())
+    if root is None:
+        return False
+    if request.single_file:
+        wanted = hit.files[_single(request, hit)]["digest"]
+        return (
+            root["manifest"] == bytes_digest(hit.content)
+            and request.output.exists()
+            and file_digest(request.output) == wanted
+        )
+    shown = _keep_labels(request, hit)
+    known = root["manifest"] == bytes_digest(shown.content)
+    return known and directory.shown(store, shown, request.output.absolute())
 
 
 class _Run:
@@ -88,16 +127,16 @@ class _Run:
 
     def make(self) -> Manifest:
         """Return the manifest of the result, having run what was missing."""
-        if self.request.check or self.request.compare:
-            return self._make()
-        self.store.prepare()
-        if not self.request.single_file:
-            directory.check_output(self.store, self.request.output)
-        with self.store.leases.running([found.digest for found in self.inputs.used]):
-            for found in self.inputs.used:
-                found.manifest  # noqa: B018  (a manifest edited by hand is refused before anything is written)
+        for found in self.inputs.used:
+            found.manifest  # noqa: B018  (a manifest edited by hand is refused before anything is written)
+            if self.store.run:
                 self.store.put(found.content)  # explain and gc follow a dataset to the manifests it descends from
-            return self._make()
+        made = self._make()
+        try:
+            manifest.check(made)
+        except (ValueError, TypeError, KeyError) as error:
+            raise TacpipeError(f"{self.request.name} gave what no dataset can hold: {error}.") from None
+        return made
 
     def _make(self) -> Manifest:
         request, stage = self.request, self.stage
@@ -184,6 +223,7 @@ class _Run:
             beside=self.inputs.beside,
             replace=record is not None,
             dry=self.request.compare,
+            run=self.store.run,
         )
         done = execution.compute(task)
         if done.record is None:
@@ -220,7 +260,7 @@ class _Run:
             if record is not None and execution.complete(self.store, record):
                 results[task.recording] = record["result"]
             else:
-                missing.append(replace(task, replace=record is not None))
+                missing.append(replace(task, replace=record is not None, run=self.store.run))
         if missing and self.request.check:
             raise WouldChangeError(f"{name} would run for {len(missing)} of {len(tasks)} recordings.")
         if self.request.compare:
@@ -326,24 +366,33 @@ def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome
         store.commit(identity, result, provenance.of(0.0), replace=True)
 
 
-def _publish(store: Store, request: Request, made: Manifest) -> None:
-    try:
-        if request.single_file:
-            _publish_file(store, request, made)
-        else:
-            directory.publish(store, made, request.output)
-    except OSError as error:
-        raise TacpipeError(
-            f"{request.output} cannot be written: {error.strerror or error}. The result is kept in the store: run the same "
-            f"command again when that is mended."
-        ) from error
+def _publish(store: Store, request: Request, made: Manifest) -> Manifest:
+    """Return the manifest that the output shows now."""
+    if request.single_file:
+        _publish_file(store, request, made)
+        return made
+    if not made.recorded:
+        directory.publish(store, made, request.output)
+        return made
+    with directory.changing(store, request.output):  # somebody may be about to label what is there
+        made = _keep_labels(request, made)
+        store.put(made.content)
+        directory.publish_alone(store, made, request.output)
+    return made
 
 
 def _publish_file(store: Store, request: Request, made: Manifest) -> None:
+    output = request.output.absolute()
+    wanted = made.files[_single(request, made)]["digest"]
+    with directory.changing(store, output), directory.writing(output):
+        if not output.exists() or file_digest(output) != wanted:
+            directory.place(store, wanted, output, copy=True)
+        store.set_root(output, bytes_digest(made.content))
+
+
+def _single(request: Request, made: Manifest) -> str:
+    """Return the name of the file that is asked for in place of a dataset."""
     name = next((name for name in made.files if name.endswith(request.output.suffix)), None)
     if name is None:
         raise UsageError(f"{request.name} makes no {request.output.suffix} file; give -o a directory.")
-    wanted = made.files[name]["digest"]
-    if not request.output.exists() or file_digest(request.output) != wanted:
-        directory.place(store, wanted, request.output.absolute(), copy=True)
-    store.set_root(request.output.absolute(), bytes_digest(made.content))
+    return name

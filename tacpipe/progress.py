@@ -20,6 +20,12 @@ def wanted() -> bool:
     return sys.stderr.isatty() and not _quiet
 
 
+def say(sentence: str) -> None:
+    """Tell on stderr what a user should know while it happens, unless quiet was asked for."""
+    if not _quiet:
+        print(f"tacpipe: {sentence}", file=sys.stderr, flush=True)
+
+
 @contextmanager
 def bar(description: str, total: int) -> Iterator[Callable[..., None]]:
     """Yield ``advance(steps=1, note="")``, which moves a bar of ``total`` steps and shows ``note`` behind it."""

@@ -14,7 +14,7 @@ from tacpipe.errors import UsageError
 from tacpipe.hashing import remembered_file_digest
 from tacpipe.manifest import Entry, Found, Manifest
 from tacpipe.stage import Stage
-from tacpipe.store import locate
+from tacpipe.store import Store
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Request:
 class Inputs:
     """All that a request reads."""
 
-    def __init__(self, request: Request) -> None:
-        self.request = request
+    def __init__(self, request: Request, store: Store) -> None:
+        self.request, self.store = request, store
         self.stage = registry.load(request.name)
         self.datasets = [manifest.find(path) for path in request.datasets]
         self.named: dict[str, Found] = {
@@ -115,7 +115,7 @@ class Inputs:
             raise UsageError(
                 f"{self.request.name} must know which recordings to train on: give --split, as made by `tacpipe split`."
             )
-        read_content = execution.reader(locate(), (str(split.directory),))
+        read_content = execution.reader(self.store, (str(split.directory),))
         table = execution.read_roles(read_content(split_digest(split), "split.parquet"))
         folds = sorted({fold for _, fold in table})
         fold = self.request.fold

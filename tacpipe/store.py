@@ -5,19 +5,25 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.files import read_json, readable_errors, sync_folder, write_whole
+from tacpipe.files import read_json, readable_errors, sentence, sync_folder, write_whole
 from tacpipe.hashing import bytes_digest, digest
-from tacpipe.leases import Leases
+from tacpipe.leases import Announcing, Leases
 
 FORMAT = "1"
+BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
+FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
+ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
+BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class MissingError(DamagedError):
@@ -33,17 +39,26 @@ class Object:
 
 
 class Store:
-    """Content by digest and results by key, in one folder."""
+    """Content by digest and results by key, in one folder.
 
-    def __init__(self, root: Path | str) -> None:
+    ``run`` is the lease of the run that this process works for, as `at_work` gave it to the process that began it.
+    """
+
+    def __init__(self, root: Path | str, run: str = "") -> None:
         self.root = Path(root)
         self._root = str(root)
         self.leases = Leases(self.root / "leases")
+        self._run = Announcing(run) if run else None
 
     # ---- places
 
     def object_path(self, name: str) -> str:
-        """Return where the object ``name`` lies, whether or not it is there."""
+        """Return where the object ``name`` lies, whether or not it is there.
+
+        Raises `DamagedError` for a name that is no digest: it would lead out of the store.
+        """
+        if not _DIGEST.fullmatch(name):
+            raise DamagedError(f"{name[:80]!r} is no digest (64 hex digits): what names it is damaged or was made up.")
         return f"{self._root}/objects/{name[:2]}/{name}"
 
     def record_path(self, key: str) -> str:
@@ -53,45 +68,67 @@ class Store:
     def prepare(self) -> None:
         """Create the store's folders if they are not there; refuse a store of another format."""
         mark = self.root / "format"
-        if not mark.exists():
-            with readable_errors(self.root):
-                for name in ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp"):
+        with readable_errors(self.root):
+            if not mark.exists():
+                for name in FOLDERS:
                     (self.root / name).mkdir(parents=True, exist_ok=True)
                 self.write_file(mark, FORMAT.encode() + b"\n")
-        found = mark.read_text().strip()
+            found = mark.read_bytes().strip().decode(errors="replace")
         if found != FORMAT:
-            raise TacpipeError(f"The store {self._root} has format {found}; this tacpipe reads format {FORMAT}.")
+            raise TacpipeError(f"The store {self._root} has format {found[:20]}; this tacpipe reads format {FORMAT}.")
+
+    # ---- runs
+
+    @contextlib.contextmanager
+    def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
+        """Announce to `gc` while in the block what is read (``manifests`` and all they name), put and reused."""
+        if self._run is not None:  # within a larger piece of work, which has its lease
+            self._run.announce(manifests)
+            yield
+            return
+        self.prepare()
+        with self.leases.running(manifests) as self._run:
+            try:
+                yield
+            finally:
+                self._run = None
+
+    @property
+    def run(self) -> str:
+        """The lease of the run at work, for the processes that work for it; empty where nobody said so."""
+        return "" if self._run is None else self._run.path
+
+    def announce(self, names: Iterable[str]) -> None:
+        """Announce objects to `gc`; whoever reuses one does so before it looks whether it is there."""
+        if self._run is not None:
+            self._run.announce(names)
 
     # ---- objects
 
-    def has(self, name: str) -> bool:
-        """Return whether an object of this digest is there; its bytes are not looked at."""
-        return os.path.exists(self.object_path(name))  # noqa: PTH110  (called once a shard: os.path is 5x faster)
-
-    def keep(self, name: str) -> bool:
-        """Return whether an object is there, and freshen it: a collection that runs meanwhile then leaves it alone."""
+    def has(self, name: str, size: int | None = None) -> bool:
+        """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
         try:
-            os.utime(self.object_path(name))
+            found = os.stat(self.object_path(name)).st_size  # noqa: PTH116  (called once a shard: os.path is 5x faster)
         except FileNotFoundError:
-            return False
-        except OSError:  # a store that may only be read has no collection to fear
-            return self.has(name)
-        return True
+            return self._put_back(name)
+        except OSError as error:
+            raise sentence(self.root, error) from error
+        return size is None or found == size
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         """Store ``content`` and return its digest and size.
 
-        An object that is there already is kept and freshened, after a look at its size: a damaged one is found on
-        reading. What cannot be made again is ``durable``: its folder is synced too, and a copy that is there already
-        is read and replaced if it is damaged.
+        An object that is there already is kept, after a look at its size: a damaged one is found on reading. What cannot
+        be made again is ``durable``: its folder is synced too, and a copy that is there already is read and replaced if
+        it is damaged.
         """
         name = bytes_digest(content)
         path = self.object_path(name)
-        with contextlib.suppress(FileNotFoundError, MissingError), readable_errors(self.root):
+        self.announce([name])
+        with contextlib.suppress(MissingError):
             if durable:
                 self.read(name)
-            if os.stat(path).st_size == len(content):  # noqa: PTH116
-                os.utime(path)
+            if self.has(name, len(content)):
                 return Object(name, len(content))
         self.write_file(path, content, mode=0o444)
         if durable:
@@ -106,25 +143,56 @@ class Store:
         """
         path = self.object_path(name)
         try:
-            with open(path, "rb", buffering=0) as file:
-                content = file.readall()
+            content = _read(path)
         except FileNotFoundError:
+            if self._put_back(name):
+                return self.read(name)
             raise MissingError(f"Object {name[:12]} is not in the store {self._root}.") from None
+        except OSError as error:
+            raise MissingError(f"Object {name[:12]} in {self._root} cannot be read: {error.strerror}.") from error
         if bytes_digest(content) != name:
-            self.quarantine(path)
-            raise MissingError(f"Object {name[:12]} was damaged and is now in {self._root}/quarantine.")
+            where = f"is now in {self._root}/quarantine" if self.quarantine(path) else "cannot be moved out of the way"
+            raise MissingError(f"Object {name[:12]} was damaged and {where}.")
         return content
 
-    def quarantine(self, path: str | Path) -> None:
-        """Move a damaged file out of the way, keeping it for whoever wants to know why."""
-        target = self.root / "quarantine" / f"{Path(path).name}.{time.time_ns()}"
-        with contextlib.suppress(FileNotFoundError):
+    def quarantine(self, path: str | Path) -> bool:
+        """Move a damaged file out of the way, for whoever wants to know why; return False where nothing may be moved."""
+        kind = "root-" if Path(path).parent.name == "roots" else ""
+        target = self.root / "quarantine" / f"{kind}{Path(path).name}.{time.time_ns()}"
+        try:
+            target.parent.mkdir(exist_ok=True)
             Path(path).replace(target)
+        except FileNotFoundError:  # another process did
+            return True
+        except OSError:
+            return False
+        return True
 
-    def write_file(self, path: Path | str, content: bytes, *, mode: int = 0o644, exclusive: bool = False) -> bool:
+    def quarantined(self, name: str) -> bool:
+        """Return whether an object of this digest was damaged, lies in quarantine, and was not made again."""
+        return any((self.root / "quarantine").glob(f"{name}.*")) and not self.has(name)
+
+    def damaged_roots(self) -> int:
+        """Return how many roots were damaged and not written anew: nobody knows which datasets they stood for."""
+        names = {path.name[len("root-") :].partition(".")[0] for path in (self.root / "quarantine").glob("root-*")}
+        return sum(not (self.root / "roots" / f"{name}.json").exists() for name in names)
+
+    def aside(self, name: str) -> str:
+        """Return where a collection keeps an object between its first look at what is needed and its second."""
+        return f"{self._root}/tmp/{ASIDE}{name}"
+
+    def _put_back(self, name: str) -> bool:
+        """Return whether an object was aside, of a collection that runs or was killed; it is back in its place then."""
+        try:
+            os.rename(self.aside(name), self.object_path(name))  # noqa: PTH104
+        except OSError:
+            return False
+        return True
+
+    def write_file(self, path: Path | str, content: bytes, *, mode: int = 0o666, exclusive: bool = False) -> bool:
         """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race."""
         with readable_errors(self.root):
-            draft = f"{self._root}/tmp/{uuid.uuid4().hex}"
+            draft = f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
             return write_whole(str(path), content, draft, mode=mode, exclusive=exclusive)
 
     # ---- records
@@ -133,8 +201,8 @@ class Store:
         """Return the record of ``key``, or None; a damaged one is quarantined and counts as none."""
         path = self.record_path(key)
         try:
-            with open(path, "rb", buffering=0) as file:
-                content = file.readall()
+            with readable_errors(self.root):
+                content = _read(path)
         except FileNotFoundError:
             return None
         try:
@@ -142,7 +210,7 @@ class Store:
             body = {"identity": record["identity"], "result": record["result"]}
             if digest(record["identity"]) == key and digest(body) == record["digest"]:
                 return record
-        except (ValueError, KeyError, TypeError, TacpipeError):
+        except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
             pass
         self.quarantine(path)
         return None
@@ -165,11 +233,15 @@ class Store:
         record = {**body, "digest": digest(body), "provenance": provenance}
         content = json.dumps(record, sort_keys=True).encode()
         path = self.record_path(key)
-        if self.write_file(path, content, exclusive=not replace):
-            if durable:
-                sync_folder(os.path.dirname(path))  # noqa: PTH120
-            return record
-        return self.record(key) or record
+        for _ in range(2):  # a second time if the record that was there turns out to be damaged
+            if self.write_file(path, content, exclusive=not replace):
+                break
+            there = self.record(key)
+            if there is not None:
+                return there
+        if durable:
+            sync_folder(os.path.dirname(path))  # noqa: PTH120
+        return record
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield every key and its record."""
@@ -180,26 +252,74 @@ class Store:
 
     # ---- roots
 
-    def root_path(self, path: Path) -> Path:
-        """Return where the root of the dataset at ``path`` lies."""
-        return self.root / "roots" / f"{digest(str(path))}.json"
+    def set_root(self, path: Path, manifest: str, *, pushed: bool = False) -> None:
+        """Note that ``path`` now holds ``manifest``; the one before stays known for `explain`.
 
-    def set_root(self, path: Path, manifest: str) -> None:
-        """Note that ``path`` now holds ``manifest``; the one before stays known for `explain`."""
-        known = self.get_root(path) or {"manifest": None, "previous": None}
+        A dataset that was ``pushed`` here has a name instead of a path, and is kept until `forget`.
+        """
+        kind, name = self.named(path, pushed=pushed)
+        known = self.get_root(path, pushed=pushed) or {"manifest": None, "previous": None}
         if known["manifest"] == manifest:
             return
-        root = {"path": str(path), "manifest": manifest, "previous": known["manifest"], "written_s": int(time.time())}
-        self.write_file(self.root_path(path), json.dumps(root, sort_keys=True).encode())
+        root = {"path": name, "kind": kind, "manifest": manifest, "previous": known["manifest"]}
+        self.write_root({**root, "written_s": int(time.time())})
 
-    def get_root(self, path: Path) -> dict[str, Any] | None:
-        """Return the root of ``path``, or None."""
-        return read_json(self.root_path(path))
+    def get_root(self, path: Path, *, pushed: bool = False) -> dict[str, Any] | None:
+        """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
+        return self.root_at(self._root_file(*self.named(path, pushed=pushed)))
 
     def roots(self) -> list[dict[str, Any]]:
-        """Return all roots."""
-        found = (read_json(path) for path in sorted((self.root / "roots").glob("*.json")))
+        """Return all roots. Damaged ones are quarantined: the next run of their stage writes them anew."""
+        found = (self.root_at(path) for path in sorted((self.root / "roots").glob("*.json")))
         return [root for root in found if root is not None]
+
+    def write_root(self, root: Mapping[str, Any]) -> None:
+        """Replace a root, as `roots` gave it or with more to say."""
+        kind, name = root.get("kind", ABSOLUTE), str(root["path"])
+        if kind == BESIDE and Path(name).is_absolute():
+            name = os.path.relpath(name, self.root.parent)
+        content = {key: value for key, value in root.items() if key != "check"} | {"path": name, "kind": kind}
+        text = json.dumps({**content, "check": digest(content)}, sort_keys=True)
+        self.write_file(self._root_file(kind, name), text.encode())
+
+    def forget(self, name: str) -> bool:
+        """Drop the roots of this path or pushed name; return whether there was one."""
+        wanted = [self.named(Path(name).absolute()), self.named(Path(name), pushed=True)]
+        files = [self._root_file(*found) for found in wanted]
+        there = [file for file in files if file.exists()]
+        for file in there:
+            with readable_errors(self.root):
+                file.unlink(missing_ok=True)
+        return bool(there)
+
+    def named(self, path: Path, *, pushed: bool = False) -> tuple[str, str]:
+        """Return kind and name of a root: relative where the dataset lies beside its store, so that both can move."""
+        if pushed:
+            return PUSHED, str(path)
+        if self.root.name == BESIDE_NAME and path.is_relative_to(self.root.parent):
+            return BESIDE, str(path.relative_to(self.root.parent))
+        return ABSOLUTE, str(path)
+
+    def _root_file(self, kind: str, name: str) -> Path:
+        return self.root / "roots" / f"{digest(name if kind == ABSOLUTE else [kind, name])}.json"
+
+    def root_at(self, file: Path) -> dict[str, Any] | None:
+        """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
+        if not file.exists():
+            return None
+        with readable_errors(self.root):
+            root = read_json(file) or {}
+        check = root.pop("check", None)
+        if check is None or check != digest(root):
+            self.quarantine(file)
+            return None
+        beside = root["kind"] == BESIDE
+        return {**root, "path": str(self.root.parent / root["path"])} if beside else root
+
+
+def _read(path: str) -> bytes:
+    with open(path, "rb", buffering=0) as file:
+        return file.readall()
 
 
 def locate(start: Path | None = None) -> Store:
@@ -207,13 +327,13 @@ def locate(start: Path | None = None) -> Store:
     named = os.environ.get("TACPIPE_STORE")
     if named:
         return Store(Path(named).absolute())
-    return Store(project(start) / ".tacpipe")
+    return Store(project(start) / BESIDE_NAME)
 
 
 def project(start: Path | None = None) -> Path:
     """Return the folder of the project: the nearest one upwards with a store, a ``dvc.yaml`` or a git repository."""
     here = (start or Path.cwd()).absolute()
-    for mark in (".tacpipe", "dvc.yaml", ".git"):
+    for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
         for folder in (here, *here.parents):
             if (folder / mark).exists():
                 return folder

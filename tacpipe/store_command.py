@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from tacpipe import garbage
-from tacpipe.errors import DAMAGED
-from tacpipe.store import locate
+from tacpipe.errors import DAMAGED, UsageError
+from tacpipe.store import Store, locate
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
@@ -72,13 +72,18 @@ def gc(
     grace_days: Annotated[
         float, typer.Option("--grace-days", help="How long a dataset counts whose path cannot be reached.")
     ] = garbage.GRACE_DAYS,
+    forget: Annotated[
+        list[str] | None, typer.Option("--forget", help="A dataset, pushed or gone, that need not be kept any longer.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Remove what no dataset, nothing that one descends from, and no running process needs.
 
     Example: tacpipe store gc --dry-run
     """
-    found = garbage.collect(locate(), dry_run=dry_run, recordings=recordings, grace_days=grace_days)
+    store = locate()
+    _forget(store, forget or [], dry_run=dry_run)
+    found = garbage.collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
     verb = "would remove" if dry_run else "removed"
     text = (
         f"{verb} {found.objects} objects ({found.bytes / 1e6:.1f} MB), {found.records} records, {found.drafts} drafts"
@@ -86,6 +91,15 @@ def gc(
     if found.kept_recordings:
         text += f"; kept {found.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
     _print(asdict(found), as_json=as_json, text=text)
+
+
+def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
+    known = {str(root["path"]) for root in store.roots()}
+    for name in names:
+        if not {name, str(Path(name).absolute())} & known:
+            raise UsageError(f"{store.root} keeps no dataset {name}; it keeps {', '.join(sorted(known)) or 'nothing'}.")
+        if not dry_run:
+            store.forget(name)
 
 
 def link(datasets: Paths) -> None:

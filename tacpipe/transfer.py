@@ -29,15 +29,14 @@ def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
     again.
     """
     there, done = Store(remote.absolute()), Transferred()
-    there.prepare()
     for path in paths:
         here = locate(path)
         found = manifest_of.find(path)
         found.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
-        here.prepare()
-        here.put(found.content)
-        _copy(here, there, found.digest, done, beside=(str(found.directory.absolute()),), ancestors=ancestors)
-        there.set_root(_name(found.directory), found.digest)
+        with here.at_work([found.digest]), there.at_work([found.digest]):
+            here.put(found.content)
+            _copy(here, there, found.digest, done, beside=(str(found.directory.absolute()),), ancestors=ancestors)
+            there.set_root(_name(found.directory), found.digest, pushed=True)
     return done
 
 
@@ -49,20 +48,24 @@ def pull(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
     for path in paths:
         directory = path.parent if path.name == manifest_of.NAME else path
         here = locate(directory if directory.exists() else None)
-        here.prepare()
-        if (directory / manifest_of.NAME).exists():
-            found = manifest_of.find(directory)
-            found.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
+        found = _found(directory, there)
+        found.manifest  # noqa: B018  (one edited by hand is refused before anything moves)
+        with here.at_work([found.digest]):
             here.put(found.content)
-        else:
-            root = there.get_root(_name(directory))
-            if root is None:
-                known = ", ".join(sorted(other["path"] for other in there.roots())) or "nothing"
-                raise UsageError(f"{remote} has no dataset {_name(directory)}; it has {known}.")
-            found = manifest_of.Found(directory, there.read(root["manifest"]))
-        _copy(there, here, found.digest, done, beside=(), ancestors=ancestors)
-        directory_of.publish(here, found.manifest, directory)
+            _copy(there, here, found.digest, done, beside=(), ancestors=ancestors)
+            directory_of.publish(here, found.manifest, directory)
     return done
+
+
+def _found(directory: Path, there: Store) -> manifest_of.Found:
+    """Return the manifest at the directory, else that which was pushed from there."""
+    if (directory / manifest_of.NAME).exists():
+        return manifest_of.find(directory)
+    root = there.get_root(_name(directory), pushed=True)
+    if root is None:
+        known = ", ".join(sorted(other["path"] for other in there.roots())) or "nothing"
+        raise UsageError(f"{there.root} has no dataset {_name(directory)}; it has {known}.")
+    return manifest_of.Found(directory, there.read(root["manifest"]))
 
 
 def _name(directory: Path) -> Path:

@@ -10,8 +10,8 @@ from tacpipe import directory as directory_of
 from tacpipe import execution
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
-from tacpipe.hashing import file_digest
-from tacpipe.store import MissingError, Store, locate
+from tacpipe.hashing import bytes_digest, file_digest
+from tacpipe.store import PUSHED, MissingError, Store, locate
 
 
 @dataclass
@@ -57,23 +57,32 @@ def verify(store: Store) -> Soundness:
         found.records += 1
         if store.record(path.stem) is None:
             found.damaged.append(path.stem)
+    for path in sorted(store.root.glob("roots/*.json")):
+        if store.root_at(path) is None:
+            found.damaged.append(f"root {path.stem}")
     found.missing = sorted(set(_wanted(store)) - set(found.damaged))
     return found
 
 
 def repair(store: Store) -> Soundness:
     """Return the soundness after making again, or adopting from dataset directories, what roots name and is not there."""
-    found = verify(store)
-    wanted = _wanted(store)
-    beside = tuple(root["path"] for root in store.roots())
-    read = execution.reader(store, beside)
-    for name, path in sorted(wanted.items()):
-        try:
-            read(name, path)
-            found.repaired.append(name)
-        except TacpipeError as error:
-            found.lost[name] = str(error)
-    found.missing = []
+    with store.at_work():
+        found = verify(store)
+        roots = store.roots()
+        manifests = [one for one in (_find(root) for root in roots) if one is not None]
+        for one in manifests:
+            if not store.has(one.digest):
+                store.put(one.content)
+                found.repaired.append(one.digest)
+        wanted = _wanted(store)
+        read = execution.reader(store, tuple(root["path"] for root in roots))
+        for name, path in sorted(wanted.items()):
+            try:
+                read(name, path)
+                found.repaired.append(name)
+            except TacpipeError as error:
+                found.lost[name] = str(error)
+        found.missing = []
     return found
 
 
@@ -82,19 +91,22 @@ def link(path: Path) -> int:
     found = manifest_of.find(path)
     manifest, directory = found.manifest, found.directory
     store = locate(directory)
-    store.prepare()
-    read = execution.reader(store, (str(directory.absolute()),))
-    count = 0
-    for name, digest in manifest.objects():
-        matches = (directory / name).exists() and file_digest(directory / name) == digest
-        if not (matches and store.has(digest)):
-            read(digest, name)  # heals the store first
-        if not matches:
-            directory_of.place(store, digest, directory / name, copy=manifest.recorded)
-            count += 1
-    store.put(found.content)
-    store.set_root(directory.absolute(), found.digest)
-    return count
+    with store.at_work([found.digest]), directory_of.changing(store, directory):
+        read = execution.reader(store, (str(directory.absolute()),))
+        stale = []
+        for name, digest in manifest.objects():
+            matches = (directory / name).is_file() and file_digest(directory / name) == digest
+            if not (matches and store.has(digest)):
+                read(digest, name)  # heals the store first
+            if not matches:
+                stale.append((name, digest))
+        directory_of.refuse_links(directory, [name for name, _ in stale])
+        with directory_of.writing(directory):
+            for name, digest in stale:
+                directory_of.place(store, digest, directory / name, copy=manifest.recorded)
+        store.put(found.content)
+        store.set_root(directory.absolute(), found.digest)
+    return len(stale)
 
 
 def status(store: Store) -> dict[str, Any]:
@@ -103,8 +115,8 @@ def status(store: Store) -> dict[str, Any]:
     for name in ("objects", "records", "quarantine", "tmp", "checkpoints"):
         files = [path for path in (store.root / name).rglob("*") if path.is_file()]
         folders[name] = {"files": len(files), "bytes": sum(path.stat().st_size for path in files)}
-    roots = [{**root, "reachable": Path(root["path"]).exists()} for root in store.roots()]
-    return {"store": str(store.root), **folders, "roots": roots, "running": [note for note, _ in store.leases.runs()]}
+    roots = [{**root, "reachable": root["kind"] == PUSHED or Path(root["path"]).exists()} for root in store.roots()]
+    return {"store": str(store.root), **folders, "roots": roots, "running": [run.note for run in store.leases.runs()]}
 
 
 def status_text(value: dict[str, Any]) -> str:
@@ -122,13 +134,30 @@ def status_text(value: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _find(root: dict[str, Any]) -> manifest_of.Found | None:
+    """Return the manifest at a root's path, None if there is no sound one."""
+    if root["kind"] == PUSHED:
+        return None
+    try:
+        found = manifest_of.find(root["path"])
+        found.manifest  # noqa: B018  (is it sound?)
+    except TacpipeError:
+        return None
+    return found
+
+
 def _wanted(store: Store) -> dict[str, str]:
-    """Return the objects that are named by the manifests at the roots' paths and are not in the store, with their paths."""
+    """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name."""
     wanted = {}
     for root in store.roots():
+        found = _find(root)
         try:
-            objects = list(manifest_of.find(root["path"]).manifest.objects())
+            content = store.read(root["manifest"]) if found is None else found.content
+            name = bytes_digest(content)
+            manifest = manifest_of.parse(content, name, verified=True)
         except TacpipeError:
             continue
-        wanted.update({name: path for path, name in objects if not store.has(name)})
+        if not store.has(name):
+            wanted[name] = manifest_of.NAME
+        wanted.update({name: path for path, name in manifest.objects() if not store.has(name)})
     return wanted

@@ -1,7 +1,9 @@
 import json
 import os
+import shutil
 import time
 from pathlib import Path
+from unittest.mock import ANY
 
 import pyarrow as pa
 import pytest
@@ -9,7 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe import upkeep
+from tacpipe import garbage, upkeep
+from tacpipe.hashing import bytes_digest
+from tacpipe.store import Store
 from tests.conftest import Lab
 from tests.test_pipeline import counts, replace_stream
 
@@ -58,24 +62,124 @@ def test_young_objects_and_those_of_a_running_process_are_kept(lab: Lab) -> None
     manifest = lab.manifest("data/s")
     lab.run("scale data/r -o data/s --factor 5")
     age(lab)
-    from tacpipe.hashing import bytes_digest
-
     with lab.store.leases.running([bytes_digest(manifest.content)]):
         collected(lab)
     assert all(lab.store.has(name) for _, name in manifest.objects())
 
 
-def test_what_a_run_reuses_is_young_again(lab: Lab) -> None:
+def test_what_a_run_announces_is_kept_however_old_it_looks(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s --factor 2")
     manifest = lab.manifest("data/s")
     lab.run("scale data/r -o data/s --factor 3")
-    age(lab)
-    for _, name in manifest.objects():
-        assert lab.store.keep(name)
+    names = [name for _, name in manifest.objects()]
+    store = lab.store
+    with store.at_work():
+        store.announce(names)
+        age(lab)
+        collected(lab)
+        assert all(store.has(name) for name in names)
     collected(lab)
-    assert all(lab.store.has(name) for _, name in manifest.objects())
-    assert not lab.store.keep("0" * 64)
+    assert sum(store.has(name) for name in names) == 1  # three times two is two times three
+
+
+def test_what_is_announced_while_a_collection_is_at_it_is_put_back(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s --factor 2")
+    before = {name for _, name in lab.manifest("data/s").objects()}
+    lab.run("scale data/r -o data/s --factor 3")
+    names = sorted(before - {name for _, name in lab.manifest("data/s").objects()})
+    age(lab)
+    looks = 0
+
+    def looking(store: Store, *given: object, **more: object) -> garbage.Live:
+        nonlocal looks
+        looks += 1
+        if looks == 2:  # everything was moved aside by now
+            assert not any(Path(store.object_path(name)).exists() for name in names)
+            other.announce(names)
+        return live(store, *given, **more)  # type: ignore[arg-type]
+
+    live = garbage.live
+    monkeypatch.setattr(garbage, "live", looking)
+    other = lab.store
+    with other.at_work():
+        garbage.collect(lab.store, dry_run=False)
+    assert looks == 2
+    assert all(Path(other.object_path(name)).exists() for name in names)
+    assert list((other.root / "tmp").iterdir()) == []
+
+
+def test_what_a_killed_collection_had_moved_aside_is_found_and_put_back(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    store = lab.store
+    names = [name for _, name in lab.manifest("data/r").objects()]
+    for name in names:
+        Path(store.object_path(name)).rename(store.aside(name))
+    assert store.read(names[0]) and store.has(names[1])
+    age(lab)
+    collected(lab)
+    assert all(Path(store.object_path(name)).exists() for name in names)
+    assert upkeep.verify(store).clean
+
+
+def test_nothing_is_removed_while_a_manifest_that_something_descends_from_is_damaged(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    lab.run("total data/s -o data/t")
+    name = bytes_digest(Path("data/s/manifest.json").read_bytes())
+    shutil.rmtree("data/s")
+    lab.run("scale data/r -o data/u --factor 7")
+    shutil.rmtree("data/u")
+    age(lab)
+    path = Path(lab.store.object_path(name))
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes().replace(b"trial-001", b"trial-002"))
+    before = sorted(lab.store.root.glob("objects/*/*"))
+    failed = lab.call("store gc --grace-days 0")
+    assert failed.code == 4 and name[:12] in failed.err and "nothing was removed" in failed.err
+    assert sorted(lab.store.root.glob("objects/*/*")) == [kept for kept in before if kept != path]
+    lab.run("scale data/r -o data/s")
+    assert collected(lab, "--grace-days 0")["objects"] > 0
+
+
+def test_nothing_is_removed_while_a_root_is_damaged(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    root = lab.store.get_root(lab.folder / "data/s")
+    (file,) = (path for path in lab.store.root.glob("roots/*") if "data/s" in path.read_text())
+    file.write_text(file.read_text().replace("data/s", "data/z"))
+    age(lab)
+    failed = lab.call("store gc")
+    assert failed.code == 4 and "1 roots" in failed.err
+    assert counts(lab.run("scale data/r -o data/s --json").out) == (0, 4)
+    assert lab.store.get_root(lab.folder / "data/s") == {**(root or {}), "written_s": ANY}
+    assert collected(lab)["objects"] == 0
+
+
+def test_what_was_pushed_to_a_store_stays_until_it_is_forgotten(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    remote = Store(lab.folder.with_name(f"{lab.folder.name}-remote"))
+    lab.run(f"store push {remote.root} data/s")
+    monkeypatch.setenv("TACPIPE_STORE", str(remote.root))
+    for path in remote.root.rglob("*"):
+        os.utime(path, (0, 0))
+    assert collected(lab, "--grace-days 0")["objects"] == 0
+    assert lab.call("store gc --forget data/other").code == 2
+    assert collected(lab, "--grace-days 0 --forget data/s")["objects"] > 0
+
+
+def test_a_project_that_was_moved_keeps_its_datasets(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    age(lab)
+    moved = lab.folder.with_name(f"{lab.folder.name}-moved")
+    lab.folder.rename(moved)
+    monkeypatch.chdir(moved)
+    assert collected(lab, "--grace-days 0")["objects"] == 0
+    assert counts(lab.run("scale data/r -o data/s --json").out) == (0, 4)
+    lab.folder.mkdir()
 
 
 def test_recordings_that_nothing_names_are_kept_unless_asked_for(lab: Lab) -> None:
@@ -99,10 +203,10 @@ def test_a_root_that_cannot_be_reached_counts_for_fourteen_days(lab: Lab) -> Non
     root = lab.store.get_root(lab.folder / "data/s")
     assert root is not None and "missing_since_s" in root
     root["missing_since_s"] -= 13 * 86400
-    lab.store.root_path(lab.folder / "data/s").write_text(json.dumps(root))
+    lab.store.write_root(root)
     assert collected(lab)["objects"] == 0
     root["missing_since_s"] -= 2 * 86400
-    lab.store.root_path(lab.folder / "data/s").write_text(json.dumps(root))
+    lab.store.write_root(root)
     assert collected(lab)["objects"] > 0
 
 
@@ -112,12 +216,11 @@ def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: La
     Path("data/s").rename("elsewhere")
     age(lab)
     collected(lab)
-    file = lab.store.root_path(lab.folder / "data/s")
-    root = json.loads(file.read_text())
-    file.write_text(json.dumps({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400}))
+    root = lab.store.get_root(lab.folder / "data/s") or {}
+    lab.store.write_root({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400})
     Path("elsewhere").rename("data/s")
     collected(lab)
-    assert "missing_since_s" not in json.loads(file.read_text())
+    assert "missing_since_s" not in (lab.store.get_root(lab.folder / "data/s") or {})
     Path("data/s").rename("elsewhere")
     assert collected(lab)["objects"] == 0
 

@@ -131,11 +131,12 @@ def test_runs_are_seen_while_they_last(store: Store) -> None:
         with store.leases.running(["dead"]):
             os._exit(9)
     os.waitpid(child, 0)
-    assert list(store.leases.runs()) == []
+    assert store.leases.runs() == []
     with store.leases.running(["m"]):
         handle = Store(store.root)
-        assert [note["manifests"] for note, _ in handle.leases.runs()] == [["m"]]
-    assert list(store.leases.runs()) == []
+        (run,) = handle.leases.runs()
+        assert run.manifests == ["m"] and run.note["pid"] == os.getpid()
+    assert store.leases.runs() == []
 
 
 def test_a_root_remembers_what_was_at_its_path_before(store: Store, tmp_path: Path) -> None:

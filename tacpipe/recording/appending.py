@@ -13,7 +13,6 @@ import numpy as np
 from tacpipe import directory, provenance
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.hashing import digest
 from tacpipe.manifest import ACQUIRE, Entry, Manifest
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
@@ -62,7 +61,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     made = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
     store.commit(identity, result, made, durable=True)
     output = output.absolute()
-    with store.leases.hold(digest([ACQUIRE, str(output)])):
+    with directory.changing(store, output):
         before = existing(output)
         there = {} if before is None else before.recordings
         for name, other in there.items():
@@ -77,7 +76,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
         store.put(now.content, durable=True)
-        directory.publish(store, now, output)
+        directory.publish_alone(store, now, output)
     return name
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import sys
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 
+from tacpipe import interruption
 from tacpipe.errors import TacpipeError
+from tacpipe.interruption import Ended
 from tacpipe.recording import appending, sealing, triggers
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
@@ -53,30 +51,6 @@ class Recorded:
             for name, rows in self.rows.items()
         )
         return f"{self.name}: {self.seconds:.1f} s, {told}"
-
-
-class Ended:
-    """Whether somebody asked to end: the first Ctrl-C ends a recording and keeps it, the second interrupts."""
-
-    def __init__(self) -> None:
-        self._asked = threading.Event()
-
-    def __enter__(self) -> Ended:
-        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def __call__(self) -> bool:
-        """Return whether somebody did."""
-        return self._asked.is_set()
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self._asked.is_set():
-            raise KeyboardInterrupt
-        self._asked.set()
 
 
 def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> tuple[list[Recorded], list[str]]:
@@ -135,12 +109,12 @@ def _record(
         late = plan.duration_s is not None and time.monotonic() - began_s >= plan.duration_s
         return ended() or late or stops()
 
-    with contextlib.closing(spool):  # held until it is sealed: nobody else may recover it meanwhile
+    kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
+    with interruption.saying(f"tacpipe: interrupted. {kept}."), contextlib.closing(spool):  # nobody else may recover it
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {time.monotonic() - began_s:.0f} s"))
         lost = recorder.lost()  # now: while it is sealed nobody looks at what comes
         view.show(f"sealing {name}")
-        kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
         try:
             return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig), lost
         except TacpipeError as error:
@@ -148,14 +122,12 @@ def _record(
         except Exception as error:
             error.add_note(f"{kept}.")
             raise
-        except KeyboardInterrupt:
-            print(f"tacpipe: interrupted. {kept}.", file=sys.stderr)
-            raise
 
 
 def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     sealed = sealing.seal(spooled, rig)
-    name = appending.append(store, output, spooled, rig, sealed)
+    with store.at_work():
+        name = appending.append(store, output, spooled, rig, sealed)
     spooled.remove()
     rows = {stream: one.table.num_rows for stream, one in sealed.items()}
     stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
