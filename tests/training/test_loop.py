@@ -69,12 +69,14 @@ def test_training_leaves_the_random_generator_as_it_was(tmp_path: Path) -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("damage", ["cut", "a weight that a disk changed"])
+def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str) -> None:
     whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "damaged", interrupted_after(9))
     file = tmp_path / "damaged" / checkpoint.FILE
-    file.write_bytes(file.read_bytes()[:-10])
+    content = file.read_bytes()
+    file.write_bytes(content[:-10] if damage == "cut" else content[:-10] + bytes([content[-10] ^ 1]) + content[-9:])
     assert same(run(tmp_path / "damaged"), whole)
     assert "training starts over" in caplog.text
 
