@@ -99,6 +99,7 @@ def add(program: typer.Typer, summary: str) -> None:
 
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe import directory
+    from tacpipe.interruption import Ended
     from tacpipe.recording import appending, trials, triggers
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import View
@@ -116,7 +117,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     directory.check_output(store, plan.output)
     appending.existing(plan.output)
     recorder = Recorder(rig)
-    with trials.Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
+    with Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(ended)
         recorded, lost = trials.run(recorder, store, plan, view, ended)
     for one in recorded if not quiet else ():
@@ -131,18 +132,18 @@ def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
 
     sealed, left = [], 0
     for folder in spool.abandoned(store.root):
-        with spool.claimed(folder) as ours:
-            if not ours:
-                continue
-            try:
+        try:
+            with spool.claimed(folder) as ours:
+                if not ours:
+                    continue
                 one = trials.recover(store, folder)
-            except NothingError:
-                continue  # it ended before a sample came
-            except Exception as error:  # whatever a damaged spool or another version's driver may raise
-                why = error if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-                print(f"tacpipe: The spool {folder} stays as it is. {why}", file=sys.stderr)
-                left += 1
-                continue
+        except NothingError:
+            continue  # it ended before a sample came
+        except Exception as error:  # whatever a damaged spool or another version's driver may raise
+            why = error if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+            print(f"tacpipe: The spool {folder} stays as it is. {why}", file=sys.stderr)
+            left += 1
+            continue
         sealed.append(one)
         if not quiet:
             print(f"recovered {one.line()}", file=sys.stderr)
@@ -153,8 +154,8 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     """Open every stream and return what each does. Raises `DeviceError` for those that do not open or give nothing."""
     from dataclasses import asdict
 
+    from tacpipe.interruption import Ended
     from tacpipe.recording.recorder import Recorder
-    from tacpipe.recording.trials import Ended
     from tacpipe.recording.view import line
 
     recorder = Recorder(rig)

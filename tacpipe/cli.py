@@ -1,17 +1,21 @@
 """The command line: one command a registered stage, and those that look after datasets and the store.
 
 Only the command that was asked for is built, and only its module imported: ``tacpipe --help`` and a hit must not wait for
-torch, pyarrow, pandas, scikit-learn or open3d.
+torch, pyarrow, pandas, scikit-learn or open3d. What it takes to build one comes once wishes to end are heeded.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import typer
+from tacpipe import interruption
+from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
+from tacpipe.files import told
 
-from tacpipe import commands, registry
-from tacpipe.errors import INTERRUPTED, TacpipeError
+if TYPE_CHECKING:
+    import typer
 
 HELP = """From a tactile sensor's cable to a table of results that can be traced back to its bytes.
 
@@ -28,8 +32,12 @@ SUMMARIES = {
 }
 
 
-def app(arguments: list[str]) -> typer.Typer:
+def app(arguments: Sequence[str]) -> typer.Typer:
     """Return the program that can answer ``arguments``: with the one command they name, or all of them for help."""
+    import typer
+
+    from tacpipe import commands, registry
+
     program = typer.Typer(
         help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
     )
@@ -57,20 +65,55 @@ def app(arguments: list[str]) -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line; exit with the documented codes."""
+    """Run the command line of this process, which ends within a second of Ctrl-C; exit with the documented codes."""
+    code = INTERRUPTED
     try:
-        app(sys.argv[1:])(prog_name="tacpipe")
+        interruption.heed()
+        code = answer(sys.argv[1:])
+    except KeyboardInterrupt:  # as it began, or after it was done
+        interruption.tell()
+    sys.exit(interruption.done(code))
+
+
+def answer(arguments: Sequence[str]) -> int:
+    """Run one command line and return its exit code, one of those that are documented."""
+    try:
+        code = _call(arguments)
     except TacpipeError as error:
-        print(f"tacpipe: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        if not interruption.wished():
+            print(f"tacpipe: {error}", file=sys.stderr)
+            return error.exit_code
+        code = INTERRUPTED
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        code = INTERRUPTED
     except BrokenPipeError:
-        sys.exit(0)
+        return DONE
+    except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
+        if not interruption.wished():
+            print(f"tacpipe: {told(error)}", file=sys.stderr)
+            return FAILED
+        code = INTERRUPTED
+    except Exception:
+        if not interruption.wished():
+            raise
+        code = INTERRUPTED
+    if code == INTERRUPTED:
+        interruption.tell()
+    return code
 
 
-def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: list[str]) -> None:
-    from tacpipe import stage_command
+def _call(arguments: Sequence[str]) -> int:
+    try:
+        app(arguments)(arguments, prog_name="tacpipe")
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    return DONE
+
+
+def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: Sequence[str]) -> None:
+    import typer
+
+    from tacpipe import registry, stage_command
 
     if names == [group]:
         stage_command.add(program, group, group)
@@ -87,6 +130,8 @@ def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: l
 
 def _add_summaries(program: typer.Typer, names: dict[str, str], groups: set[str]) -> None:
     """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
+    from tacpipe import commands, registry
+
     lines = {
         group: SUMMARIES.get(group) or registry.summary(group if group in names else _first(names, group))
         for group in groups

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tacpipe import interruption
 from tacpipe.errors import TacpipeError
 
 TRIALS = 30
@@ -118,9 +119,16 @@ def run_rig(output: Path, rig_file: Path) -> Path:
 def _run(several: list[list[str]]) -> None:
     for command in several:
         print("$ tacpipe " + " ".join(command), file=sys.stderr, flush=True)
-        done = subprocess.run([sys.executable, "-m", "tacpipe.cli", *command], stdout=subprocess.DEVNULL, check=False)
-        if done.returncode:
-            raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(command)}` ended with {done.returncode}.")
+        process = subprocess.Popen([sys.executable, "-m", "tacpipe.cli", *command], stdout=subprocess.DEVNULL)
+        with interruption.saying(""):  # the command says it
+            try:
+                code = process.wait()
+            except KeyboardInterrupt:
+                process.terminate()
+                process.wait()
+                raise
+        if code:
+            raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(command)}` ended with {code}.")
 
 
 def _results(output: Path) -> list[str]:

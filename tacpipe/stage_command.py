@@ -13,7 +13,7 @@ import typer
 
 from tacpipe import params as params_of
 from tacpipe import pipeline, progress, registry
-from tacpipe.errors import FAILED, INTERRUPTED
+from tacpipe.errors import FAILED
 from tacpipe.request import Request
 from tacpipe.stage import Stage
 
@@ -88,12 +88,7 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         compare=given["compare"],
         **paths,
     )
-    try:
-        outcome = pipeline.run(request)
-    except KeyboardInterrupt:
-        print("tacpipe: interrupted; what was finished is kept.", file=sys.stderr)
-        raise typer.Exit(INTERRUPTED) from None
-    _report(outcome, as_json=given["json_"], quiet=given["quiet"])
+    _report(pipeline.run(request), as_json=given["json_"], quiet=given["quiet"])
 
 
 def _report(outcome: pipeline.Outcome, *, as_json: bool, quiet: bool) -> None:

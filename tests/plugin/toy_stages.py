@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -60,11 +59,6 @@ def read(params: Read, files: Files) -> Recording:
     except ValueError as error:
         raise TacpipeError(f"{path} holds {error.args[0].rpartition(':')[2].strip()}, which is no number.") from None
     return Recording({"left": pa.table({"x": pa.array(values, pa.uint16())})})
-
-
-def die(*arguments: object) -> None:
-    """End the process as the kernel does that is out of memory."""
-    os._exit(9)
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
+from tacpipe.interruption import TWICE_S
 from tacpipe.recording import sealing
 from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab
 from tests.recording import live
 
-Interrupt = Callable[[int], None]
+Interrupt = Callable[..., None]
 
 
 @pytest.fixture
@@ -29,11 +33,12 @@ def while_sealing() -> Iterator[Interrupt]:
     """A function that has the next recording interrupted so many times while it is sealed."""
     patch, real = pytest.MonkeyPatch(), sealing.seal
 
-    def interrupt(times: int) -> None:
+    def interrupt(times: int, apart_s: float = 2 * TWICE_S) -> None:
         def seal(*given: Any) -> Any:
             patch.undo()
             for _ in range(times):
                 os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(apart_s)
             return real(*given)
 
         patch.setattr(sealing, "seal", seal)
@@ -86,6 +91,35 @@ def test_one_signal_while_sealing_changes_nothing(lab: Lab, rig: Emulator, while
     lab.run("acquire rig.toml -o rec --duration 0.5")
 
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
+
+
+def test_two_signals_at_once_are_one_wish(lab: Lab, rig: Emulator, while_sealing: Interrupt) -> None:
+    while_sealing(2, 0)  # as of `timeout`, which signals a process and then its group
+    lab.run("acquire rig.toml -o rec --duration 0.5")
+
+    live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
+
+
+def test_a_second_signal_ends_a_sealing_that_hears_of_none(lab: Lab, rig: Emulator) -> None:
+    script = (
+        "import hashlib, sys; from tacpipe import cli; from tacpipe.recording import sealing;"
+        "sealing.seal = lambda *_: (print('sealing', flush=True), hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1));"
+        "sys.argv = ['tacpipe', *'acquire rig.toml -o rec --name one --quiet'.split()]; cli.main()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], cwd=lab.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    (spool,) = live.awaited(lambda: live.spools(lab.folder))
+    live.awaited(lambda: (spool / "bytes").stat().st_size > 4000)
+    process.send_signal(signal.SIGINT)
+    assert process.stdout is not None and process.stdout.readline() == "sealing\n"
+    time.sleep(2 * TWICE_S)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
+
+    assert process.returncode == 130
+    assert err == f"tacpipe: interrupted. What was recorded is kept in {spool}; `tacpipe acquire --recover` seals it.\n"
+    assert lab.run("acquire --recover").err.startswith("recovered one: ")
 
 
 def test_a_second_signal_while_sealing_leaves_the_spool_and_it_is_recovered(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -37,23 +35,21 @@ def emulate(
 ) -> None:
     """Serve a rig."""
     from tacpipe.files import readable_errors, write_whole
+    from tacpipe.interruption import Ended
     from tacpipe.recording.rig import read
     from tacpipe.simulation.emulation import byte_faults, rig_file
     from tacpipe.simulation.emulation.emulator import Emulator
 
     asked, wrong = read(rig), byte_faults.parse(faults)
-    done = threading.Event()
-    for sign in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(sign, lambda *_: done.set())
     sys.setswitchinterval(SWITCH_S)
-    with readable_errors(output), Emulator(asked, seed, wrong, output) as emulator:
-        path = output / "rig.toml"
-        write_whole(str(path), rig_file.text(emulator.rig).encode(), f"{path}.draft")
-        print(path, flush=True)
-        for name, stream in emulator.rig.streams.items():
-            print(f"{name}: {stream.kind} at {stream.address}", file=sys.stderr)
-        done.wait(duration)
-    with readable_errors(output):
+    with Ended() as ended, readable_errors(output):
+        with Emulator(asked, seed, wrong, output) as emulator:
+            path = output / "rig.toml"
+            write_whole(str(path), rig_file.text(emulator.rig).encode(), f"{path}.draft")
+            print(path, flush=True)
+            for name, stream in emulator.rig.streams.items():
+                print(f"{name}: {stream.kind} at {stream.address}", file=sys.stderr)
+            ended.wait(duration)
         for ledger in emulator.ledger.values():
             ledger.write(output / "ledger")
     for name, ledger in emulator.ledger.items():

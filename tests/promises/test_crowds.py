@@ -1,0 +1,261 @@
+"""Many processes on one store, of several users, on several hosts: each key is made once, and nobody is in the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from tacpipe import upkeep
+from tacpipe.store import Store
+from tests.promises import kills
+from tests.promises.counts import count
+from tests.promises.kills import Scene
+from tests.promises.warm import Warm, serving
+from tests.recording.live import awaited
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are followed in /proc")
+CROWDS = [8, pytest.param(32, marks=pytest.mark.faults)]
+ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
+GROUP, USERS = 54321, (54322, 54323)
+ELSEWHERE = 'hostname elsewhere && mkdir -p "$1" && mount --bind "$2" "$1" && shift 2 && exec "$@"'
+UNSHARED = ["unshare", "--uts", "--mount", "--pid", "--fork"]
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[Warm]:
+    with serving() as server:
+        yield server
+
+
+@pytest.fixture
+def scene(tmp_path: Path, plugin: Path, warm: Warm) -> Scene:
+    """An empty project whose commands begin at once."""
+    (tmp_path / "project/.tacpipe").mkdir(parents=True)
+    return Scene(tmp_path, warm, {"PYTHONPATH": os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")])})
+
+
+def outcomes(scene: Scene, commands: Sequence[str]) -> list[dict[str, int]]:
+    """Run all commands at once, beside a `store gc` that begins again and again; return what each of them told."""
+    crowd = [scene.start(f"{words} --jobs 1 --json --quiet") for words in commands]
+    collecting, collections = scene.start("store gc --grace-days 0"), 1
+    while any(running.poll() is None for running in crowd):
+        if collecting.poll() is not None:
+            assert kills.ended(collecting) == 0, collecting.out.read_text()
+            kills.aged(scene.project)  # nothing is spared for its youth
+            collecting = scene.start("store gc --grace-days 0")
+            collections += 1
+        time.sleep(0.01)
+    assert kills.ended(collecting) == 0, collecting.out.read_text()
+    assert collections > 1
+    told = []
+    for running in crowd:
+        said = running.out.read_text()
+        assert kills.ended(running) == 0, said
+        told.append(json.loads(said.splitlines()[-1]))
+    count("processes in crowds", len(crowd) + collections)
+    return told
+
+
+def tidy(store: Store) -> None:
+    """Fail unless a store is sound, and nobody left a lease or a draft in it."""
+    assert upkeep.verify(store).clean, upkeep.verify(store).to_text()
+    assert list((store.root / "tmp").iterdir()) == []
+    assert list((store.root / "leases").iterdir()) == []
+
+
+@pytest.mark.parametrize("size", CROWDS)
+def test_processes_that_ask_for_the_same_keys_make_each_once_while_garbage_is_collected(
+    scene: Scene, size: int
+) -> None:
+    scene.run("simulate toy --trials 50 --rows 4 -o data/r")
+    told = outcomes(scene, [f"scale data/r -o data/s{number}" for number in range(size)])
+    assert sum(one["ran"] for one in told) == 50
+    assert all(one["ran"] + one["reused"] == 50 for one in told)
+    assert len({(scene.project / f"data/s{number}/manifest.json").read_bytes() for number in range(size)}) == 1
+    tidy(Store(scene.project / ".tacpipe"))
+
+
+@pytest.mark.parametrize("size", CROWDS)
+def test_processes_that_ask_for_different_keys_all_get_theirs_while_garbage_is_collected(
+    scene: Scene, size: int
+) -> None:
+    scene.run("simulate toy --trials 6 --rows 4 -o data/r")
+    told = outcomes(scene, [f"scale data/r -o data/s{factor} --factor {factor}" for factor in range(size)])
+    assert [one["ran"] for one in told] == [6] * size
+    for factor in range(size):
+        again = scene.start(f"scale data/r -o data/s{factor} --factor {factor} --check --quiet")
+        assert kills.ended(again) == 0, again.out.read_text()
+    tidy(Store(scene.project / ".tacpipe"))
+
+
+@pytest.mark.parametrize("size", CROWDS)
+def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, size: int) -> None:
+    scene.run("simulate toy --trials 6 --rows 4 -o data/r")
+    commands = [f"scale data/r -o data/s{number} --factor {number % 4} --pause-s 0.1" for number in range(size)]
+    crowd = [scene.start(f"{words} --jobs 1") for words in commands]
+    awaited(lambda: len(list(scene.project.glob(".tacpipe/leases/*"))) > size // 2)
+    for running in crowd:
+        os.killpg(running.pid, signal.SIGKILL)
+    for running in crowd:
+        assert kills.ended(running) in (0, -signal.SIGKILL)
+    assert list(scene.project.glob(".tacpipe/leases/*")), "none of them held a lease"
+    for words in (*commands, "label data/r trial-000 --set material=foam", "store gc", "store repair"):
+        at_once = scene.start(words, TACPIPE_LOCK_TIMEOUT_S="0")
+        assert kills.ended(at_once) == 0, at_once.out.read_text()
+    kills.aged(scene.project)
+    scene.run("store gc")
+    tidy(Store(scene.project / ".tacpipe"))
+    count("kills survived", size)
+
+
+def test_who_waits_for_a_stopped_process_is_told_whom_and_gives_up(scene: Scene) -> None:
+    scene.run("simulate toy --trials 1 --rows 4 -o data/r")
+    words = "scale data/r --pause-s 0.5 -o data/s"
+    first = scene.start(words)
+    awaited(lambda: [path for path in scene.project.glob(".tacpipe/leases/*") if not path.name.startswith("run-")])
+    os.killpg(first.pid, signal.SIGSTOP)
+    second = scene.start(f"{words}2", TACPIPE_LOCK_TIMEOUT_S="3")
+    code, said = kills.ended(second), second.out.read_text()
+    os.killpg(first.pid, signal.SIGCONT)
+    assert code == 6
+    waiting, gave_up = said.splitlines()
+    assert waiting.startswith(f"tacpipe: waiting for process {first.pid} on {os.uname().nodename} (tacpipe {words})")
+    assert gave_up.startswith(
+        f"tacpipe: Process {first.pid} on {os.uname().nodename} (tacpipe {words}), which is stopped"
+    )
+    assert kills.ended(first) == 0
+    assert scene.run(f"{words}2")
+    tidy(Store(scene.project / ".tacpipe"))
+
+
+@pytest.mark.parametrize("times", [3, pytest.param(40, marks=pytest.mark.faults)])
+@pytest.mark.parametrize("words", ["scale data/r -o data/s", "label data/r trial-000 --set material=foam"])
+def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs(
+    scene: Scene, words: str, times: int
+) -> None:
+    scene.run("simulate toy --trials 6 --rows 4 -o data/r")
+    scene.run("scale data/r -o data/s --factor 7")  # whose shards are garbage once it is replaced
+    kills.aged(scene.project)
+    scene.keep()
+    lasts_s, wanted = scene.run(words), kills.State.of(scene.project).files
+    rng = random.Random(words)
+    for trial in range(times):
+        scene.again()
+        after_s = lasts_s * (trial + rng.random()) / times
+        running = scene.start(words)
+        time.sleep(after_s)
+        os.kill(running.pid, signal.SIGSTOP)
+        kills.aged(scene.project)
+        scene.run("store gc --grace-days 0")
+        os.kill(running.pid, signal.SIGCONT)
+        told = f"stopped after {after_s:.4f} of {lasts_s:.4f} s: "
+        assert kills.ended(running) == 0, told + running.out.read_text()
+        found = upkeep.verify(Store(scene.project / ".tacpipe"))
+        assert found.clean, told + found.to_text()
+        assert kills.State.of(scene.project).files == wanted, told
+        count("kills survived")
+
+
+def unshares() -> bool:
+    return ROOT and subprocess.run([*UNSHARED, "true"], capture_output=True, check=False).returncode == 0
+
+
+def waited(processes: Sequence[subprocess.Popen[str]]) -> list[dict[str, int]]:
+    told = []
+    for process in processes:
+        out, err = process.communicate()
+        assert process.returncode == 0, err
+        told.append(json.loads(out))
+    count("processes in crowds", len(processes))
+    return told
+
+
+@pytest.mark.skipif(not unshares(), reason="another host takes `unshare`, which is not permitted here")
+@pytest.mark.parametrize("size", [4, pytest.param(16, marks=pytest.mark.faults)])
+def test_two_hosts_that_share_a_store_make_each_key_once(scene: Scene, tmp_path: Path, size: int) -> None:
+    scene.run("simulate toy --trials 12 --rows 4 -o data/r")
+    shutil.copytree(scene.project / "data", tmp_path / "other/data")
+    store, seen = scene.project / ".tacpipe", tmp_path / "seen"
+    here = [sys.executable, "-m", "tacpipe.cli"]
+    there = [*UNSHARED, "sh", "-c", ELSEWHERE, "sh", str(seen), str(store), *here]
+    processes = [
+        subprocess.Popen(
+            [*(there if number % 2 else here), *f"scale data/r -o data/s{number} --pause-s 0.02 --json".split()],
+            cwd=tmp_path / ("other" if number % 2 else "project"),
+            env={**os.environ, **scene.environment, "TACPIPE_STORE": str(seen if number % 2 else store)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(size)
+    ]
+    assert sum(one["ran"] for one in waited(processes)) == 12
+    tidy(Store(store))
+
+
+PROBE = """
+import json, shlex, sys
+from tacpipe import cli
+for words in sys.argv[1:]:
+    sys.argv = ["tacpipe", *shlex.split(words)]
+    assert cli.answer(sys.argv[1:]) == 0
+print(json.dumps([name for name in sys.modules if name.partition(".")[0] not in ("__main__", "toy_stages")]))
+"""
+
+
+@pytest.fixture
+def shared(scene: Scene) -> Iterator[Scene]:
+    """A project in a folder of a group, for processes that need not read what is installed for root alone."""
+    commands = [
+        "simulate toy --trials 2 -o data/r",
+        "scale data/r -o data/s",
+        "label data/r trial-000 --set a=1",
+        "store gc",
+    ]
+    probe = [sys.executable, "-c", PROBE, *commands]
+    environment = {**os.environ, **scene.environment}
+    done = subprocess.run(probe, cwd=scene.project, env=environment, capture_output=True, text=True, check=True)
+    modules = json.loads(done.stdout.splitlines()[-1])
+    with tempfile.TemporaryDirectory(prefix="tacpipe-group-") as name, serving(*modules) as server:
+        lab = Path(name)
+        shutil.copytree(Path(scene.environment["PYTHONPATH"].split(os.pathsep)[0]), lab / "plugin")
+        for folder in (lab, lab / "plugin", lab / "plugin/toy.egg-info", lab / "project", lab / "project/.git"):
+            folder.mkdir(exist_ok=True)
+            os.chown(folder, -1, GROUP)
+            folder.chmod(0o2775)
+        yield Scene(lab, server, {"PYTHONPATH": str(lab / "plugin"), "TEST_GROUP": str(GROUP)})
+
+
+@pytest.mark.skipif(not ROOT, reason="only root can be several users")
+@pytest.mark.parametrize("size", [4, pytest.param(16, marks=pytest.mark.faults)])
+def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:
+    def done(*commands: str, first: int = 0) -> list[str]:
+        """Run commands of the users in turn, all at once; return the last line that each printed."""
+        users = [USERS[(first + number) % 2] for number in range(len(commands))]
+        crowd = [shared.start(words, TEST_USER=str(user)) for words, user in zip(commands, users, strict=True)]
+        for running in crowd:
+            assert kills.ended(running) == 0, running.out.read_text()
+        count("processes in crowds", len(crowd))
+        return [running.out.read_text().splitlines()[-1] for running in crowd]
+
+    done("simulate toy --jobs 1 --trials 12 --rows 4 -o data/r")
+    told = done(*(f"scale data/r --json --jobs 1 --quiet -o data/s{number}" for number in range(size)))
+    assert sum(json.loads(one)["ran"] for one in told) == 12
+    told = done(*(f"scale data/r --factor 9 --json --quiet --jobs 1 -o data/s{n}" for n in range(size)), first=1)
+    assert sum(json.loads(one)["ran"] for one in told) == 12  # each wrote over what was the other's
+    for first in (0, 1):
+        done(f"label data/r trial-000 --set material=foam{first}", first=first)
+        kills.aged(shared.project)
+        done("store gc", first=first)
+    tidy(Store(shared.project / ".tacpipe"))

@@ -1,0 +1,186 @@
+"""Whatever a command is killed by, and whenever: nothing keeps writing, the store is sound, a rerun equals a clean run."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tacpipe.interruption import SENTENCE
+from tests.promises import kills, stubborn
+from tests.promises.counts import count
+from tests.promises.kills import Scene
+from tests.promises.operations_cases import STAGES, TOYS, Case
+from tests.promises.warm import Warm, serving
+from tests.recording.live import awaited
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are followed in /proc")
+LEARNING = ("torch", "sklearn.ensemble", "sklearn.linear_model", "scipy.signal", "scipy.optimize")
+POOL = "scale data/r -o data/s --jobs 2"
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[Warm]:
+    with serving() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def learned() -> Iterator[Warm]:
+    """A warm process that has imported what stages learn with."""
+    with serving(*LEARNING) as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def stubborn_plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stubborn")
+    shutil.copy(str(stubborn.__file__), folder)
+    (folder / "stubborn.egg-info").mkdir()
+    (folder / "stubborn.egg-info/entry_points.txt").write_text(stubborn.ENTRY_POINTS)
+    return folder
+
+
+@pytest.fixture
+def scene(tmp_path: Path, plugin: Path, stubborn_plugin: Path, warm: Warm) -> Scene:
+    """An empty project whose commands begin at once."""
+    return made(tmp_path, warm, plugin, stubborn_plugin)
+
+
+def made(folder: Path, server: Warm, *plugins: Path) -> Scene:
+    (folder / "project/.tacpipe").mkdir(parents=True)
+    return Scene(
+        folder, server, {"PYTHONPATH": os.pathsep.join([*map(str, plugins), os.environ.get("PYTHONPATH", "")])}
+    )
+
+
+def begun(scene: Scene, case: Case) -> Scene:
+    """Do what comes before the command of a case."""
+    case.sources(scene.project)
+    for command in case.before:
+        scene.run(command)
+    case.spoil(scene.project)
+    kills.aged(scene.project)
+    return scene
+
+
+def computing(scene: Scene) -> bool:
+    """Return whether somebody makes a key, who has had the time to come as far as its stage."""
+    held = [path for path in scene.project.glob(".tacpipe/leases/*.lock") if not path.name.startswith("run-")]
+    return bool(held) and all(time.time() - path.stat().st_mtime > 0.3 for path in held)
+
+
+@pytest.mark.parametrize("name", ["scale", "label", "store gc"])
+def test_a_command_that_is_killed_at_a_random_moment_leaves_what_a_rerun_makes_whole(scene: Scene, name: str) -> None:
+    case = next(case for case in TOYS if case.name == name)
+    kills.survive(begun(scene, case), case.command, kills.KILLS, len(kills.KILLS))
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("case", TOYS, ids=lambda case: case.name)
+def test_every_small_command_survives_kills_at_all_of_its_moments(scene: Scene, case: Case) -> None:
+    kills.survive(begun(scene, case), case.command, kills.KILLS, 3 * len(kills.KILLS), sound=case.sound)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("case", STAGES, ids=lambda case: case.name)
+def test_every_stage_survives_kills_at_all_of_its_moments(tmp_path: Path, learned: Warm, case: Case) -> None:
+    scene = begun(made(tmp_path, learned), case)
+    kills.survive(scene, case.command, kills.KILLS, len(kills.KILLS))
+
+
+@pytest.mark.faults
+def test_a_pool_of_workers_survives_kills_at_all_of_its_moments(scene: Scene) -> None:
+    scene.run("simulate toy --trials 24 --rows 4 -o data/r")
+    strikes = {**kills.KILLS, **kills.WORKERS}
+    kills.survive(scene, POOL, strikes, 5 * len(strikes), fresh=True)
+
+
+@pytest.mark.parametrize("name", ["SIGKILL", "Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_call_in_c_that_takes_minutes_ends_with_the_command(scene: Scene, name: str, jobs: int) -> None:
+    scene.run("simulate toy --trials 9 --rows 4 -o data/r")
+    running = scene.start(f"stuck data/r -o data/s --jobs {jobs}", fresh=jobs > 1)
+    awaited(lambda: computing(scene))
+    assert len(kills.session(running.pid)) >= jobs
+    kills.KILLS[name](running)
+    code = kills.ended(running)
+    kills.gone(running.pid)
+    assert code == (-signal.SIGKILL if name == "SIGKILL" else 130)
+    kills.orderly(running.out.read_text(), code)
+    assert scene.run("scale data/r -o data/s")
+    count("kills survived")
+
+
+@pytest.mark.parametrize("name", kills.WORKERS)
+def test_a_worker_that_dies_is_a_sentence_and_what_was_finished_is_kept(scene: Scene, name: str) -> None:
+    scene.run("simulate toy --trials 40 --rows 4 -o data/r")
+    running = scene.start(f"{POOL} --pause-s 0.1", fresh=True)
+    awaited(lambda: len(list(scene.project.glob(".tacpipe/records/*/*"))) > 45)
+    kills.WORKERS[name](running)
+    code, said = kills.ended(running), running.out.read_text()
+    kills.gone(running.pid)
+    kills.orderly(said, code)
+    if "worker" in name:
+        assert code == 1 and "tacpipe: A worker process died, most likely for lack of memory." in said
+    else:
+        assert code == 0  # workers that are there need it no more
+    count("kills survived")
+    rerun = scene.start(f"{POOL} --pause-s 0.1 --json")
+    assert kills.ended(rerun) == 0
+    told = json.loads(rerun.out.read_text().splitlines()[-1])
+    assert told["reused"] >= 4 and told["ran"] + told["reused"] == 40
+
+
+def test_a_mistake_in_a_stage_is_told_with_the_place_in_the_worker(scene: Scene) -> None:
+    scene.run("simulate toy --trials 9 --rows 4 -o data/r")
+    running = scene.start("mistaken data/r -o data/s --jobs 2", fresh=True)
+    assert kills.ended(running) == 1
+    said = running.out.read_text()
+    assert "ZeroDivisionError: trial-" in said
+    assert "in a worker process:\n" in said and "stubborn.py" in said and "in stage mistaken" in said
+
+
+def test_an_interrupt_ends_the_wait_for_a_lock(scene: Scene) -> None:
+    scene.run("simulate toy --trials 1 --rows 4 -o data/r")
+    first = scene.start("scale data/r -o data/s --pause-s 60")
+    awaited(lambda: computing(scene))
+    second = scene.start("scale data/r -o data/t --pause-s 60")
+    awaited(lambda: len(list(scene.project.glob(".tacpipe/leases/run-*"))) == 2)
+    for running in (second, first):
+        os.killpg(running.pid, signal.SIGINT)
+        assert kills.ended(running) == 130
+        assert running.out.read_text() == f"{SENTENCE}\n"
+
+
+def test_a_process_that_was_told_to_ignore_interrupts_goes_on(scene: Scene) -> None:
+    scene.run("simulate toy --trials 1 --rows 4 -o data/r")
+    words = [sys.executable, "-m", "tacpipe.cli", *["scale", "data/r", "-o", "data/s", "--pause-s", "1"]]
+    process = subprocess.Popen(
+        ["nohup", "sh", "-c", 'trap "" INT; exec "$@"', "sh", *words],
+        cwd=scene.project,
+        env={**os.environ, **scene.environment},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    awaited(lambda: computing(scene))
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 0
+
+
+@pytest.mark.parametrize("name", ["Ctrl-C", "SIGTERM"])
+def test_the_demo_ends_with_the_command_that_it_runs(scene: Scene, name: str) -> None:
+    running = scene.start("demo -o demo", fresh=True)
+    awaited(lambda: list(scene.project.glob(".tacpipe/records/*/*")))
+    kills.KILLS[name](running)
+    assert kills.ended(running) == 130
+    kills.gone(running.pid)
+    kills.orderly(running.out.read_text(), 130)
