@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.files import write_whole
+from tacpipe.files import sync_folders, write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import MissingError, Store
@@ -45,8 +46,11 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
         yield
 
 
-def publish_alone(store: Store, manifest: Manifest, directory: Path) -> None:
-    """Do as `publish` does, in the block of `changing`."""
+def publish_alone(store: Store, manifest: Manifest, directory: Path, *, damaged: bool = False) -> None:
+    """Do as `publish` does, in the block of `changing`.
+
+    Where ``damaged`` shards may be, those stay as they are: a recording that is lost must not hinder the next one.
+    """
     directory = directory.absolute()
     check_output(store, directory)
     wanted = dict(manifest.objects())
@@ -55,14 +59,36 @@ def publish_alone(store: Store, manifest: Manifest, directory: Path) -> None:
     gone = _named(directory) - set(wanted)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
-        store.set_root(directory, bytes_digest(manifest.content))
-        for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
-            draft.unlink(missing_ok=True)  # of a process that was killed
+        store.set_root(directory, bytes_digest(manifest.content), durable=True)
+        sweep(directory)
         for path in stale:
-            place(store, wanted[path], directory / path, copy=manifest.recorded)
+            with contextlib.suppress(*([MissingError] if damaged else [])):
+                place(store, wanted[path], directory / path, copy=manifest.recorded)
         _remove(directory, gone)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
+        if manifest.recorded:
+            settle(store, manifest, directory)
+
+
+def sweep(directory: Path) -> None:
+    """Remove what a process left that was killed while it wrote here."""
+    for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
+        draft.unlink(missing_ok=True)
+
+
+def sweep_beside(path: Path) -> None:
+    """Do as `sweep` for what was to become the file ``path``; what else lies in its folder is not ours."""
+    for draft in path.parent.glob(f".{glob.escape(path.name[:100])}.*{_DRAFT}"):
+        draft.unlink(missing_ok=True)
+
+
+def settle(store: Store, manifest: Manifest, directory: Path) -> None:
+    """Have what ``directory`` shows outlast a loss of power: recordings and their labels cannot be made again."""
+    project = store.root.parent
+    top = project if directory.is_relative_to(project) else directory.parent
+    for folder in sorted({directory, *((directory / path).parent for path, _ in manifest.objects())}):
+        sync_folders(str(folder), str(top))
 
 
 @contextlib.contextmanager
@@ -125,8 +151,9 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
     source = store.object_path(name)
     try:
         if copy or not _link(source, draft):
-            draft.write_bytes(content)
-        draft.replace(path)
+            write_whole(str(path), content, str(draft))
+        else:
+            draft.replace(path)
     except FileNotFoundError:
         raise MissingError(f"Object {name[:12]} vanished from the store; run the same command again.") from None
     finally:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+LONGEST_WORD = 250  # letters: more is no path or name that a person gave
 DONE, FAILED, USAGE, WOULD_CHANGE, DAMAGED, DEVICE, LOCKED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
 
@@ -9,6 +12,15 @@ class TacpipeError(Exception):
     """A mistake that its reader can mend: printed without traceback."""
 
     exit_code = FAILED
+
+    def __str__(self) -> str:
+        """Return the sentence; what a stranger wrote in it is cut to a line's length, and says nothing to a terminal."""
+        text = super().__str__()
+        if len(text) > LONGEST_WORD:
+            text = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][:100]}…{word[0][-100:]}", text)
+        if text.isprintable():
+            return text
+        return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 class UsageError(TacpipeError):
@@ -21,6 +33,10 @@ class WouldChangeError(TacpipeError):
     """``--check`` found that the stored result is not up to date."""
 
     exit_code = WOULD_CHANGE
+
+
+class StorageError(TacpipeError):
+    """The disk or the store failed, which says nothing of what was to be stored."""
 
 
 class DamagedError(TacpipeError):

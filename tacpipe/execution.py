@@ -14,7 +14,7 @@ from typing import Any
 from tacpipe import params as params_of
 from tacpipe import provenance, registry
 from tacpipe.dataset import Dataset, Shard
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
 from tacpipe.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.manifest import ACQUIRE, Manifest, shard_path
 from tacpipe.stage import Recording, Result, Stage
@@ -45,6 +45,7 @@ class Done:
     error: str = ""
     exit_code: int = 0
     made: bool = True  # False if another process was faster
+    at_fault: bool = True  # the recording is, and not the disk, a damaged input or another process
 
 
 def compute(task: Task) -> Done:
@@ -68,7 +69,8 @@ def compute(task: Task) -> Done:
     except TacpipeError as error:
         with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
             (store.root / "checkpoints" / key).rmdir()
-        return Done(task.recording, None, str(error), error.exit_code)
+        at_fault = error.exit_code == FAILED and not isinstance(error, StorageError)
+        return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
 
 
 class _Scratch:
@@ -151,7 +153,8 @@ def reader(store: Store, beside: tuple[str, ...] = ()) -> Callable[[str, str], b
         try:
             return store.read(name)
         except MissingError as error:
-            return _adopt(store, name, path, beside) or _remake(store, name, path, str(error))
+            content = _adopt(store, name, path, beside)
+            return _remake(store, name, path, str(error)) if content is None else content
 
     return read
 
@@ -163,8 +166,9 @@ def _adopt(store: Store, name: str, path: str, beside: tuple[str, ...]) -> bytes
         except OSError:
             continue
         if bytes_digest(content) == name:
-            store.prepare()
-            store.put(content, durable=True)
+            with contextlib.suppress(TacpipeError):  # of a store that may only be read the sound copy is as good
+                store.prepare()
+                store.put(content, durable=True)
             return content
     return None
 
@@ -182,9 +186,14 @@ def _remake(store: Store, name: str, path: str, why: str) -> bytes:
         if stage.version != identity["version"]:
             other = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
             continue
-        with store.leases.hold(digest(identity), f"{identity['stage']}, for {path}"):
-            if not store.has(name):  # else another process has made it again
-                execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
+        try:
+            with store.leases.hold(digest(identity), f"{identity['stage']}, for {path}"):
+                if not store.has(name):  # else another process has made it again
+                    execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
+        except TacpipeError as error:
+            if error.exit_code != FAILED:
+                raise
+            raise DamagedError(f"{why} It cannot be made again here: {error}") from error
         if store.has(name):
             return store.read(name)
         other = f"{identity['stage']} gave something else when it was run again: other libraries, or chance"
@@ -219,9 +228,9 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
         if kind == "Shard":
             found[name] = Shard(task.recording, inputs[name], read)
         elif kind in ("Dataset", "Model"):
-            found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
+            found[name] = _dataset(store, inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
-            found[name] = tuple(_dataset(value, read) for value in inputs[name])
+            found[name] = tuple(_dataset(store, value, read) for value in inputs[name])
         elif kind == "Fitted":
             found[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
@@ -239,7 +248,7 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
             raise TacpipeError(f"{path} changed while it was read. Run the same command again.")
 
 
-def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
+def _dataset(store: Store, value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
     lineage = value["lineage"]
     manifest = Manifest(
         stage=lineage["stage"],
@@ -249,7 +258,7 @@ def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dat
         recordings=value["recordings"],
         files={name: {"digest": file} for name, file in value["files"].items()},
     )
-    return Dataset(manifest, read)
+    return Dataset(manifest, read, place=store.object_path)
 
 
 def read_roles(content: bytes) -> dict[tuple[str, int], str]:

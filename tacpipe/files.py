@@ -7,10 +7,11 @@ import errno
 import json
 import os
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import StorageError
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
 
@@ -49,6 +50,27 @@ def sync_folder(path: str) -> None:
         os.close(handle)
 
 
+def sync_folders(path: str, top: str) -> None:
+    """Do as `sync_folder` for a folder and all above it up to ``top``: each may be new."""
+    while True:
+        sync_folder(path)
+        if path == top or len(path) <= len(top):
+            return
+        path = os.path.dirname(path)  # noqa: PTH120
+
+
+def listed(folder: Path, pattern: str = "*") -> list[Path]:
+    """Return what lies in a folder, sorted; nothing where there is none.
+
+    A folder that cannot be listed is an error here. `Path.glob` passes over it, and what it holds would seem to be gone.
+    """
+    try:
+        names = os.listdir(folder)  # noqa: PTH208
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [folder / name for name in sorted(names) if fnmatchcase(name, pattern)]
+
+
 def read_json(path: Path) -> dict[str, Any] | None:
     """Return the mapping that a file holds; None if it is not there or holds none."""
     try:
@@ -69,21 +91,29 @@ def readable_errors(root: Path) -> Iterator[None]:
         raise sentence(root, error) from error
 
 
-def sentence(root: Path | str, error: OSError) -> TacpipeError:
+def sentence(root: Path | str, error: OSError) -> StorageError:
     """Return in words what the file system said of something under the store ``root``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return TacpipeError(
+        return StorageError(
             f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
             f"shows what the store could give back) and run the same command again."
         )
     if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-        return TacpipeError(
+        return StorageError(
             f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
             f"TACPIPE_STORE."
         )
-    return TacpipeError(
+    return StorageError(
         f"The store {root} cannot be used: {error.strerror or error}, says the system of {error.filename or 'it'}. "
         f"Look after the disk, then run the same command again."
+    )
+
+
+def told(error: OSError) -> str:
+    """Return in words what the file system said of anything else."""
+    return (
+        f"{error.filename or 'A file'} cannot be used: {error.strerror or error}. Nothing was half written; mend that, then "
+        f"run the same command again."
     )
 
 

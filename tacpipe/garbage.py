@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -59,23 +60,24 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False)
     contents: dict[str, bytes] = {}
     for root in store.roots():
         path = Path(root["path"])
-        here = None if root["kind"] == PUSHED else _content(path)
+        here, reached = None, root["kind"] == PUSHED
+        if not reached:
+            here, reached = _content(path)
         if here is not None:
+            _expect_sound(here, path)
             contents[bytes_digest(here)] = here
             wanted.append(bytes_digest(here))
-            reached = True
-        else:
-            reached = path.is_file() or root["kind"] == PUSHED  # a report: its manifest lies in the store alone
         expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
     damaged = store.damaged_roots()
     if damaged:
         raise DamagedError(
-            f"{damaged} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
-            f"removed. Run the commands that wrote them again (whose are not in `tacpipe store status`)."
+            f"{len(damaged)} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
+            f"removed. `tacpipe store repair` finds those beside the store, and the commands that wrote the others write "
+            f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
         )
-    found.objects |= _closure(store, wanted, contents)
+    found.objects |= _closure(store, wanted, contents) | _doubtful(store)
     return found
 
 
@@ -104,7 +106,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
     collected.kept_recordings = len(kept)
     aside = []
-    for path in store.root.glob("objects/*/*"):
+    for path in store.listed("objects", "*", "*"):
         if path.name in needed.objects or path.name in kept or _young(path):
             continue
         if dry_run:
@@ -114,6 +116,8 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
                 os.rename(path, store.aside(path.name))  # noqa: PTH104
                 aside.append(path.name)
     if aside:
+        shown = {root["manifest"] for root in store.roots()}
+        aside.sort(key=lambda name: name not in shown)  # no manifest is there that names what is gone
         _remove(store, aside, live(store, grace_days).objects, collected)
     _sweep(store, needed, collected, grace_days, dry_run=dry_run)
     return collected
@@ -133,7 +137,7 @@ def _remove(store: Store, aside: list[str], needed: set[str], collected: Collect
 
 def _put_back(store: Store) -> None:
     """Put back what a collection that was killed had moved aside."""
-    for path in store.root.glob(f"tmp/{ASIDE}*"):
+    for path in store.listed("tmp", f"{ASIDE}*"):
         with contextlib.suppress(DamagedError):
             if store.has(path.name.removeprefix(ASIDE)):
                 path.unlink(missing_ok=True)
@@ -171,7 +175,7 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> set
         try:
             manifest = manifest_of.parse(contents.get(name) or store.read(name), name, verified=True)
         except TacpipeError as error:
-            if store.quarantined(name):
+            if store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
                 raise DamagedError(
                     f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is not "
                     f"known what it needs; nothing was removed. `tacpipe store repair` may bring it back."
@@ -182,17 +186,44 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> set
     return objects | manifests
 
 
+def _doubtful(store: Store) -> set[str]:
+    """Return the digests that damaged records hold: nobody knows any more whether theirs were recordings."""
+    found: set[str] = set()
+    for path in store.listed("quarantine", "*.json.*"):
+        if path.name.startswith("root-") or store.record(path.name.partition(".")[0]) is not None:
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            found.update(re.findall(r"[0-9a-f]{64}", path.read_bytes().decode("latin-1")))
+    return found
+
+
 def ancestors(manifest: manifest_of.Manifest) -> list[str]:
     """Return the digests of the manifests that this one was made from."""
     return [given["manifest"] for several in manifest.inputs.values() for given in several]
 
 
-def _content(path: Path) -> bytes | None:
-    """Return the manifest that lies at a root's path; None if the path cannot be reached or holds another thing."""
+def _content(path: Path) -> tuple[bytes | None, bool]:
+    """Return the manifest that lies at a root's path, None if there is none; and whether the path is there.
+
+    A path of which the system tells no more than that it failed counts as there: an error is no absence.
+    """
     try:
-        return (path / manifest_of.NAME).read_bytes()
+        return (path / manifest_of.NAME).read_bytes(), True
+    except (FileNotFoundError, NotADirectoryError):
+        with contextlib.suppress(OSError):
+            return None, path.is_file()  # a report: its manifest lies in the store alone
     except OSError:
-        return None
+        pass
+    return None, True
+
+
+def _expect_sound(content: bytes, path: Path) -> None:
+    try:
+        manifest_of.parse(content, str(path / manifest_of.NAME))
+    except TacpipeError as error:
+        raise DamagedError(
+            f"{error} It is not known what it needs, so nothing was removed; `tacpipe store repair` may bring it back."
+        ) from None
 
 
 def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
@@ -213,14 +244,16 @@ def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: 
 
 def _sweep(store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool) -> None:
     now_s = time.time()
-    for path in store.root.glob("tmp/*"):
+    for path in store.listed("tmp", "*"):
         if path.name.startswith(ASIDE) or path.name.partition(".")[0] in needed.runs:
             continue
         dead = path.name.startswith("run-")  # its run is over; of who told no run an old draft is swept up
         collected.drafts += _drop(path, _YOUNG_S if dead else _DRAFT_S, now_s, dry_run=dry_run)
-    for path in store.root.glob("quarantine/*"):
+    for path in store.listed("quarantine", "*"):
         _drop(path, grace_days * 86400, now_s, dry_run=dry_run)
-    for folder in store.root.glob("checkpoints/*"):
+    if not dry_run:
+        store.leases.sweep()
+    for folder in store.listed("checkpoints", "*"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1
             if not dry_run:

@@ -9,7 +9,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from tacpipe import regular
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt
 
 SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
 _remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system said of the file, its digest
@@ -24,10 +26,13 @@ def canonical(value: Any) -> bytes:
     b'{"a":[1.5,null],"b":1}'
     """
     try:
-        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-    except (TypeError, ValueError) as error:
+        text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        if "\\ud" in text:  # beyond 16 bits, or half a character, of which two would read as a whole one
+            json.dumps(value, ensure_ascii=False).encode()
+        return text.encode()
+    except (TypeError, ValueError, RecursionError) as error:
         raise TacpipeError(
-            f"A key cannot be made of {value!r}: {error}. Use numbers, text, lists and mappings."
+            f"A key cannot be made of {excerpt(value)}: {error}. Use numbers, text, lists and mappings."
         ) from error
 
 
@@ -50,8 +55,11 @@ def bytes_digest(content: bytes) -> str:
 
 
 def file_digest(path: Path | str) -> str:
-    """Return the sha256 of a file's content, as ``sha256sum`` prints it."""
-    with open(path, "rb", buffering=0) as file:
+    """Return the sha256 of a file's content, as ``sha256sum`` prints it.
+
+    Raises `TacpipeError` for a pipe, a device or a folder, which have no content or no end of it.
+    """
+    with regular.opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -17,17 +17,12 @@ from tacpipe.store import locate
 
 def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
     """Return the labels of ``name=value`` texts; numbers and true, false, null are read as YAML does."""
-    import yaml
-
     labels: dict[str, Attribute] = {}
     for text in sets:
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
             raise UsageError(f"--set {text} should read name=value, as in --set material=foam.")
-        labels[name] = yaml.safe_load(value) if value else ""
-        found = labels[name]
-        if not isinstance(found, str | int | float | bool | None) or (isinstance(found, float) and not isfinite(found)):
-            labels[name] = value
+        labels[name] = _value(value) if value else ""
     if exclude is not None and include:
         raise UsageError("--exclude and --include contradict each other; give one.")
     if exclude is not None:
@@ -37,6 +32,19 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
     if not labels:
         raise UsageError("Nothing to change: give --set name=value, --exclude REASON or --include.")
     return labels
+
+
+def _value(text: str) -> Attribute:
+    """Return what a text stands for, where that is a number, true, false or null; else the text."""
+    from tacpipe import yaml_text
+
+    try:
+        found = yaml_text.load(text)
+    except ValueError:
+        return text
+    if isinstance(found, float) and not isfinite(found):
+        return text
+    return found if isinstance(found, str | int | float | None) else text
 
 
 def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Path:
@@ -51,8 +59,8 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
         found = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
         changed = found.manifest.labelled({name: dict(labels) for name in _matching(found, patterns)})
         store.put(found.content)
-        store.put(changed.content)
-        directory_of.publish_alone(store, changed, directory)
+        store.put(changed.content, durable=True)
+        directory_of.publish_alone(store, changed, directory, damaged=True)
     return directory
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from tacpipe import progress
 from tacpipe.errors import LockedError, TacpipeError
-from tacpipe.files import read_json, readable_errors, write_all
+from tacpipe.files import listed, read_json, readable_errors, write_all
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
 TELL_AFTER_S = 2.0  # a shorter wait is no news
@@ -65,9 +65,7 @@ class Leases:
                 os.pwrite(handle, _note(what=what), 0)
             yield
         finally:
-            with contextlib.suppress(OSError):  # the kernel frees the lock in any case
-                path.unlink()
-            os.close(handle)
+            _release(path, handle)
 
     @contextlib.contextmanager
     def running(self, manifests: Iterable[str] = ()) -> Iterator[Announcing]:
@@ -83,9 +81,7 @@ class Leases:
             yield announcing
             announcing.close()
         finally:
-            with contextlib.suppress(OSError):  # the kernel frees the lock in any case
-                path.unlink()
-            os.close(handle)
+            _release(path, handle)
 
     def runs(self) -> list[Run]:
         """Return the running processes with what they announced so far; forget dead ones.
@@ -93,7 +89,7 @@ class Leases:
         A run that began and told nothing yet has made no use of anything yet.
         """
         found = []
-        for path in sorted(self.folder.glob("run-*.lock")):
+        for path in listed(self.folder, "run-*.lock"):
             try:
                 handle = _try_lock(path, create=False)
                 if handle is None:
@@ -108,6 +104,16 @@ class Leases:
                 continue
         return found
 
+    def sweep(self) -> None:
+        """Remove the files that killed processes left; their locks went with them."""
+        for path in listed(self.folder, "*.lock"):
+            with contextlib.suppress(FileNotFoundError, TacpipeError):
+                handle = _try_lock(path, create=False)
+                if handle is not None:
+                    if _has_locks(handle):  # else nobody knows whose it is
+                        path.unlink()
+                    os.close(handle)
+
     @contextlib.contextmanager
     def alone(self, what: str) -> Iterator[None]:
         """Do ``what`` in the block while nobody else does. Raises `LockedError` at once if somebody does."""
@@ -120,8 +126,7 @@ class Leases:
                 os.pwrite(handle, _note(what=what), 0)
             yield
         finally:
-            path.unlink(missing_ok=True)
-            os.close(handle)
+            _release(path, handle)
 
 
 class Announcing:
@@ -152,8 +157,16 @@ class Announcing:
     def close(self) -> None:
         """Announce nothing more."""
         if self._handle >= 0:
-            os.close(self._handle)
+            with contextlib.suppress(OSError):  # what was announced is needed no more
+                os.close(self._handle)
             self._handle = -1
+
+
+def _release(path: Path, handle: int) -> None:
+    with contextlib.suppress(OSError):  # the kernel frees the lock in any case
+        path.unlink()
+    with contextlib.suppress(OSError):
+        os.close(handle)
 
 
 def _told(path: Path) -> Run:
@@ -273,5 +286,8 @@ def _open(path: Path, *, create: bool) -> int:
             raise
         path.parent.mkdir(parents=True, exist_ok=True)
         return os.open(path, os.O_RDWR | flags, 0o666)
-    except PermissionError:
-        return os.open(path, os.O_RDONLY)  # another user's, who shares the store: it can be waited for
+    except PermissionError as error:
+        try:
+            return os.open(path, os.O_RDONLY)  # another user's, who shares the store: it can be waited for
+        except FileNotFoundError:
+            raise error from None

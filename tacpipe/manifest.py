@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, UsageError
+from tacpipe.excerpt import excerpt, plain
 from tacpipe.hashing import bytes_digest, digest
 from tacpipe.stage import Attribute
 
@@ -21,6 +22,7 @@ NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add t
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _PART = r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*"
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
+_PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
 
 
@@ -111,18 +113,19 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
         value = json.loads(content)
         found, stored = value.pop("format"), value.pop("digest")
         if found != FORMAT:
-            raise UsageError(f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}.")
+            raise UsageError(f"{where} has manifest format {excerpt(found)}; this tacpipe reads format {FORMAT}.")
         manifest = Manifest(**value)
         manifest.__dict__["content"] = content  # primes the cached property: the bytes are at hand
         computed = stored if verified else manifest.digest
         check(manifest)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(
-            f"{where} is not a manifest of tacpipe ({error}). Restore it, or run the stage that made it again."
+            f"{where} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
+            f"again."
         ) from None
     if computed != stored:
         raise DamagedError(
-            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it says {str(stored)[:12]}. "
+            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it says {excerpt(stored)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     return manifest
@@ -144,21 +147,30 @@ def safe_path(path: str) -> bool:
 def check(manifest: Manifest) -> None:
     """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: a stranger may have written it."""
     _check_lineage(manifest)
+    contents = list(manifest.files.values())
     for entry in manifest.recordings.values():
         for name, value in entry["attributes"].items():
             if not isinstance(value, str | int | float | None):
                 raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
-        for shard in entry["shards"].values():
-            _expect_count(shard["rows"], "rows")
-            _expect_count(shard["bytes"], "bytes")
-    for file in manifest.files.values():
-        _expect_count(file["bytes"], "bytes")
-    paths = set()
-    for path, name in manifest.objects():
-        if not safe_path(path) or path == NAME or path in paths:
-            raise ValueError(f"the path {path[:80]!r} leads out of the dataset, is there twice, or is none")
-        _expect_digest(name)
-        paths.add(path)
+        contents += entry["shards"].values()
+    counts = [one["bytes"] for one in contents] + [one["rows"] for one in contents[len(manifest.files) :]]
+    for count in counts:
+        if type(count) is not int or count < 0:
+            raise ValueError(f"{str(count)[:80]!r} is no count of rows or bytes")
+    for one in contents:
+        _expect_digest(one["digest"])
+    _check_paths([path for path, _ in manifest.objects()])
+
+
+def _check_paths(paths: list[str]) -> None:
+    text = "\n".join(paths)  # a thousand at once: a hit does not wait for a thousand calls
+    plain = text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
+    if not plain or max(map(len, paths), default=0) > NAME_BYTES:
+        for path in paths:
+            if not safe_path(path):
+                raise ValueError(f"the path {path[:80]!r} leads out of the dataset, or no file can have it")
+    if len(set(paths)) < len(paths) or NAME in paths:
+        raise ValueError(f"two of its shards and files share a path, or one is called {NAME}")
 
 
 def _check_lineage(manifest: Manifest) -> None:
@@ -185,11 +197,6 @@ def _expect_mapping(value: object, what: str) -> None:
 def _expect_digest(name: object) -> None:
     if not isinstance(name, str) or not _DIGEST.fullmatch(name):
         raise ValueError(f"{str(name)[:80]!r} is no digest")
-
-
-def _expect_count(value: object, what: str) -> None:
-    if not isinstance(value, int) or value < 0:
-        raise ValueError(f"{what} {str(value)[:80]!r} is no count")
 
 
 def shard_path(recording: str, stream: str) -> str:

@@ -12,7 +12,7 @@ from tacpipe import directory, execution, executors, keys, manifest, progress, p
 from tacpipe import params as params_of
 from tacpipe import request as request_of
 from tacpipe.dataset import Dataset
-from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
+from tacpipe.errors import FAILED, LOCKED, DamagedError, LockedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.execution import Done, Task
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import Entry, Manifest
@@ -39,7 +39,9 @@ class Outcome:
 def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
     found = manifest.find(path)
-    return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),)))
+    store = locate(found.directory)
+    read = execution.reader(store, (str(found.directory.absolute()),))
+    return Dataset(found.manifest, read, place=store.object_path)
 
 
 def run(request: Request) -> Outcome:
@@ -51,9 +53,9 @@ def run(request: Request) -> Outcome:
     outcome = Outcome(request.output, digest(identity))
     hit = None if request.compare else _answer(store, outcome.key)
     if hit is not None and (request.check or _shown(store, request, hit)):
-        made, outcome.reused = _keep_labels(request, hit), len(hit.recordings) or 1
+        made, outcome.reused = _keep_labels(store, request, hit), len(hit.recordings) or 1
     elif request.check or request.compare:
-        made = _keep_labels(request, _Run(request, store, inputs, outcome).make())
+        made = _keep_labels(store, request, _Run(request, store, inputs, outcome).make())
     else:
         with store.at_work([found.digest for found in inputs.used]):
             made = _make(request, store, inputs, identity, outcome)
@@ -113,8 +115,8 @@ def _shown(store: Store, request: Request, hit: Manifest) -> bool:
             and request.output.exists()
             and file_digest(request.output) == wanted
         )
-    shown = _keep_labels(request, hit)
-    known = root["manifest"] == bytes_digest(shown.content)
+    shown = _keep_labels(store, request, hit)
+    known = root["manifest"] == bytes_digest(shown.content) and store.has(root["manifest"])
     return known and directory.shown(store, shown, request.output.absolute())
 
 
@@ -228,11 +230,14 @@ class _Run:
         done = execution.compute(task)
         if done.record is None:
             raise _error(done.exit_code, done.error)
+        made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:
-            self.outcome.differs += execution.differences(record["result"], done.record["result"], name)
+            self.outcome.differs += execution.differences(record["result"], made, name)
+            made = record["result"]  # what else was made rests on what is stored
+        elif self.request.compare and not counted:
+            raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
         self.outcome.ran += done.made and counted
         self.outcome.reused += counted and not done.made
-        made: Mapping[str, Any] = done.record["result"]
         return made
 
     def _fit(self) -> dict[str, Any]:
@@ -297,15 +302,20 @@ class _Run:
     def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
         source = f"{self.request.source}/"  # where the files lay is no part of a manifest
         self.outcome.bad.update({name: bad[name].error.replace(source, "") for name in sorted(bad)})
-        ordinary = all(done.exit_code == TacpipeError.exit_code for done in bad.values())
-        if not bad or (self.request.skip_bad and ordinary):
+        others = sorted({(-done.exit_code, done.error) for done in bad.values() if not done.at_fault})
+        if others and all(code == -FAILED for code, _ in others):  # the disk fails all alike: once is enough
+            raise _error(FAILED, others[0][1])
+        if not bad or (self.request.skip_bad and not others):
             return
+        waited = [done.error for done in bad.values() if done.exit_code == LOCKED]
+        if waited:  # nothing is wrong with the recording, which another process works on
+            raise LockedError(waited[0])
         lines = "\n".join(f"  {recording}: {bad[recording].error}" for recording in sorted(bad))
         plural = "recordings" if len(bad) > 1 else "recording"
+        advice = "mend these." if others else "mend these, or leave them out with --skip-bad."
         raise _error(
             max(done.exit_code for done in bad.values()),
-            f"{name} could not read {len(bad)} {plural}:\n{lines}\n"
-            f"What is good is kept in the store; mend these, or leave them out with --skip-bad.",
+            f"{name} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; {advice}",
         )
 
     # ---- models: the chain that they carry
@@ -341,15 +351,32 @@ def _error(exit_code: int, sentence: str) -> TacpipeError:
     return error
 
 
-def _keep_labels(request: Request, made: Manifest) -> Manifest:
-    """Return recordings with the labels that were set by hand on those they replace."""
-    if not made.recorded:
+def _keep_labels(store: Store, request: Request, made: Manifest) -> Manifest:
+    """Return recordings with the labels that were set by hand on those they replace.
+
+    Raises `DamagedError` if these cannot be told: no rerun would bring them back.
+    """
+    if not made.recorded or not (request.output / manifest.NAME).exists():
         return made
     try:
-        labels = manifest.find(request.output).manifest.labels
+        before = manifest.find(request.output).manifest
+    except TacpipeError as error:
+        before = _before(store, request.output, error)
+    return made.labelled(before.labels) if before.labels else made
+
+
+def _before(store: Store, output: Path, error: TacpipeError) -> Manifest:
+    """Return the manifest that was written at ``output``, which is damaged now, from the store."""
+    root = store.get_root(output.absolute())
+    try:
+        if root is not None:
+            return manifest.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
     except TacpipeError:
-        return made
-    return made.labelled(labels) if labels else made
+        pass
+    raise DamagedError(
+        f"{error} Labels that were set by hand may stand in it, and would be lost: bring it back with git, or remove it to "
+        f"go on without them."
+    )
 
 
 def _check(store: Store, request: Request, made: Manifest) -> None:
@@ -360,7 +387,7 @@ def _check(store: Store, request: Request, made: Manifest) -> None:
 
 def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome: Outcome) -> None:
     """Store the manifest, and the run if every recording was good: then a rerun is answered at once."""
-    stored = vars(store.put(made.content))
+    stored = vars(store.put(made.content, durable=made.recorded))
     if not outcome.bad:
         result = {"recordings": {}, "files": {manifest.NAME: stored}}
         store.commit(identity, result, provenance.of(0.0), replace=True)
@@ -375,7 +402,7 @@ def _publish(store: Store, request: Request, made: Manifest) -> Manifest:
         directory.publish(store, made, request.output)
         return made
     with directory.changing(store, request.output):  # somebody may be about to label what is there
-        made = _keep_labels(request, made)
+        made = _keep_labels(store, request, made)
         store.put(made.content)
         directory.publish_alone(store, made, request.output)
     return made
@@ -386,6 +413,7 @@ def _publish_file(store: Store, request: Request, made: Manifest) -> None:
     wanted = made.files[_single(request, made)]["digest"]
     with directory.changing(store, output), directory.writing(output):
         if not output.exists() or file_digest(output) != wanted:
+            directory.sweep_beside(output)
             directory.place(store, wanted, output, copy=True)
         store.set_root(output, bytes_digest(made.content))
 

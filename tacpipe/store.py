@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.files import read_json, readable_errors, sentence, sync_folder, write_whole
+from tacpipe.files import listed, read_json, readable_errors, sentence, sync_folders, write_whole
 from tacpipe.hashing import bytes_digest, digest
 from tacpipe.leases import Announcing, Leases
 
@@ -73,6 +73,7 @@ class Store:
                 for name in FOLDERS:
                     (self.root / name).mkdir(parents=True, exist_ok=True)
                 self.write_file(mark, FORMAT.encode() + b"\n")
+                sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
             found = mark.read_bytes().strip().decode(errors="replace")
         if found != FORMAT:
             raise TacpipeError(f"The store {self._root} has format {found[:20]}; this tacpipe reads format {FORMAT}.")
@@ -119,20 +120,21 @@ class Store:
         """Store ``content`` and return its digest and size.
 
         An object that is there already is kept, after a look at its size: a damaged one is found on reading. What cannot
-        be made again is ``durable``: its folder is synced too, and a copy that is there already is read and replaced if
-        it is damaged.
+        be made again is ``durable``: the folders above it are synced too, and a copy that is there already is read and
+        replaced if it is damaged.
         """
         name = bytes_digest(content)
         path = self.object_path(name)
         self.announce([name])
+        there = False
         with contextlib.suppress(MissingError):
             if durable:
                 self.read(name)
-            if self.has(name, len(content)):
-                return Object(name, len(content))
-        self.write_file(path, content, mode=0o444)
-        if durable:
-            sync_folder(os.path.dirname(path))  # noqa: PTH120
+            there = self.has(name, len(content))
+        if not there:
+            self.write_file(path, content, mode=0o444)
+        if durable:  # whoever put it there
+            self._sync(path)
         return Object(name, len(content))
 
     def read(self, name: str) -> bytes:
@@ -170,12 +172,16 @@ class Store:
 
     def quarantined(self, name: str) -> bool:
         """Return whether an object of this digest was damaged, lies in quarantine, and was not made again."""
-        return any((self.root / "quarantine").glob(f"{name}.*")) and not self.has(name)
+        return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
 
-    def damaged_roots(self) -> int:
-        """Return how many roots were damaged and not written anew: nobody knows which datasets they stood for."""
-        names = {path.name[len("root-") :].partition(".")[0] for path in (self.root / "quarantine").glob("root-*")}
-        return sum(not (self.root / "roots" / f"{name}.json").exists() for name in names)
+    def damaged_roots(self) -> list[str]:
+        """Return the names of roots that were damaged and not written anew: nobody knows which datasets they stood for."""
+        names = {path.name[len("root-") :].partition(".")[0] for path in self.listed("quarantine", "root-*")}
+        return sorted(name for name in names if not (self.root / "roots" / f"{name}.json").exists())
+
+    def is_root_of(self, name: str, path: Path) -> bool:
+        """Return whether the root of this name stands for the dataset at ``path``."""
+        return self._root_file(*self.named(path)).stem == name
 
     def aside(self, name: str) -> str:
         """Return where a collection keeps an object between its first look at what is needed and its second."""
@@ -188,6 +194,19 @@ class Store:
         except OSError:
             return False
         return True
+
+    def _sync(self, path: str | Path) -> None:
+        """Have the name of a file of the store outlast a loss of power, as its content does."""
+        with readable_errors(self.root):
+            sync_folders(os.path.dirname(path), self._root)  # noqa: PTH120
+
+    def listed(self, *patterns: str) -> list[Path]:
+        """Return the paths in the store that match a pattern a level. Raises `TacpipeError` for folders it cannot list."""
+        found = [self.root]
+        with readable_errors(self.root):
+            for pattern in patterns:
+                found = [path for folder in found for path in listed(folder, pattern)]
+        return found
 
     def write_file(self, path: Path | str, content: bytes, *, mode: int = 0o666, exclusive: bool = False) -> bool:
         """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race."""
@@ -207,8 +226,7 @@ class Store:
             return None
         try:
             record: dict[str, Any] = json.loads(content)
-            body = {"identity": record["identity"], "result": record["result"]}
-            if digest(record["identity"]) == key and digest(body) == record["digest"]:
+            if _sound(record, key):
                 return record
         except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
             pass
@@ -230,7 +248,7 @@ class Store:
         """
         key = digest(identity)
         body = {"identity": identity, "result": result}
-        record = {**body, "digest": digest(body), "provenance": provenance}
+        record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
         content = json.dumps(record, sort_keys=True).encode()
         path = self.record_path(key)
         for _ in range(2):  # a second time if the record that was there turns out to be damaged
@@ -238,31 +256,33 @@ class Store:
                 break
             there = self.record(key)
             if there is not None:
-                return there
+                record = there
+                break
         if durable:
-            sync_folder(os.path.dirname(path))  # noqa: PTH120
+            self._sync(path)
         return record
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield every key and its record."""
-        for path in sorted(self.root.glob("records/*/*.json")):
+        for path in self.listed("records", "*", "*.json"):
             record = self.record(path.stem)
             if record is not None:
                 yield path.stem, record
 
     # ---- roots
 
-    def set_root(self, path: Path, manifest: str, *, pushed: bool = False) -> None:
+    def set_root(self, path: Path, manifest: str, *, pushed: bool = False, durable: bool = False) -> None:
         """Note that ``path`` now holds ``manifest``; the one before stays known for `explain`.
 
         A dataset that was ``pushed`` here has a name instead of a path, and is kept until `forget`.
         """
         kind, name = self.named(path, pushed=pushed)
         known = self.get_root(path, pushed=pushed) or {"manifest": None, "previous": None}
-        if known["manifest"] == manifest:
-            return
-        root = {"path": name, "kind": kind, "manifest": manifest, "previous": known["manifest"]}
-        self.write_root({**root, "written_s": int(time.time())})
+        if known["manifest"] != manifest:
+            root = {"path": name, "kind": kind, "manifest": manifest, "previous": known["manifest"]}
+            self.write_root({**root, "written_s": int(time.time())})
+        if durable:
+            self._sync(self._root_file(kind, name))
 
     def get_root(self, path: Path, *, pushed: bool = False) -> dict[str, Any] | None:
         """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
@@ -270,7 +290,7 @@ class Store:
 
     def roots(self) -> list[dict[str, Any]]:
         """Return all roots. Damaged ones are quarantined: the next run of their stage writes them anew."""
-        found = (self.root_at(path) for path in sorted((self.root / "roots").glob("*.json")))
+        found = (self.root_at(path) for path in self.listed("roots", "*.json"))
         return [root for root in found if root is not None]
 
     def write_root(self, root: Mapping[str, Any]) -> None:
@@ -305,9 +325,9 @@ class Store:
 
     def root_at(self, file: Path) -> dict[str, Any] | None:
         """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
-        if not file.exists():
-            return None
         with readable_errors(self.root):
+            if not file.exists():
+                return None
             root = read_json(file) or {}
         check = root.pop("check", None)
         if check is None or check != digest(root):
@@ -315,6 +335,15 @@ class Store:
             return None
         beside = root["kind"] == BESIDE
         return {**root, "path": str(self.root.parent / root["path"])} if beside else root
+
+
+def _sound(record: dict[str, Any], key: str) -> bool:
+    """Return whether a record is the key's own, and all of it is as it was written (older ones have no check)."""
+    identity, provenance = record["identity"], record["provenance"]
+    body = {"identity": identity, "result": record["result"]}
+    check = record.get("check", digest(provenance))
+    whole = set(record) <= {"identity", "result", "digest", "provenance", "check"} and check == digest(provenance)
+    return whole and digest(identity) == key and digest(body) == record["digest"]
 
 
 def _read(path: str) -> bytes:

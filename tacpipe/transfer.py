@@ -36,7 +36,7 @@ def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
         with here.at_work([found.digest]), there.at_work([found.digest]):
             here.put(found.content)
             _copy(here, there, found.digest, done, beside=(str(found.directory.absolute()),), ancestors=ancestors)
-            there.set_root(_name(found.directory), found.digest, pushed=True)
+            there.set_root(_name(found.directory), found.digest, pushed=True, durable=True)
     return done
 
 
@@ -106,7 +106,7 @@ def _copy(
     for _, record in source.records():
         names = set(execution.named(record["result"]))
         if names and names <= moved:
-            target.commit(record["identity"], record["result"], record["provenance"])
+            target.commit(record["identity"], record["result"], record["provenance"], durable=True)
 
 
 def _put(target: Store, content: bytes, name: str, done: Transferred) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import time
+import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +13,7 @@ from tacpipe import directory as directory_of
 from tacpipe import execution
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
+from tacpipe.files import write_whole
 from tacpipe.hashing import bytes_digest, file_digest
 from tacpipe.store import PUSHED, MissingError, Store, locate
 
@@ -47,17 +51,17 @@ class Soundness:
 def verify(store: Store) -> Soundness:
     """Return the soundness of every object and record; damaged ones are moved to quarantine."""
     found = Soundness()
-    for path in sorted(store.root.glob("objects/*/*")):
+    for path in store.listed("objects", "*", "*"):
         found.objects += 1
         try:
             store.read(path.name)
         except MissingError:
             found.damaged.append(path.name)
-    for path in sorted(store.root.glob("records/*/*.json")):
+    for path in store.listed("records", "*", "*.json"):
         found.records += 1
         if store.record(path.stem) is None:
             found.damaged.append(path.stem)
-    for path in sorted(store.root.glob("roots/*.json")):
+    for path in store.listed("roots", "*.json"):
         if store.root_at(path) is None:
             found.damaged.append(f"root {path.stem}")
     found.missing = sorted(set(_wanted(store)) - set(found.damaged))
@@ -68,7 +72,9 @@ def repair(store: Store) -> Soundness:
     """Return the soundness after making again, or adopting from dataset directories, what roots name and is not there."""
     with store.at_work():
         found = verify(store)
+        found.repaired += _roots_again(store)
         roots = store.roots()
+        found.repaired += [name for root in roots for name in _manifest_again(store, root)]
         manifests = [one for one in (_find(root) for root in roots) if one is not None]
         for one in manifests:
             if not store.has(one.digest):
@@ -84,6 +90,38 @@ def repair(store: Store) -> Soundness:
                 found.lost[name] = str(error)
         found.missing = []
     return found
+
+
+def _roots_again(store: Store) -> list[str]:
+    """Write damaged roots anew whose datasets lie beside the store; return their names."""
+    names, found = store.damaged_roots(), []
+    for place, folders, files in os.walk(store.root.parent) if names else ():
+        folders[:] = [folder for folder in folders if not folder.startswith(".")]
+        if manifest_of.NAME not in files:
+            continue
+        one = _sound(Path(place))
+        if one is None:
+            continue
+        for name in names:
+            if store.is_root_of(name, Path(place)):
+                store.set_root(Path(place), one.digest)
+                found.append(f"root {name}")
+    return found
+
+
+def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
+    """Write the manifest at a root's path anew where it is damaged; return its digest. What lay there goes to quarantine."""
+    path = Path(root["path"]) / manifest_of.NAME
+    if root["kind"] == PUSHED or not path.is_file() or _find(root) is not None:
+        return []
+    try:
+        content = store.read(root["manifest"])
+    except MissingError:
+        return []
+    store.write_file(store.root / "quarantine" / f"{path.name}.{time.time_ns()}", path.read_bytes())
+    with directory_of.changing(store, path.parent), directory_of.writing(path.parent):
+        write_whole(str(path), content, str(path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.draft")))
+    return [root["manifest"]]
 
 
 def link(path: Path) -> int:
@@ -102,6 +140,7 @@ def link(path: Path) -> int:
                 stale.append((name, digest))
         directory_of.refuse_links(directory, [name for name, _ in stale])
         with directory_of.writing(directory):
+            directory_of.sweep(directory)
             for name, digest in stale:
                 directory_of.place(store, digest, directory / name, copy=manifest.recorded)
         store.put(found.content)
@@ -136,10 +175,12 @@ def status_text(value: dict[str, Any]) -> str:
 
 def _find(root: dict[str, Any]) -> manifest_of.Found | None:
     """Return the manifest at a root's path, None if there is no sound one."""
-    if root["kind"] == PUSHED:
-        return None
+    return None if root["kind"] == PUSHED else _sound(Path(root["path"]))
+
+
+def _sound(directory: Path) -> manifest_of.Found | None:
     try:
-        found = manifest_of.find(root["path"])
+        found = manifest_of.find(directory)
         found.manifest  # noqa: B018  (is it sound?)
     except TacpipeError:
         return None

@@ -157,6 +157,20 @@ def test_nothing_is_removed_while_a_root_is_damaged(lab: Lab) -> None:
     assert collected(lab)["objects"] == 0
 
 
+def test_a_recording_whose_record_was_damaged_is_kept_though_nothing_names_it(lab: Lab) -> None:
+    Path("src").mkdir()
+    Path("src/a.txt").write_text("1 2 3")
+    lab.run("ingest numbers src -o data/r")
+    (name,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
+    Path("src/a.txt").write_text("4 5 6")
+    lab.run("ingest numbers src -o data/r")
+    (record,) = (path for path in lab.store.root.glob("records/*/*") if name in path.read_text())
+    record.write_text(record.read_text().replace("irreplaceable", "irreplaceablf"))
+    age(lab)
+    collected(lab)
+    assert lab.store.has(name) and not record.exists()
+
+
 def test_what_was_pushed_to_a_store_stays_until_it_is_forgotten(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
@@ -257,6 +271,15 @@ def test_whatever_happens_in_whatever_order_no_dataset_at_a_path_loses_anything(
         for path in Path("data").glob("*/manifest.json"):
             for _, name in lab.manifest(str(path.parent)).objects():
                 lab.store.read(name)
+
+
+def test_leases_of_killed_processes_are_swept_up_and_those_of_others_stay(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    leases = lab.store.root / "leases"
+    (leases / f"{'ab' * 32}.lock").touch()
+    with lab.store.leases.hold("cd" * 32):
+        collected(lab)
+        assert [path.name[:2] for path in leases.iterdir()] == ["cd"]
 
 
 def test_two_collections_do_not_run_at_once(lab: Lab) -> None:

@@ -64,9 +64,10 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     with directory.changing(store, output):
         before = existing(output)
         there = {} if before is None else before.recordings
-        for name, other in there.items():
-            if other["shards"] == shards:
-                return name  # a crash came between this and the spool's end
+        known = next((name for name, other in there.items() if other["shards"] == shards), None)
+        if before is not None and known is not None:  # a crash came between this and the spool's end
+            directory.publish_alone(store, before, output, damaged=True)
+            return known
         name = _free(spooled.header["recording"], there)
         now = before or Manifest(ACQUIRE, VERSION)
         now = replace(
@@ -76,7 +77,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
         store.put(now.content, durable=True)
-        directory.publish_alone(store, now, output)
+        directory.publish_alone(store, now, output, damaged=True)
     return name
 
 

@@ -14,6 +14,7 @@ can be read of it, and the next mark begins anew.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import mmap
@@ -30,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.errors import TacpipeError
-from tacpipe.files import readable_errors, sync_folder, write_whole
+from tacpipe.files import listed, readable_errors, sync_folder, write_whole
 from tacpipe.sensors.framing import Chunks
 
 FOLDER = "spool"  # within the store
@@ -164,10 +165,10 @@ class Spooled:
         self.folder = folder
         try:
             self.header: dict[str, Any] = json.loads((folder / "header.json").read_bytes())
-            self.streams: list[str] = self.header["streams"]
+            self.streams: list[str] = [str(name) for name in self.header["streams"]]
         except FileNotFoundError:
             raise TacpipeError(f"The spool {folder} has no header: its process ended before it recorded.") from None
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, LookupError, TypeError, RecursionError, OverflowError) as error:
             raise TacpipeError(
                 f"The spool {folder} has no readable header ({error}): its recording ended before it began. "
                 f"Remove the folder."
@@ -200,7 +201,11 @@ class Spooled:
                 _, _, kind, number, _, count, size = HEAD.unpack_from(content, place)
                 if (wanted is None or number == wanted) and number < len(self.streams):
                     body = content[place + HEAD.size : place + HEAD.size + size]
-                    yield self.streams[number], _body(kind, self.streams[number], count, body)
+                    told = _body(kind, self.streams[number], count, body)
+                    if told is None:
+                        self._damaged(place, stop - place)
+                    else:
+                        yield self.streams[number], told
                 place = stop
 
     def _damaged(self, offset: int, size: int) -> None:
@@ -215,7 +220,7 @@ class Spooled:
         try:
             content = (self.folder / "tally").read_bytes()
             return {name: Tallied(*TALLY.unpack_from(content, n * TALLY.size)) for n, name in enumerate(self.streams)}
-        except (OSError, struct.error):
+        except (FileNotFoundError, struct.error):  # one that cannot be read now is no reason to forget what was lost
             return {}
 
     def utc_ns(self, t_ns: Any) -> Any:
@@ -231,15 +236,21 @@ class Spooled:
 def abandoned(store: Path) -> list[Path]:
     """Return the folders of spools that no process writes or seals any more, oldest first."""
     found = []
-    for folder in (store / FOLDER).glob("*"):
-        with claimed(folder) as ours:
-            if not ours:
-                continue
-            age_s = time.time() - (folder / "bytes").stat().st_mtime
-            if (folder / "header.json").exists():
-                found.append((-age_s, folder))
-            elif age_s > YOUNG_S:  # its process ended before it recorded
-                _remove(folder)
+    for folder in listed(store / FOLDER):
+        try:
+            with claimed(folder) as ours:
+                age_s = time.time() - (folder / "bytes" if ours else folder).stat().st_mtime
+                if ours and (folder / "header.json").exists():
+                    found.append((-age_s, folder))
+                elif ours and age_s > YOUNG_S:  # its process ended before it recorded, or after it was sealed
+                    _remove(folder)
+            if not ours and age_s > YOUNG_S:
+                folder.rmdir()  # fails for one that holds anything
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            if error.errno != errno.ENOTEMPTY:
+                found.append((0.0, folder))  # who tries to seal it tells what is wrong with it
     return [folder for _, folder in sorted(found)]
 
 
@@ -248,7 +259,7 @@ def claimed(folder: Path) -> Iterator[bool]:
     """Hold a spool while in the block; yield False if it is gone, or if a process writes or seals it."""
     try:
         handle = os.open(folder / "bytes", os.O_RDONLY)
-    except OSError:
+    except FileNotFoundError:
         yield False
         return
     try:
@@ -263,7 +274,7 @@ def claimed(folder: Path) -> Iterator[bool]:
 
 
 def _remove(folder: Path) -> None:
-    for name in ("bytes", "tally", "header.json", ".header.json"):
+    for name in ("header.json", ".header.json", "tally", "bytes"):  # without a header it is sealed no second time
         with contextlib.suppress(FileNotFoundError):
             (folder / name).unlink()
     with contextlib.suppress(OSError):
@@ -298,10 +309,16 @@ def _end(content: mmap.mmap, place: int) -> int | None:
         return stop if zlib.crc32(covered) == check else None
 
 
-def _body(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note:
-    if kind == NOTE:
-        told = json.loads(body)
-        return Note(told["t_ns"], stream, told["what"], told["detail"])
-    stamps = np.frombuffer(body, "<i8", count)
-    sizes = np.frombuffer(body, "<u4", count, 8 * count)
-    return Chunks(stamps.astype(np.int64), sizes.astype(np.int64), body[12 * count :])
+def _body(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | None:
+    """Return what a block holds, None where its sum is right and it is still none: another program wrote it."""
+    try:
+        if kind == NOTE:
+            told = json.loads(body)
+            return Note(int(told["t_ns"]), stream, str(told["what"]), str(told["detail"]))
+        stamps = np.frombuffer(body, "<i8", count)
+        sizes = np.frombuffer(body, "<u4", count, 8 * count).astype(np.int64)
+    except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
+        return None
+    if kind != CHUNKS or not count or int(sizes.sum()) != len(body) - 12 * count:
+        return None
+    return Chunks(stamps.astype(np.int64), sizes, body[12 * count :])

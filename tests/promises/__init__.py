@@ -1,1 +1,1 @@
-"""Tests of what a lab is promised: faults, kills, crowds, corruption, hostile input; the slow ones carry the mark ``faults``."""
+"""Tests of what a lab is promised: faults, kills, crowds, corruption, hostile input; slow ones carry the mark ``faults``."""

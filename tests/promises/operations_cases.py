@@ -1,0 +1,200 @@
+"""Every stage and every command that touches a store, on data so small that a run takes milliseconds."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from tacpipe.hashing import bytes_digest
+
+
+def _nothing(lab: Path) -> None:
+    """Leave the lab as it is."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command to be tried, and what must have happened before it."""
+
+    name: str
+    command: str
+    before: tuple[str, ...] = ()
+    sources: Callable[[Path], None] = _nothing  # writes what the commands before it read
+    spoil: Callable[[Path], None] = _nothing  # happens right before it
+    outputs: tuple[str, ...] = field(default=())  # where it writes besides the store; by default behind -o
+    durable: bool = False  # what it was given cannot be made again: once it has ended it outlasts a loss of power
+    sound: bool = True  # whether the store is before it
+
+    @property
+    def written(self) -> tuple[str, ...]:
+        """Where the command writes besides the store."""
+        words = self.command.split()
+        return self.outputs or tuple(after for word, after in pairwise(words) if word == "-o")
+
+
+# ---- a plug-in's stages
+
+NUMBERS = "ingest numbers src -o data/i"
+TOY = (
+    "simulate toy --trials 2 --rows 4 -o data/r",
+    "scale data/r -o data/s",
+    "halves data/s -o data/split",
+    "centre data/s --split data/split -o data/c",
+    "total data/c -o data/t",
+)
+
+
+def _numbers(lab: Path) -> None:
+    (lab / "src").mkdir()
+    (lab / "src/a.txt").write_text("1 2 3")
+    (lab / "src/b.txt").write_text("4 5 6")
+
+
+def _damage(lab: Path) -> None:
+    """Damage a shard in the store and beside its manifest, and remove another one from the store."""
+    first, second = sorted((lab / "data/s").glob("*.parquet"))
+    for path in (first, second):
+        stored = lab / ".tacpipe/objects" / bytes_digest(path.read_bytes())[:2] / bytes_digest(path.read_bytes())
+        path.unlink()
+        stored.chmod(0o644)
+        if path == first:
+            stored.write_bytes(stored.read_bytes()[:-1] + b"x")
+        else:
+            stored.unlink()
+
+
+def _unlink(lab: Path) -> None:
+    """Remove a shard beside its manifest and spoil another one."""
+    first, second = sorted((lab / "data/s").glob("*.parquet"))
+    for path in (first, second):
+        path.unlink()
+    second.write_bytes(b"something else")
+
+
+def _leave(lab: Path) -> None:
+    """Leave something for gc: an output whose folder is gone, and a draft of long ago."""
+    for path in (lab / "data/t").iterdir():
+        path.unlink()
+    (lab / "data/t").rmdir()
+    (lab / ".tacpipe/tmp/0123456789abcdef").write_bytes(b"left")
+
+
+def _forget(lab: Path) -> None:
+    """Remove the project's store and a dataset: what was pushed is all there is."""
+    shutil.rmtree(lab / ".tacpipe")
+    (lab / ".tacpipe").mkdir()
+    shutil.rmtree(lab / "data/s")
+
+
+def _spool(lab: Path) -> None:
+    """Leave the spool of a recording that was killed."""
+    from tests.conftest import Lab, Ran
+    from tests.recording.test_recovering import spooled
+
+    spooled(Lab(lab, lambda command: Ran(0, "", "")), unread=3, count=20)
+
+
+PUSH = "store push remote data/s data/split"
+TOYS = (
+    Case("ingest.numbers", NUMBERS, sources=_numbers, durable=True),
+    *(Case(name, TOY[n], TOY[:n]) for n, name in enumerate(("simulate.toy", "scale", "halves", "centre", "total"))),
+    Case("named", "named data/r -o data/n", TOY[:1]),
+    Case("label", "label data/r trial-000 --set material=foam", TOY[:1], outputs=("data/r",), durable=True),
+    Case("store status", "store status", TOY[:2]),
+    Case("store verify", "store verify", TOY[:2]),
+    Case("store repair", "store repair", TOY[:2], spoil=_damage, sound=False),
+    Case("store gc", "store gc --grace-days 0", TOY, spoil=_leave),
+    Case("store link", "store link data/s", TOY[:2], spoil=_unlink, outputs=("data/s",)),
+    Case("store push", PUSH, TOY[:3], outputs=("remote",), durable=True),
+    Case("store pull", "store pull remote data/s", (*TOY[:3], PUSH), spoil=_forget, outputs=("data/s",)),
+    Case("acquire", "acquire --recover --json", spoil=_spool, outputs=("rec",), durable=True),
+)
+
+# ---- the stages of this project
+
+FORWARD = (
+    "simulate forward --trials 4 --duration-s 4 --robot-rate-hz 200 -o data/r",
+    "synchronize data/r -o data/synced",
+    "segment contacts data/synced -o data/c",
+    "split data/c -o data/split --scheme random --val 0.25 --test 0.25",
+    "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 2 --batch 64 "
+    "--context 3 --horizon 2",
+    "evaluate models/f data/c --split data/split -o results/f",
+)
+MATERIAL = (
+    "simulate material --jobs 1 --trials 16 --materials 2 --arm-every 2 -o data/r",
+    "segment slides --jobs 1 data/r -o data/s --frames 60",
+    "split data/s -o data/split --scheme random --stratify sensor,material --val 0.25 --test 0.25",
+    "train material data/s --split data/split -o models/m --architecture raec --hidden 4 --latents 3 --epochs 2",
+)
+TOUCH = (
+    "simulate touch --trials 6 --objects 1 --raw --families box,sphere -o data/r",
+    "segment grasps data/r -o data/g",
+    "split data/g -o data/split --scheme random --val 0.2 --test 0.2",
+    "train touch data/g --split data/split -o models/t --architecture patches --networks 1 --epochs 2 --points 16 "
+    "--hidden 8",
+)
+
+
+CHAINS = {
+    "forward": FORWARD,
+    "material": MATERIAL,
+    "touch": TOUCH,
+    **{  # what works recording by recording needs no more than two to show all that it does with files
+        f"two {name}": (re.sub(r"--trials \d+", "--trials 2", first), *rest)
+        for name, (first, *rest) in {"forward": FORWARD, "material": MATERIAL, "touch": TOUCH}.items()
+    },
+}
+
+
+def _of(chain: str, names: dict[int, str]) -> list[Case]:
+    """Return cases of a chain's commands, by their numbers."""
+    return [Case(name, CHAINS[chain][number], CHAINS[chain][:number]) for number, name in names.items()]
+
+
+def _ingest(name: str) -> Case:
+    return Case(
+        f"ingest.{name}", f"ingest {name} src -o data/r", sources=lambda lab: _publish(name, lab / "src"), durable=True
+    )
+
+
+def _publish(name: str, place: Path) -> None:
+    """Write recordings in a published format."""
+    from tests.formats import grasp_files, slide_files, xela_files
+
+    if name == "biotac-slide":
+        slide_files.write_biotac(place, arm=False)
+    elif name == "roboskin":
+        slide_files.write_roboskin(place, slide_files.felt(2))
+    elif name == "vision2tactile":
+        grasp_files.write_grasp(place)
+    elif name == "xela-flat":
+        xela_files.write_flat(place / "data_sample_2021-11-24-15-19-34")
+    else:
+        xela_files.write_psc(place / "data_sample_2022-02-21-09-58-49")
+
+
+STAGES = (
+    *_of("two forward", {0: "simulate.forward", 1: "synchronize", 2: "segment.contacts"}),
+    *_of("forward", {3: "split", 4: "train.forward", 5: "evaluate"}),
+    *_of("two material", {0: "simulate.material", 1: "segment.slides"}),
+    *_of("material", {3: "train.material"}),
+    *_of("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
+    *_of("touch", {3: "train.touch"}),
+    Case("segment.slips", "segment slips data/c -o data/slips", CHAINS["two forward"][:3]),
+    Case("compress.pca", "compress pca data/c --split data/split -o data/z --components 2", FORWARD[:4]),
+    Case(
+        "compress.autoencoder",
+        "compress autoencoder data/c --split data/split -o data/z --epochs 1 --components 2 --hidden 4",
+        FORWARD[:4],
+    ),
+    Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
+    Case("report", "report results/f -o report.html", FORWARD),
+    *(_ingest(name) for name in ("biotac-slide", "roboskin", "vision2tactile", "xela-flat", "xela-psc")),
+)
+CASES = {case.name: case for case in (*TOYS, *STAGES)}
+assert len(CASES) == len(TOYS) + len(STAGES)

@@ -1,0 +1,254 @@
+"""One command tried with every fault at every call of the file system.
+
+    python -m tests.promises.operations_trials FOLDER CASE... [--every 7]
+
+prints a JSON line for each case: how many operations failed, and which promises did not hold. It is a process of its
+own because it changes what ``open`` and the like are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import shlex
+import signal
+import sys
+import traceback
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tacpipe import cli, execution, hashing, upkeep
+from tacpipe.errors import DAMAGED
+from tacpipe.store import Store
+from tests.promises.operations import Call, Shim
+from tests.promises.operations_cases import CASES, Case
+from tests.promises.operations_power import Disk
+from tests.promises.operations_replay import Replay
+from tests.promises.operations_survey import Killer, Left, Survey
+from tests.promises.operations_tree import Place, State
+
+CODES = (0, 1, 2, 3, 4, 5, 6, 130)
+LIMIT_S = 60  # for one trial, which takes a second at most
+DEATHS = 4  # how many kills of each command happen in earnest, about
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a command printed, and how it ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+@dataclass
+class Tried:
+    """What became of all trials of a case."""
+
+    case: str
+    calls: int = 0
+    failed: int = 0
+    states: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+def main() -> None:
+    """Try the cases that are named."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("cases", nargs="+")
+    parser.add_argument("--every", type=int, default=1, help="try every so many-th call alone")
+    given = parser.parse_args()
+    os.environ.pop("TACPIPE_STORE", None)
+    os.environ["TACPIPE_LOCK_TIMEOUT_S"] = "10"
+    hashing.SETTLED_NS = 0  # calls must not depend on what time it is
+    os.fsync = os.fdatasync = lambda handle: None  # type: ignore[assignment]  # nobody takes the power away here
+    for name in given.cases:
+        lab = given.folder.absolute() / name.replace(" ", "-")
+        print(json.dumps(asdict(Trials(CASES[name], lab).run(given.every))), flush=True)
+
+
+class Trials:
+    """The trials of one case, in an empty folder."""
+
+    def __init__(self, case: Case, lab: Path) -> None:
+        self.case, self.lab = case, lab
+        self.tried = Tried(case.name)
+        self._proven: dict[tuple[str, str], list[str]] = {}
+        (lab / ".tacpipe").mkdir(parents=True)
+        os.chdir(lab)
+        case.sources(lab)
+        for command in case.before:
+            _succeed(command)
+        case.spoil(lab)
+        replay = Replay()
+        replay.install()
+        self.place = Place(lab)
+        self.before = self._shown(self.place.before)
+        _succeed(case.command)
+        replay.listening = False
+        self.shown, self.kept = self._shown(self.place.look()), self._kept()
+
+    def run(self, every: int) -> Tried:
+        """Try every fault at every call (or every so many-th), and a loss of power at the end."""
+        self.place.restore()
+        survey = Survey(Disk.of(self.lab, self.place.before), every)
+        with Shim(self.lab, watch=survey) as shim:
+            ran = call(self.case.command)
+        assert ran.code == 0, f"{self.case.command}: {ran.err}"
+        problems = _differences("the folder", _plain(survey.disk.killed()), _plain(self.place.look()))
+        assert not problems, f"a change was not seen: {problems}"
+        survey.end()
+        self.tried.calls = len(shim.calls)
+        self._die(survey)
+        for left in survey.left:
+            self._judge(left, [])
+        for number in range(1, len(shim.calls) + 1, every):
+            for fault in shim.calls[number - 1].errors:
+                self._fail(number, shim.calls[number - 1], fault)
+        self.tried.states = len(self._proven)
+        return self.tried
+
+    def _fail(self, number: int, wanted: Call, fault: str) -> None:
+        """Run the command with one call failing."""
+        self.place.restore()
+        with Shim(self.lab, at=number, fault=fault) as shim:
+            ran = call(self.case.command)
+        met = shim.calls[number - 1] if len(shim.calls) >= number else Call("none", "")
+        assert met.name == wanted.name, f"call {number} is {met} now, and was {wanted}"
+        told = f"{fault} at call {number}, {met.name} {met.path.removeprefix(f'{self.lab}/')}"
+        self._judge(Left(self.place.look(), told, "failed" if ran.code else "done"), _wrong(ran))
+
+    def _die(self, survey: Survey) -> None:
+        """Kill the command in earnest at some calls, and see that this leaves what the survey says."""
+        numbers = sorted(survey.kills)
+        for number in numbers[:: max(1, len(numbers) // DEATHS)]:
+            self.place.restore()
+            child = os.fork()
+            if child == 0:
+                with Shim(self.lab, watch=Killer(number)):
+                    call(self.case.command)
+                os._exit(0)
+            _, status = os.waitpid(child, 0)
+            assert os.WIFSIGNALED(status), f"call {number} was not reached"
+            told = [state.told(self.place.before) for state in (self.place.look(), survey.kills[number])]
+            assert told[0] == told[1], f"a kill at call {number} leaves something else than the calls before it made"
+
+    def _judge(self, left: Left, problems: list[str]) -> None:
+        self.tried.failed += 1
+        key = left.state.told(self.place.before), left.ended
+        if key not in self._proven:
+            self._proven[key] = self._disproved(left)
+        self.tried.problems += [f"{left.fault}: {problem}" for problem in [*problems, *self._proven[key]]]
+
+    def _disproved(self, left: Left) -> list[str]:
+        """Return which promises do not hold for what a fault left behind."""
+        store, problems = Store(self.lab / ".tacpipe"), []
+        shown = self._shown(left.state)
+        wanted = {path: content for path, content in self.before.items() if not self._ours(path)}
+        problems += [f"the input {path} changed" for path, was in wanted.items() if shown.get(path) != was]
+        if not left.dark:
+            known = {path: (self.before.get(path), self.shown.get(path)) for path in shown if not _draft(path)}
+            problems += [f"{path} is half written" for path, either in known.items() if shown[path] not in either]
+        if left.ended == "done" or (left.ended == "done, dark" and self.case.durable):
+            problems += _differences("what was reported as done", self.shown, shown)
+        self.place.put(left.state)
+        if self.case.sound and (not left.dark or (left.ended.startswith("done") and self.case.durable)):
+            problems += _unsound("the store", store)
+        again = call(self.case.command)
+        if again.code:
+            return [*problems, f"the rerun ended with {again.code}: {again.err[-900:]}"]
+        problems += _differences("the output of the rerun", self.shown, self._shown(self.place.look()))
+        problems += _unsound("the store after the rerun", store)
+        return problems + _differences("the store after the rerun", self.kept, self._kept())
+
+    # ---- what there is to see
+
+    def _ours(self, path: str) -> bool:
+        return any(path == output or path.startswith(f"{output}/") for output in self.case.written)
+
+    def _shown(self, state: State) -> dict[str, bytes]:
+        """Return every file outside of stores by path."""
+        stores = (".tacpipe/", "remote/")
+        return {path: file.content for path, file in state.files.items() if not path.startswith(stores)}
+
+    def _kept(self) -> dict[str, Any]:
+        """Return all that the stores know, apart from where and when it was made."""
+        known: dict[str, Any] = {}
+        for root in (self.lab / ".tacpipe", self.lab / "remote"):
+            if not root.exists():
+                continue
+            store = Store(root)
+            known |= {f"{root.name} object {path.name}": True for path in root.glob("objects/*/*")}
+            known |= {f"{root.name} record {key}": record["result"] for key, record in store.records()}
+            known |= {f"{root.name} root {found['path']}": found["manifest"] for found in store.roots()}
+            known |= {f"{root.name} spool {path.parent.name}": True for path in root.glob("spool/*/header.json")}
+            checkpoints = (path.name for path in root.glob("checkpoints/*"))  # gc removes those of keys that are made
+            known |= {f"{root.name} checkpoint {key}": True for key in checkpoints if store.record(key) is None}
+        return known
+
+
+def call(command: str) -> Ran:
+    """Run a command as the program does."""
+    hashing._remembered.clear()  # as in a new process
+    execution._known.clear()
+    out, err = io.StringIO(), io.StringIO()
+    sys.argv = ["tacpipe", *shlex.split(command)]
+    signal.alarm(LIMIT_S)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = cli.answer(sys.argv[1:])
+        except BaseException as error:
+            ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "/promises/" not in frame.filename]
+            places = [f"{Path(frame.filename).name}:{frame.lineno} {frame.name}" for frame in ours]
+            print(f"Traceback: {type(error).__name__}: {error}, by {', '.join(places[-4:])}", file=err)
+            code = 1
+    signal.alarm(0)
+    return Ran(code, out.getvalue(), err.getvalue())
+
+
+def _succeed(command: str) -> None:
+    ran = call(command)
+    assert ran.code == 0, f"{command}: {ran.err}"
+
+
+def _wrong(ran: Ran) -> list[str]:
+    """Return what is wrong with how a command ended."""
+    sentences = [line for line in ran.err.splitlines() if line.startswith("tacpipe: ")]
+    if ran.code not in CODES or "Traceback" in ran.err:
+        return [f"ended with {ran.code}: {ran.err[-900:]}"]
+    if ran.code == DAMAGED and ran.out:
+        return []  # the findings of `store verify` and `store repair` are what these commands print
+    if ran.code and len(sentences) != 1:
+        return [f"ended with {ran.code} and {len(sentences)} sentences: {ran.err[-900:]}"]
+    return []
+
+
+def _unsound(where: str, store: Store) -> list[str]:
+    found = upkeep.verify(store)
+    return [] if found.clean else [f"{where} is damaged: {found.to_text()}"]
+
+
+def _draft(path: str) -> bool:
+    return path.rpartition("/")[2].startswith(".")
+
+
+def _plain(state: State) -> dict[str, Any]:
+    return {**{path: file.content for path, file in state.files.items()}, **dict.fromkeys(state.folders)}
+
+
+def _differences(where: str, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    lost = sorted(set(wanted) - set(found))
+    more = sorted(set(found) - set(wanted))
+    other = sorted(name for name in set(wanted) & set(found) if wanted[name] != found[name])
+    told = (("lacks", lost), ("has besides", more), ("has other content in", other))
+    return [f"{where} {what} {', '.join(names[:3])}" for what, names in told if names]
+
+
+if __name__ == "__main__":
+    main()

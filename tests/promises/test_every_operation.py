@@ -1,0 +1,128 @@
+"""Every operation fails once: each call of the file system, of every command, in every way that a disk knows.
+
+After each fault the command has ended with a sentence and a documented code, or as if nothing were; the store is sound,
+inputs are untouched, nothing is half written where somebody reads; and running the command again gives, byte for byte,
+what a clean run gives. The same holds for a kill before each call and amid each write, and for a loss of power.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from tacpipe import registry, store_command, upkeep
+from tests.conftest import Lab
+from tests.promises.counts import count
+from tests.promises.operations import Call, Shim
+from tests.promises.operations_cases import CASES, STAGES, TOYS
+from tests.test_garbage import age
+
+MEMORY = Path("/dev/shm")  # where thousands of folders come and go in no time
+PROJECT = Path(__file__).parents[2]
+QUICK = (TOYS[:5], TOYS[5:11], TOYS[11:])
+
+
+def tried(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dict[str, Any]]:
+    """Return what trials of cases tell, made in a process whose threads are few enough to be forked."""
+    call = ["-m", "tests.promises.operations_trials"] if not script else ["-c", script]
+    path = os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")])
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else folder) as place:
+        done = subprocess.run(
+            [sys.executable, *call, place, *words],
+            cwd=PROJECT,
+            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    for one in found:
+        count("operations failed", one["failed"])
+    return found
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("name", CASES)
+def test_whatever_fails_nothing_is_torn_and_the_rerun_equals_a_clean_run(
+    name: str, plugin: Path, tmp_path: Path
+) -> None:
+    (one,) = tried(plugin, tmp_path, name)
+    assert one["failed"] > one["calls"] > 0
+    assert one["problems"] == []
+
+
+@pytest.mark.parametrize("cases", QUICK, ids=lambda cases: cases[0].name)
+def test_whatever_fails_of_small_commands_nothing_is_torn(cases: Any, plugin: Path, tmp_path: Path) -> None:
+    found = tried(plugin, tmp_path, *(case.name for case in cases), "--every", "29")
+    assert {one["case"]: one["problems"] for one in found} == {case.name: [] for case in cases}
+
+
+BREAKS = {
+    "a file is written in its place": (
+        "def write(path, content, draft, *, mode=0o666, exclusive=False):\n"
+        "    Path(path).parent.mkdir(parents=True, exist_ok=True)\n"
+        "    return bool(Path(path).write_bytes(content))\n"
+        "store.write_whole = directory.write_whole = write\n"
+    ),
+    "nothing is synced": (
+        "class System:\n"
+        "    __getattr__ = lambda self, name: (lambda handle: None) if name == 'fsync' else getattr(os, name)\n"
+        "files.os = System()\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("broken", BREAKS)
+def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tmp_path: Path) -> None:
+    script = (
+        "import os; from pathlib import Path; from tacpipe import directory, files, store\n"
+        f"{BREAKS[broken]}"
+        "from tests.promises import operations_trials; operations_trials.main()"
+    )
+    (one,) = tried(plugin, tmp_path, "ingest.numbers", "--every", "29", script=script)
+    assert one["problems"]
+
+
+def test_a_rerun_changes_nothing_on_the_disk_and_so_needs_none_that_can_be_written(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    with Shim(lab.folder) as shim:
+        lab.run("scale data/r -o data/s")
+    assert shim.calls
+    assert [call for call in shim.calls if call.changes] == []
+
+
+@pytest.mark.parametrize("folder", ["roots", "records", "leases"])
+def test_garbage_is_not_collected_where_a_folder_cannot_be_listed(lab: Lab, folder: str) -> None:
+    lab.run("simulate toy --trials 2 -o data/r")
+    lab.run("scale data/r -o data/s")
+    age(lab)
+    with Shim(lab.folder) as shim:
+        lab.run("store gc")
+    there = sorted(lab.store.root.glob("objects/*/*"))
+    number = 1 + shim.calls.index(Call("scandir", str(lab.store.root / folder)))
+    with Shim(lab.folder, at=number, fault="EACCES"):
+        ran = lab.call("store gc")
+    assert ran.code == 1 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1
+    assert sorted(lab.store.root.glob("objects/*/*")) == there
+    assert upkeep.verify(lab.store).clean
+
+
+def test_no_stage_and_no_command_of_the_store_is_left_out() -> None:
+    stages = {name for name, target in registry.stages().items() if not target.startswith("toy_")}
+    program = typer.Typer()
+    store_command.add(program, "")
+    (group,) = program.registered_groups
+    assert group.typer_instance is not None
+    commands = {f"store {command.name}" for command in group.typer_instance.registered_commands}
+    assert stages == {case.name for case in STAGES}
+    assert commands == {case.name for case in TOYS if case.name.startswith("store ")}
