@@ -27,13 +27,9 @@ class Params:
 @stage(version=2)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Judge a model on recordings, by the measures of the task it was trained for."""
-    import json
+    from tacpipe import model_files
 
-    from tacpipe import registry
-    from tacpipe.errors import TacpipeError
-
-    if "config.json" not in model.files:
-        raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train`.")
-    task = registry.load_task(json.loads(model.files["config.json"])["task"])
-    result: Result = task.evaluate(model.files, recordings)
+    task = model_files.task(model.files)
+    with model_files.believed("the model"):
+        result: Result = task.evaluate(model.files, recordings)
     return result

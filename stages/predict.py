@@ -25,19 +25,15 @@ class Params:
 @stage(version=1)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     """Write what a model expects of each recording, with the time at which it was known."""
-    import json
+    from tacpipe import model_files
 
-    from tacpipe import registry
-    from tacpipe.errors import TacpipeError
-
-    if "config.json" not in model.files:
-        raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train`.")
     try:
         steps = sorted({int(step) for step in params.steps.split(",")})
     except ValueError:
         raise UsageError(
             f"steps is {params.steps!r}; it must be whole numbers with commas between, like 1,5,10."
         ) from None
-    task = registry.load_task(json.loads(model.files["config.json"])["task"])
-    result: Result = task.predict(model.files, recordings, steps)
+    task = model_files.task(model.files)
+    with model_files.believed("the model"):
+        result: Result = task.predict(model.files, recordings, steps)
     return result

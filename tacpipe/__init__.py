@@ -24,12 +24,7 @@ def load(path: Any) -> Any:
 
     Raises `UsageError` if ``path`` holds no model.
     """
-    import json
-
-    from tacpipe import registry
-    from tacpipe.errors import UsageError
+    from tacpipe import model_files
 
     files = open(path).files
-    if "config.json" not in files:
-        raise UsageError(f"{path} is no model: it has no config.json. Give what `tacpipe train` wrote with -o.")
-    return registry.load_task(json.loads(files["config.json"])["task"]).load(files)
+    return model_files.task(files, str(path)).load(files)

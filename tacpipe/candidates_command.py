@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tacpipe.errors import UsageError
+from tacpipe.excerpt import plain
 
 if TYPE_CHECKING:
     from tacpipe.clouds.candidates import Candidate
@@ -115,12 +116,13 @@ def _some(names: list[str]) -> str:
 def _touch_model(path: Path) -> Any:
     """Return the model of touch at ``path``. Raises `UsageError` if it is one of another task."""
     import tacpipe
+    from tacpipe import model_files
 
     files = tacpipe.open(path).files
-    task = json.loads(files["config.json"]).get("task") if "config.json" in files else None
+    task = model_files.tree(files, model_files.CONFIG).get("task") if model_files.CONFIG in files else None
     if task is not None and task != "touch":
         raise UsageError(
-            f"{path} is a model of task {task}; what a grasp would feel is foretold by one of task touch. "
+            f"{path} is a model of task {plain(str(task))}; what a grasp would feel is foretold by one of task touch. "
             f"`tacpipe train touch` makes one."
         )
     return tacpipe.load(path)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
+import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from tacpipe.errors import UsageError
+from tacpipe import regular, yaml_text
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.excerpt import excerpt, listed, plain
 from tacpipe.stage import Stage
 
 PRESETS = ("paper", "quick")
@@ -66,11 +69,12 @@ def check(stage: Stage, key: str, value: Any, where: str) -> Any:
 
 def _checked(known: Mapping[str, Any], key: str, value: Any, where: str, noun: str) -> Any:
     if key not in known:
-        raise UsageError(f"{where}: there is no {noun} {key}; there are {', '.join(known) or 'none'}.")
+        told = plain(key) if isinstance(key, str) else excerpt(key)
+        raise UsageError(f"{where}: there is no {noun} {told}; there are {', '.join(known) or 'none'}.")
     wanted = known[key]
     fitted = _fit(value, wanted, f"{where}, {key}")
     if fitted is _NO:
-        raise UsageError(f"{where}: {key} is {value!r}, which is no {_name(wanted)}.")
+        raise UsageError(f"{where}: {key} is {excerpt(value)}, which is no {_name(wanted)}.")
     return fitted
 
 
@@ -116,6 +120,7 @@ def comments(stage: Stage) -> dict[str, str]:
 
 
 _NO = object()
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # YAML 1.1 takes 1e-3 for text, and nobody else does
 
 
 def _fit(value: Any, wanted: Any, where: str) -> Any:
@@ -123,8 +128,8 @@ def _fit(value: Any, wanted: Any, where: str) -> Any:
     origin = get_origin(wanted)
     if origin in (typing.Union, types.UnionType):
         return next((fit for kind in get_args(wanted) if (fit := _fit(value, kind, where)) is not _NO), _NO)
-    if origin is typing.Literal:
-        return value if value in get_args(wanted) else _NO
+    if origin is typing.Literal:  # 1, 1.0 and True are equal, and three values in a key
+        return next((one for one in get_args(wanted) if one == value and type(one) is type(value)), _NO)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             return _NO
@@ -134,12 +139,25 @@ def _fit(value: Any, wanted: Any, where: str) -> Any:
         if isinstance(value, Mapping):
             return filled(typing.cast(type, wanted), value, where, "key")
         return value if isinstance(value, typing.cast(type, wanted)) else _NO
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+    if wanted is float and isinstance(value, str) and _EXPONENT.fullmatch(value):
+        value = float(value)
+    if wanted is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value) + 0.0 if abs(value) <= sys.float_info.max else _NO  # NaN is none; -0.0 becomes 0.0
+    if wanted is str and isinstance(value, str) and not _encodes(value):
+        return _NO
     if wanted is type(None):
         return value if value is None else _NO
     right = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
     return value if right else _NO
+
+
+def _encodes(text: str) -> bool:
+    """Return whether text is Unicode: of other bytes on the command line halves of characters are made."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _name(wanted: Any) -> str:
@@ -157,33 +175,33 @@ def _name(wanted: Any) -> str:
 
 
 def _parse(text: str) -> Any:
-    import yaml
-
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
+        return yaml_text.load(text)
+    except ValueError:
         return text
 
 
 def _from_file(path: Path, block: str, *, required: bool) -> dict[str, Any]:
-    import yaml
-
     try:
-        found = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
+        found = yaml_text.load(regular.content(path)) or {}
     except FileNotFoundError:
         raise UsageError(f"There is no file {path} to read params from.") from None
-    except yaml.YAMLError as error:
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except TacpipeError as error:
+        raise UsageError(str(error)) from error
+    except ValueError as error:
         raise UsageError(f"{path} cannot be read: {error}.") from error
     for part in block.split("."):
         if not isinstance(found, dict):
-            raise UsageError(f"{path}: {part} of block {block} stands in {found!r}, which is no mapping.")
+            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is no mapping.")
         if part not in found:
             if required:
-                raise UsageError(f"{path} has no block {block}; at {part} there are {', '.join(map(str, found))}.")
+                raise UsageError(f"{path} has no block {block}; at {part} there are {listed(found)}.")
             return {}
         found = found[part]
     if not isinstance(found, dict):
-        raise UsageError(f"{path}: block {block} is {found!r}; it should be a mapping of params.")
+        raise UsageError(f"{path}: block {block} is {excerpt(found)}; it should be a mapping of params.")
     return found
 
 

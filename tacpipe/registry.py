@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.excerpt import plain
 from tacpipe.stage import Stage
 
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
@@ -77,9 +78,9 @@ def load(name: str) -> Stage:
 
 def load_task(name: str) -> Any:
     """Return the module of the task of this name."""
-    target = entry_points()[TASKS].get(name)
+    target = entry_points()[TASKS].get(str(name))
     if target is None:
-        raise UsageError(f"There is no task {name}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
+        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
     return _import(name, target)
 
 
@@ -95,7 +96,7 @@ def load_sensor(name: str) -> Any:
     """
     target = sensors().get(name)
     if target is None:
-        raise UsageError(f"There is no sensor {name}; there are {', '.join(sensors())}.")
+        raise UsageError(f"There is no sensor {plain(name)}; there are {', '.join(sensors())}.")
     return _import(name, target)
 
 

@@ -10,7 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from tacpipe import memory
 from tacpipe.errors import DamagedError
+from tacpipe.excerpt import plain
+from tacpipe.parquet_claims import claimed
 
 ROW_GROUP_ROWS = 1 << 20
 HELD_SHARE = 0.25  # above this share of repeated rows zstd beats delta packing; measured, docs/format.md
@@ -18,6 +21,10 @@ ZSTD_LEVEL = 3
 ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
 _CLOCKS = ("t_ns", "t_device_ns", "seq")
 _KEY = b"tacpipe"
+BROKEN = (  # what pyarrow raises for broken files, and Python for what these say of themselves
+    *(pa.ArrowException, OSError, ValueError, RuntimeError, MemoryError, OverflowError),
+    *(LookupError, TypeError, AttributeError),
+)
 
 
 def to_parquet(table: pa.Table) -> bytes:
@@ -60,18 +67,27 @@ def to_parquet(table: pa.Table) -> bytes:
 def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
     """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
 
-    Raises `DamagedError` when the bytes are no Parquet file.
+    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there or more than
+    the memory that is left.
     """
     try:
         file = pq.ParquetFile(pa.BufferReader(content))
+        needed = claimed(file.schema, content, columns)
+    except BROKEN as error:
+        raise _damaged(content, error) from error
+    memory.require(needed, f"A Parquet file of {len(content)} bytes", error=DamagedError)
+    try:
         table = file.read(columns=list(columns) if columns is not None else None)
-    except pa.ArrowException as error:
-        raise DamagedError(f"These {len(content)} bytes are no Parquet file: {error}.") from error
-    stored = (file.metadata.metadata or {}).get(_KEY)
-    if stored is None:
-        return table
-    names = file.schema_arrow.names
-    return table.cast(_with_fields(table.schema, names, json.loads(stored)))
+        stored = (file.metadata.metadata or {}).get(_KEY)
+        if stored is None:
+            return table
+        return table.cast(_with_fields(table.schema, file.schema_arrow.names, json.loads(stored)))
+    except BROKEN as error:
+        raise _damaged(content, error) from error
+
+
+def _damaged(content: bytes, error: Exception) -> DamagedError:
+    return DamagedError(f"These {len(content)} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
 
 
 def _held_share(table: pa.Table) -> float:

@@ -76,6 +76,7 @@ class Cloud:
 
 def require_columns(table: pa.Table, names: Sequence[str]) -> None:
     """Raise `TacpipeError` naming the first of ``names`` that is no column of the table."""
-    missing = [name for name in names if name not in table.column_names]
+    there = set(table.column_names)  # which the table lists anew each time that it is asked
+    missing = [name for name in names if name not in there]
     if missing:
         raise TacpipeError(f"The column {missing[0]} is missing. Ingest or segment the recording again.")

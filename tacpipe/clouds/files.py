@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tacpipe import regular
 from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.library import open3d
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.ply import parsed as parsed_ply
 
 TEXT = (".pts", ".xyz", ".xyzn", ".xyzrgb")  # a line a point
 SUFFIXES = (".pcd", ".ply", *TEXT)
@@ -25,18 +29,19 @@ def read(path: Path | str) -> Cloud:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise TacpipeError(f"{path} is no cloud that can be read; it must end in one of {', '.join(SUFFIXES)}.")
-    if not path.is_file():
+    if not path.exists() or path.is_dir():
         raise TacpipeError(f"There is no file {path}; give the file of a cloud of points.")
+    regular.require(path, path.stat().st_mode)
     if not path.stat().st_size:
         raise TacpipeError(f"{path} is empty. Copy it again from its source.")
-    cloud = _pcd(path) if path.suffix.lower() == ".pcd" else _by_open3d(path, _told(path))
+    cloud = READERS.get(path.suffix.lower(), _text)(path)
     require_metres(path, cloud)
     return cloud
 
 
 def require_metres(path: Path, cloud: Cloud) -> None:
     """Raise `TacpipeError` where a cloud is larger than `LARGEST_M`."""
-    extent_m = float(np.ptp(cloud.points_m, axis=0).max(initial=0.0))
+    extent_m = float(np.ptp(cloud.points_m.astype(np.float64), axis=0).max(initial=0.0))
     if extent_m > LARGEST_M:
         raise TacpipeError(
             f"{path} is {extent_m:.4g} m long; clouds are {LARGEST_M:g} m at most. It looks like millimetres: divide its "
@@ -47,48 +52,76 @@ def require_metres(path: Path, cloud: Cloud) -> None:
 def _pcd(path: Path) -> Cloud:
     from tacpipe.formats import pcd
 
-    header = pcd.read_header(path)
-    return _by_open3d(path, header.points) if header.data == "binary_compressed" else pcd.read(path)
+    content = regular.content(path)
+    header = pcd.read_header(path, content)
+    if header.data != "binary_compressed":
+        return pcd.read(path)
+    pcd.require_compressed(path, content, header)  # open3d takes the memory that the file claims
+    return _by_open3d(path, header.points)
+
+
+def _ply(path: Path) -> Cloud:
+    """Return the cloud of a PLY file; open3d's parser writes beyond its memory where a header is made to have it do so."""
+    ply.points(path)
+    xyz, colours = parsed_ply(path, regular.content(path))
+    _require_finite(path, xyz)
+    return Cloud(xyz, colours)
+
+
+READERS = {".pcd": _pcd, ".ply": _ply}
+
+
+def _text(path: Path) -> Cloud:
+    return _by_open3d(path, _told(path))
 
 
 def _told(path: Path) -> int:
-    """Return how many points a file tells of: its header, or its lines."""
-    if path.suffix.lower() == ".ply":
-        return ply.points(path)
+    """Return how many points a file of text tells of: its first line, or its lines."""
     lines = path.read_bytes().splitlines()
     filled = [line.split() for line in lines if line.strip() and not line.startswith(b"#")]
     if path.suffix.lower() != ".pts":
         return len(filled)
-    if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit():
+    if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > ply.DIGITS:
         raise TacpipeError(f"{path} is no PTS file: its first line must be the number of points alone.")
-    return int(filled[0][0])
+    told = int(filled[0][0])
+    if _rows(path) < told:  # open3d takes memory for as many as are told
+        raise TacpipeError(
+            f"{path} tells of {told} points, and {_rows(path)} can be read: it was cut off. Copy it again from its source."
+        )
+    return told
 
 
 def _by_open3d(path: Path, told: int) -> Cloud:
     """Return the cloud that open3d reads, if it is what the file tells."""
     with open3d() as library:
         found = library.io.read_point_cloud(str(path), format=path.suffix.lower()[1:])
-        points, colours = np.asarray(found.points), np.asarray(found.colors)  # (point, xyz), (point, rgb) from 0 to 1
+        with np.errstate(over="ignore"):  # what no float32 holds is not finite then
+            points = np.asarray(found.points).astype(np.float32)  # (point, xyz)
+        colours = np.asarray(found.colors)  # (point, rgb) from 0 to 1
     held = _rows(path) if path.suffix.lower() == ".pts" else len(points)
     if min(held, len(points)) != told or not told:
         raise TacpipeError(
             f"{path} tells of {told} points, and {min(held, len(points))} can be read: it was cut off, or some are no "
             f"numbers. Copy it again from its source."
         )
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        raise TacpipeError(
-            f"{path} holds {np.count_nonzero(~finite)} of {told} points that are not finite (NaN), the first being point "
-            f"{int(np.argmin(finite))}. Remove them and save the cloud again."
-        )
+    _require_finite(path, points)
     if not found.has_colors():
-        return Cloud(points.astype(np.float32))
+        return Cloud(points)
     if not (colours.min() >= 0 and colours.max() <= 1):
         raise TacpipeError(
             f"{path} has colours from {colours.min():g} to {colours.max():g}; in its format they are shares from 0 to 1. "
             f"Divide them by 255."
         )
-    return Cloud(points.astype(np.float32), np.rint(colours * 255).astype(np.uint8))
+    return Cloud(points, np.rint(colours * 255).astype(np.uint8))
+
+
+def _require_finite(path: Path, points: NDArray[Any]) -> None:
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        raise TacpipeError(
+            f"{path} holds {np.count_nonzero(~finite)} of {len(points)} points that are not finite (NaN), the first being "
+            f"point {int(np.argmin(finite))}. Remove them and save the cloud again."
+        )
 
 
 def _rows(path: Path) -> int:

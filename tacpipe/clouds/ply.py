@@ -1,4 +1,4 @@
-"""How many points a PLY file tells of and how many it holds: open3d fills up with zeros what was cut off.
+"""How many points a PLY file tells of and how many it holds, whatever elements lie around them.
 
 Source: Greg Turk, "The PLY Polygon File Format" (1994): a header of lines up to ``end_header``; elements follow in the order
 of the header, each row the element's properties in their order.
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tacpipe import regular
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt
 
 SIZES = {  # bytes of a scalar property
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
@@ -17,6 +19,7 @@ SIZES = {  # bytes of a scalar property
     **dict.fromkeys(("double", "float64"), 8),
 }
 LONGEST_HEADER = 65_536  # bytes
+DIGITS = 18  # of a number in a header
 
 
 def points(path: Path) -> int:
@@ -24,18 +27,20 @@ def points(path: Path) -> int:
 
     Raises `TacpipeError`, naming the file, where it is no PLY file, has no points, or is shorter than they are.
     """
-    content = path.read_bytes()
+    content = regular.content(path)
     end = content.find(b"end_header", 0, LONGEST_HEADER)
     lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
-    if end < 0 or lines[0] != ["ply"]:
+    if end < 0 or lines[:1] != [["ply"]]:
         raise TacpipeError(
             f"{path} is no PLY file, or was cut off: it must begin with ply and a header up to end_header."
         )
     body = content[content.find(b"\n", end) + 1 or len(content) :]
-    form = next((words[1] for words in lines if words[0] == "format" and len(words) == 3), "")
+    form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
     for name, count, widths in _elements(path, lines):
-        if widths is None and count:
-            return _told(path, lines)  # a row's length is in the row: what follows is not counted
+        if widths is None and count:  # a row's length is in the row, of one byte or more: what follows is not counted
+            _require(path, count, name, len(body))
+            _require(path, _told(path, lines), "vertex", len(body))
+            return _told(path, lines)
         held = len(body.split()) if form == "ascii" else len(body)
         needed = count * (len(widths or ()) if form == "ascii" else sum(widths or ()))
         if held < needed:
@@ -54,14 +59,23 @@ def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[i
     found: list[tuple[str, int, list[int] | None]] = []
     for words in lines:
         if words[:1] == ["element"]:
-            if len(words) != 3 or not (words[2].isascii() and words[2].isdigit()):
-                raise TacpipeError(f"{path} has the line {' '.join(words)!r}; it must be element, a name and a number.")
+            if len(words) != 3 or not (words[2].isascii() and words[2].isdigit()) or len(words[2]) > DIGITS:
+                raise TacpipeError(
+                    f"{path} has the line {excerpt(' '.join(words))}; it must be element, a name and a number."
+                )
             found.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and found:
             name, count, sizes = found[-1]
             scalar = sizes is not None and len(words) == 3 and words[1] in SIZES
             found[-1] = (name, count, [*sizes, SIZES[words[1]]] if scalar and sizes is not None else None)
     return found
+
+
+def _require(path: Path, count: int, name: str, held: int) -> None:
+    if count > held:
+        raise TacpipeError(
+            f"{path} was cut off: it tells of {count} rows of {name:.40}, and {held} bytes follow. Copy it again."
+        )
 
 
 def _told(path: Path, lines: list[list[str]]) -> int:

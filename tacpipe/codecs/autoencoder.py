@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from tacpipe import model_files
 from tacpipe.codecs import measures, stretches
 from tacpipe.codecs.codec import (
     DESCRIPTION,
@@ -97,7 +97,7 @@ class Autoencoder:
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Autoencoder:
         """Return the codec that `to_files` wrote."""
-        content, tensors = json.loads(files[DESCRIPTION]), load_tensors(files[TENSORS])
+        content, tensors = json.loads(files[DESCRIPTION]), model_files.arrays(files[TENSORS], TENSORS)
         encoder, decoder = (
             tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(content["layers"][part]))
             for part in ("encoder", "decoder")

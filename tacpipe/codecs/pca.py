@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from tacpipe import model_files
 from tacpipe.codecs import measures, stretches
 from tacpipe.codecs.codec import (
     DESCRIPTION,
@@ -91,7 +91,7 @@ class PCA:
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> PCA:
         """Return the codec that `to_files` wrote."""
-        content, tensors = json.loads(files[DESCRIPTION]), load_tensors(files[TENSORS])
+        content, tensors = json.loads(files[DESCRIPTION]), model_files.arrays(files[TENSORS], TENSORS)
         return cls(
             tuple(content["channels"]),
             tuple(content["layout"]),

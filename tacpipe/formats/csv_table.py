@@ -13,7 +13,9 @@ A row that was cut short is seen. A last *number* that was cut short (``0.1234``
 from __future__ import annotations
 
 import csv
+import io
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -22,7 +24,9 @@ import pyarrow as pa
 import pyarrow.csv as pc
 from numpy.typing import NDArray
 
+from tacpipe import regular
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt, listed, plain
 
 _STAMP = re.compile(r"\s*\d{1,10}(\.\d{1,9})?\s*")
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
@@ -63,7 +67,7 @@ def read_csv(
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         fault = _first_fault(path, names, trailing_comma, seconds)
-        raise TacpipeError(fault or f"{path} is no CSV file: {error}.") from error
+        raise TacpipeError(fault or f"{path} is no CSV file: {plain(str(error), 200)}.") from error
     if not table.num_rows:
         raise TacpipeError(f"{path} has a header and no rows; the recording is empty. Delete it or record it again.")
     if tail and any(cell != "" for cell in table.column(len(names)).unique().to_pylist()):
@@ -128,24 +132,26 @@ def file_row(path: Path, index: int) -> int:
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each line that is not blank."""
     try:
-        with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
+        with io.TextIOWrapper(regular.opened(path), "utf-8-sig", "replace", "") as file:
             reader = csv.reader(file)
             for cells in reader:
                 if cells:
                     yield reader.line_num, cells
     except (OSError, csv.Error) as error:
-        raise TacpipeError(f"{path} cannot be read: {error}. Check the path and copy the file again.") from error
+        raise TacpipeError(
+            f"{path} cannot be read: {plain(str(error), 200)}. Check the path and copy the file again."
+        ) from error
 
 
 def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
-    doubled = sorted({name for name in names if names.count(name) > 1})
+    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubled:
-        raise TacpipeError(f"{path} has more than one column {', '.join(doubled)}; each name may stand once.")
-    missing = [name for name in columns if name not in names]
+        raise TacpipeError(f"{path} has more than one column {listed(doubled, 4)}; each name may stand once.")
+    there = set(names)
+    missing = [name for name in columns if name not in there]
     if missing:
-        listed = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
         raise TacpipeError(
-            f"{path} lacks the column {listed}; its header begins with {', '.join(names[:4])}. "
+            f"{path} lacks the column {listed(missing, 4)}; its header begins with {', '.join(map(plain, names[:4]))}. "
             f"It may belong to another format."
         )
 
@@ -164,11 +170,12 @@ def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds
             return f"{path}, row {line} has {len(cells)} fields instead of {len(names)}; {cause}. Copy the file again."
         for name, cell in zip(names, cells, strict=True):
             if not _NUMBER.fullmatch(cell):
-                return f"{path}, row {line}, column {name} holds {cell!r}, which is no number. Put the cell right."
+                told = f"column {plain(name)} holds {excerpt(cell)}"
+                return f"{path}, row {line}, {told}, which is no number. Put the cell right."
             if name == seconds and not _STAMP.fullmatch(cell):
                 return (
-                    f"{path}, row {line}, column {name} holds {cell}; it must be seconds since 1970 with nine decimals "
-                    f"at most. Put the cell right."
+                    f"{path}, row {line}, column {name} holds {plain(cell)}; it must be seconds since 1970 with "
+                    f"nine decimals at most. Put the cell right."
                 )
     return None
 

@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe import regular
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import plain
 
 KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 VERSIONS = ("0.7", ".7")
@@ -22,6 +24,10 @@ KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}
 POSITION = ("x", "y", "z")
 COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alpha is left out
 LONGEST_HEADER = 65_536  # bytes; a file without the line DATA in so many is none
+DIGITS = 18  # of a number in a header
+LONGEST_NUMBER = 64  # letters of a number in a file of text
+LARGEST_POINT = 65_536  # bytes, fields that are skipped included
+LZF_MOST = 88  # by which compression makes points smaller at most: three bytes stand for 264
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,8 @@ def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.
     if header.points == 0:
         raise TacpipeError(f"{path} holds no point (POINTS 0). Copy the file again or leave its recording out.")
     points = _of_bytes(path, content, header) if header.data == "binary" else _of_text(path, content, header)
-    xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)  # (point, xyz)
+    with np.errstate(over="ignore"):  # what no float32 holds is not finite then, and refused or left out as such
+        xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)  # (point, xyz)
     if header.colour is None:
         return xyz, None
     return xyz, unpacked(np.ascontiguousarray(points[header.colour]).view("<u4"))
@@ -88,7 +95,7 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
         )
     if lines["VERSION"] not in [[version] for version in VERSIONS]:
         raise TacpipeError(
-            f"{path} is a PCD file of version {' '.join(lines['VERSION'])}; 0.7 can be read. Save it again as that."
+            f"{path} is a PCD file of version {plain(' '.join(lines['VERSION']))}; 0.7 can be read. Save it again as that."
         )
     points = _whole(path, "POINTS", lines["POINTS"])
     if "WIDTH" in lines and "HEIGHT" in lines:
@@ -100,8 +107,22 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
             )
     data = " ".join(lines["DATA"])
     if data not in ("ascii", "binary", "binary_compressed"):
-        raise TacpipeError(f"{path} says DATA {data}; it must be ascii, binary or binary_compressed.")
+        raise TacpipeError(f"{path} says DATA {plain(data)}; it must be ascii, binary or binary_compressed.")
     return Header(_point(path, lines), points, data, length)
+
+
+def require_compressed(path: Path, content: bytes, header: Header) -> None:
+    """Raise `TacpipeError` where compressed points are not as many as their header says, or more than they can be.
+
+    In front of them stand their size and that of the points they stand for, four bytes each.
+    """
+    needed, there = header.points * header.point.itemsize, len(content) - header.length - 8
+    size, told = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
+    if there < size or told != needed or needed > size * LZF_MOST:
+        raise TacpipeError(
+            f"{path} tells {header.points} points of {header.point.itemsize} bytes, and {max(there, 0)} bytes follow that "
+            f"say they are {size}, and {told} once unpacked: it was cut off or its header is wrong. Copy the file again."
+        )
 
 
 def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
@@ -115,7 +136,7 @@ def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
 
 def _content(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return regular.content(path)
     except OSError as error:
         raise TacpipeError(
             f"{path} cannot be read: {error.strerror or error}. Copy it again from its source."
@@ -147,8 +168,11 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
 
 
 def _whole(path: Path, keyword: str, words: list[str]) -> int:
-    if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()):
-        raise TacpipeError(f"{path} says {keyword} {' '.join(words)}; it must be a whole number. Copy the file again.")
+    if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()) or len(words[0]) > DIGITS:
+        raise TacpipeError(
+            f"{path} says {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
+            f"Copy the file again."
+        )
     return int(words[0])
 
 
@@ -159,26 +183,35 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
     for keyword, words in (("SIZE", lines["SIZE"]), ("TYPE", lines["TYPE"]), ("COUNT", counts)):
         if len(words) != len(names):
             raise TacpipeError(
-                f"{path} has {len(names)} FIELDS ({' '.join(names)}) and {len(words)} in {keyword}; each field needs one."
+                f"{path} has {len(names)} FIELDS ({plain(' '.join(names))}) and {len(words)} in {keyword}; each "
+                f"field needs one."
             )
     fields: list[tuple[str, str, tuple[int, ...]]] = []
+    total = 0
     for place, (name, kind, size, count) in enumerate(zip(names, lines["TYPE"], lines["SIZE"], counts, strict=True)):
         letter, sizes = KINDS.get(kind, ("", ()))
         width, many = _whole(path, "SIZE", [size]), _whole(path, "COUNT", [count])
         if width not in sizes:
-            raise TacpipeError(f"{path} has the field {name} of TYPE {kind} and SIZE {size}; there is no such number.")
+            told = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
+            raise TacpipeError(f"{path} has {told}; there is no such number.")
         wrong_place = name in POSITION and (letter != "f" or many != 1)
         if wrong_place or (name in COLOURS and (width != 4 or many != 1)):
             right = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"
             raise TacpipeError(
                 f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count}; it must be {right}."
             )
+        total += width * many
+        if not many > 0 or total > LARGEST_POINT:
+            raise TacpipeError(
+                f"{path} has the field {plain(name)} of COUNT {count}; a point has {LARGEST_POINT} bytes at most, and each "
+                f"field one number or more. Copy the file again."
+            )
         own = name if name in (*POSITION, *COLOURS) else f"skipped{place}"  # PCL names all its padding "_"
         fields.append((own, f"<{letter}{width}", () if many == 1 else (many,)))
     missing = [axis for axis in POSITION if names.count(axis) != 1]
     if missing or any(names.count(name) > 1 for name in COLOURS):
         raise TacpipeError(
-            f"{path} has the FIELDS {' '.join(names)}; x, y, z must be there once, and rgb at most once."
+            f"{path} has the FIELDS {plain(' '.join(names))}; x, y, z must be there once, and rgb at most once."
         )
     return np.dtype(fields)
 
@@ -216,12 +249,12 @@ def _of_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
         )
     names = header.point.names or ()
     widths = [int(np.prod(header.point[name].shape)) for name in names]
-    found = np.zeros(header.points, header.point)
     for row, words in enumerate(rows):
         if len(words) != sum(widths):
             raise TacpipeError(
                 f"{path}, point {row}: the line has {len(words)} numbers; it must have {sum(widths)}. Copy the file again."
             )
+    found = np.zeros(header.points, header.point)
     for place, name in enumerate(names):
         if name in (*POSITION, *COLOURS):
             found[name] = _column(path, [words[sum(widths[:place])] for words in rows], header.point[name])
@@ -230,8 +263,15 @@ def _of_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
 
 def _column(path: Path, words: list[str], kind: np.dtype[np.void]) -> NDArray[np.void]:
     """Return the numbers of a column of text. Raises `TacpipeError`, naming the point, for what is none."""
+    long = next((row for row, word in enumerate(words) if len(word) > LONGEST_NUMBER), None)
+    if long is not None:  # an array of words makes room in each row for the longest
+        raise TacpipeError(
+            f"{path}, point {long}: a number of {len(words[long])} letters is longer than {LONGEST_NUMBER}. Copy the file "
+            f"again."
+        )
     try:
-        return np.array(words).astype(kind)
+        with np.errstate(over="ignore", invalid="ignore"):  # what the type does not hold is not finite then
+            return np.array(words).astype(kind)
     except (ValueError, OverflowError) as error:
         for row, word in enumerate(words):
             try:

@@ -8,12 +8,17 @@ has is told from its values. The rate is not published.
 from __future__ import annotations
 
 import ast
+import math
+import os
 import re
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import regular
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt, plain
 from tacpipe.formats.folders import walk
 from tacpipe.stage import Attribute, Files, Recording, stage
 
@@ -26,7 +31,14 @@ PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
 LARGEST = 255.0  # readings stem from eight bits, compensated for temperature
 ALONG_TIME = 0.85  # correlation of neighbours: of published slides 0.92 or more along time, 0.82 or less otherwise
 LAYOUTS = ("time", "authors")
+UNREADABLE = (
+    *(OSError, ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, MemoryError, OverflowError),
+    tokenize.TokenError,
+)
 MADE = "from nominal rate"
+MOST_LABEL = 10_000  # materials
+LONGEST_HEAD = 10_000  # bytes in front of an array, as numpy allows
+KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
 
 
 @dataclass(frozen=True)
@@ -115,17 +127,31 @@ def _found(source: Path) -> list[tuple[str, Path]]:
 def _slides(path: Path) -> int:
     """Return how many slides a block has, from the head of the file alone: numpy takes longer to load than a hit."""
     try:
-        with open(path, "rb") as file:
+        with regular.opened(path) as file:
             if file.read(6) != b"\x93NUMPY":
                 raise ValueError("it does not begin as an array of numpy does")
             wide = file.read(2)[0] > 1
-            head = ast.literal_eval(file.read(int.from_bytes(file.read(4 if wide else 2), "little")).decode())
-        shape = head["shape"]
-    except (OSError, ValueError, SyntaxError, KeyError, IndexError, TypeError) as error:
-        raise TacpipeError(f"{path} cannot be read as an array: {error}. Copy it again from its source.") from error
-    if not (isinstance(shape, tuple) and len(shape) == 4):
+            length = int.from_bytes(file.read(4 if wide else 2), "little")
+            if length > LONGEST_HEAD:
+                raise ValueError(f"its head has {length} bytes, {LONGEST_HEAD} are allowed")
+            head = ast.literal_eval(file.read(length).decode())
+            held = os.fstat(file.fileno()).st_size - file.tell()
+        shape, kind = head["shape"], KIND.fullmatch(head["descr"])
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    if not (isinstance(shape, tuple) and len(shape) == 4 and all(type(size) is int and size > 0 for size in shape)):
         raise TacpipeError(
-            f"{path} has the shape {shape}; it must be (slide, triangle, taxel, time). Give the set's own files."
+            f"{path} has the shape {excerpt(shape)}; it must be (slide, triangle, taxel, time). Give the set's own files."
+        )
+    if kind is None:
+        told = excerpt(head["descr"])
+        raise TacpipeError(
+            f"{path} cannot be read as an array of numbers: it holds {told}. Copy it again from its source."
+        )
+    if math.prod(shape) * int(kind[1]) > held:
+        raise TacpipeError(
+            f"{path} cannot be read as an array of numbers: it tells of {excerpt(shape)} numbers of {kind[1]} bytes, and "
+            f"{held} bytes follow. Copy it again from its source."
         )
     return int(shape[0])
 
@@ -186,13 +212,14 @@ def _label(block: Path, path: Path, place: int) -> int:
     """Return the label of a slide, from 0. Raises `TacpipeError` if the labels are not one whole number a slide."""
     import numpy as np
 
-    labels, slides = _array(path).ravel(), len(_array(block))
+    labels, slides = np.atleast_1d(_array(path)).ravel(), len(_array(block))
     if len(labels) != slides:
         raise TacpipeError(f"{path} has {len(labels)} labels and {block.name} {slides} slides; copy both files again.")
     label = labels[place]
-    if labels.dtype.kind not in "fiu" or not (label >= 0 and label == np.rint(label)):
+    if labels.dtype.kind not in "fiu" or not (0 <= label <= MOST_LABEL and label == np.rint(label)):
         raise TacpipeError(
-            f"{path}, label {place} is {label!r}; it must be a whole number from 0. Copy the file again."
+            f"{path}, label {place} is {excerpt(label)}; it must be a whole number from 0 to {MOST_LABEL}. Copy the "
+            f"file again."
         )
     return int(label)
 
@@ -202,9 +229,15 @@ def _array(path: Path) -> NDArray[Any]:
     import numpy as np
 
     try:
+        with regular.opened(path) as file:
+            if file.read(6) != b"\x93NUMPY":  # numpy would take it for an archive of arrays, or a pickle
+                raise ValueError("it does not begin as an array of numpy does")
         found: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise TacpipeError(
-            f"{path} cannot be read as an array of numbers: {error}. Copy it again from its source."
-        ) from error
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
     return found
+
+
+def _unreadable(path: Path, error: BaseException) -> TacpipeError:
+    told = plain(" ".join(str(error).split()), 200)
+    return TacpipeError(f"{path} cannot be read as an array of numbers: {told}. Copy it again from its source.")

@@ -15,7 +15,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe import regular
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import plain
 from tacpipe.formats.folders import require, valid, walk
 from tacpipe.hashing import remembered_file_digest
 from tacpipe.stage import Files, Recording, stage
@@ -132,7 +134,7 @@ def _add_twins(found: dict[str, dict[str, Path]]) -> None:
 def _lines(path: Path) -> list[str]:
     """Return the lines of a small file of text. Raises `TacpipeError` if it is empty, or none."""
     try:
-        lines = path.read_text("ascii").splitlines()
+        lines = regular.content(path).decode("ascii").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise TacpipeError(f"{path} cannot be read as text: {error}. Copy it again from its source.") from error
     while lines and not lines[-1].strip():
@@ -158,7 +160,9 @@ def _grasp(path: Path) -> Grasp:
     try:
         values = np.array([float(cell) for cell in cells])
     except ValueError as error:
-        raise TacpipeError(f"{path}, row 1: {error}; all {len(cells)} cells must be numbers. Copy it again.") from error
+        raise TacpipeError(
+            f"{path}, row 1: {plain(str(error), 100)}; all {len(cells)} cells must be numbers. Copy it again."
+        ) from error
     try:
         return Grasp(values[:3], values[3:6], values[6:].reshape(3, 3) if len(cells) == WITH_WRIST else None)
     except TacpipeError as error:

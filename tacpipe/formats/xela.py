@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt
 from tacpipe.formats import channels
 from tacpipe.stage import ROLES, Attribute
 
@@ -126,7 +127,7 @@ class Meta:
                 return read(cell)
         except (ValueError, KeyError):
             pass
-        held = f"holds {cell!r}" if cell else "is missing or empty"
+        held = f"holds {excerpt(cell)}" if cell else "is missing or empty"
         raise TacpipeError(f"{self.path}, column {name} {held}; it must be {wanted}. Put the file right and try again.")
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from tacpipe.errors import DeviceError, UsageError
+from tacpipe.excerpt import excerpt
 
 SCHEMES = {
     "serial": "serial:/dev/ttyACM0",
@@ -19,6 +20,7 @@ SCHEMES = {
     "folder": "folder:/data/clouds",
     "camera": "camera:0",
 }
+LONGEST = 4096  # characters of a place, as of a path
 
 
 class LinkLostError(DeviceError):
@@ -64,13 +66,13 @@ class Link(Protocol):
 def parse(text: str) -> Address:
     """Return the address that a rig file or a command line names.
 
-    Raises `UsageError` for an unknown kind of link, or one without a place.
+    Raises `UsageError` for an unknown kind of link, or one without a place that can be printed.
 
     >>> parse("serial:/dev/ttyACM0")
     Address(scheme='serial', place='/dev/ttyACM0')
     """
     scheme, colon, place = text.partition(":")
-    if scheme not in SCHEMES or not colon or not place:
+    if scheme not in SCHEMES or not colon or not place.isprintable() or not 0 < len(place) <= LONGEST:
         examples = "; ".join(SCHEMES.values())
-        raise UsageError(f"{text!r} is no address of a device; it should read like one of these: {examples}.")
+        raise UsageError(f"{excerpt(text)} is no address of a device; it should read like one of these: {examples}.")
     return Address(scheme, place)

@@ -93,6 +93,27 @@ class Forest:
         kept |= {"cuts": self.cuts, "values": self.values}
         return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in kept.items()}
 
+    def check(self, features: int, values: int) -> None:
+        """Raise `ValueError` unless trees of so many ``features`` tell so many ``values``, and each way down them ends.
+
+        As they are grown a child stands behind its parent: nodes that lead back to one another would be gone round for ever.
+        """
+        nodes = len(self.values)
+        own = np.arange(nodes)[:, None]
+        down = (self.children > own) & (self.children < nodes) | (self.children == LEAF)
+        shapes = {
+            "roots": self.roots.ndim == 1 and len(self.roots) > 0,
+            "children": self.children.shape == (nodes, 2) and bool(down.all()),
+            "features": self.features.shape == (nodes,)
+            and bool(((self.features >= 0) & (self.features < features)).all()),
+            "cuts": self.cuts.shape == (nodes,),
+            "values": self.values.shape == (nodes, values),
+        }
+        whole = all(one.dtype.kind == "i" for one in (self.roots, self.children, self.features))
+        wrong = next((name for name, fine in shapes.items() if not fine), "" if whole else "numbers of nodes")
+        if wrong or not ((self.roots >= 0) & (self.roots < nodes)).all():
+            raise ValueError(f"the {wrong or 'roots'} of a forest of {nodes} nodes are no such")
+
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor]) -> Forest:
         """Return the forest that `tensors` wrote."""

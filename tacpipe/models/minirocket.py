@@ -119,9 +119,19 @@ class Rocket:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Rocket:
-        """Return the transform that `to_tensors` described."""
+        """Return the transform that `to_tensors` described. Raises `ValueError` where its parts do not fit one another."""
         names = ("dilations", "each", "channels", "biases")
-        return cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
+        made = cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
+        count = len(made.dilations)
+        fits = (
+            made.each.shape == (count,)
+            and made.channels.shape[:2] == (count, KERNELS)
+            and made.channels.dtype == np.bool_
+        )
+        fits = fits and bool((made.each >= 0).all()) and made.biases.shape == (KERNELS * int(made.each.sum()),)
+        if not count or not fits or not ((made.dilations >= 1) & (made.dilations <= made.frames)).all():
+            raise ValueError(f"{len(made.biases)} biases do not fit {count} dilations of {KERNELS} kernels")
+        return made
 
 
 def _dilations(frames: int, each: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -22,13 +22,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import params, registry
-from tacpipe.errors import UsageError
+from tacpipe import params, registry, regular
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.excerpt import excerpt, plain
 from tacpipe.links import link
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.stage import Attribute
 
-NAME = re.compile(r"[a-z][a-z0-9_]*")
+NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TAKEN = ("events", "truth")  # streams that a recording has beside those of its sensors
 KEYS = ("name", "sensor", "transport", "options", "emulate")
 
@@ -59,7 +60,9 @@ class Rig:
 def read(path: Path) -> Rig:
     """Return the rig that a file describes. Raises `UsageError` with the place of what is wrong."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = regular.content(path).decode()
+    except TacpipeError as error:
+        raise UsageError(str(error)) from error
     except FileNotFoundError:
         raise UsageError(f"There is no rig file {path}; docs/rig.md tells how to write one.") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -74,25 +77,28 @@ def parse(text: str, where: str = "rig.toml") -> Rig:
     """
     try:
         found = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{where} is not valid TOML: {error}.") from error
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, brackets within brackets
+        raise UsageError(f"{where} is not valid TOML: {plain(str(error), 200)}.") from error
     _known(found, ("master", "labels", "stream", "emulate"), where)
     tables = found.get("stream")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise UsageError(f"{where} lists no stream; each is a table [[stream]] with name, sensor and transport.")
     streams: dict[str, Stream] = {}
     for number, table in enumerate(tables, start=1):
-        stream = _stream(table, f"{where}, stream {table.get('name', number)}")
+        stream = _stream(table, f"{where}, stream {_called(table, number)}")
         if stream.name in streams:
             raise UsageError(f"{where} has two streams named {stream.name}; names must be unique.")
         streams[stream.name] = stream
     master = found.get("master", next(iter(streams)))
     if not isinstance(master, str) or master not in streams:
-        raise UsageError(f"{where}: the master is {master!r}; it must be one of the streams, {', '.join(streams)}.")
+        raise UsageError(
+            f"{where}: the master is {excerpt(master)}; it must be one of the streams, {', '.join(streams)}."
+        )
     labels = _table(found, "labels", where)
     for name, value in labels.items():
         if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
-            raise UsageError(f"{where}: label {name} is {value!r}; it must be text, a finite number, true or false.")
+            told = f"label {plain(name)} is {excerpt(value)}"
+            raise UsageError(f"{where}: {told}; it must be text, a finite number, true or false.")
     return Rig(streams, master, labels, _table(found, "emulate", where), text)
 
 
@@ -100,18 +106,19 @@ def _stream(table: Mapping[str, Any], where: str) -> Stream:
     _known(table, KEYS, where)
     for key in ("name", "sensor", "transport"):
         if not isinstance(table.get(key), str):
-            raise UsageError(f"{where}: {key} is {table.get(key)!r}; it must be a text.")
+            raise UsageError(f"{where}: {key} is {excerpt(table.get(key))}; it must be a text.")
     name = table["name"]
     if not NAME.fullmatch(name) or name in TAKEN:
         raise UsageError(
-            f"{where}: {name!r} cannot name a stream; take small letters, digits and _, and neither of {', '.join(TAKEN)}."
+            f"{where}: {excerpt(name)} cannot name a stream; take small letters, digits and _, 64 at most, and "
+            f"neither of {', '.join(TAKEN)}."
         )
     kind, options, emulate = table["sensor"], _table(table, "options", where), _table(table, "emulate", where)
     address = link.parse(table["transport"])
     sensor = make(kind, options, where)
     if address.scheme not in sensor.links:
         raise UsageError(
-            f"{where}: {kind} cannot be reached by {address}; it must be {' or '.join(sensor.links)}, as in "
+            f"{where}: {kind} cannot be reached by {plain(str(address))}; it must be {' or '.join(sensor.links)}, as in "
             f"{' or '.join(link.SCHEMES[scheme] for scheme in sensor.links)}."
         )
     return Stream(name, kind, sensor, address, options, emulate)
@@ -120,7 +127,7 @@ def _stream(table: Mapping[str, Any], where: str) -> Stream:
 def _table(found: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
     value = found.get(key, {})
     if not isinstance(value, dict):
-        raise UsageError(f"{where}: {key} is {value!r}; it must be a table, as in {key} = {{ … }}.")
+        raise UsageError(f"{where}: {key} is {excerpt(value)}; it must be a table, as in {key} = {{ … }}.")
     return value
 
 
@@ -130,7 +137,13 @@ def make(kind: str, options: Mapping[str, Any], where: str) -> Sensor:
     return made
 
 
+def _called(table: Mapping[str, Any], number: int) -> str:
+    """Return how a stream is named in errors."""
+    name = table.get("name", number)
+    return plain(name) if isinstance(name, str) else excerpt(name)
+
+
 def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
     for key in table:
         if key not in keys:
-            raise UsageError(f"{where}: there is no key {key}; there are {', '.join(keys)}.")
+            raise UsageError(f"{where}: there is no key {plain(key)}; there are {', '.join(keys)}.")

@@ -11,7 +11,9 @@ import io
 import itertools
 import re
 import textwrap
+import warnings
 from collections.abc import Callable
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +31,7 @@ STYLES = tuple(itertools.product(("-", "--", ":"), ("model", "persistence", "cod
 LEGEND = 52  # letters of a line
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
+    "text.parse_math": False,  # and a dollar in a name is one
     "font.family": "sans-serif",
     "font.sans-serif": ["system-ui", "DejaVu Sans"],
     "font.size": 10,
@@ -53,7 +56,8 @@ def svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float
     from matplotlib.figure import Figure
 
     content = io.StringIO()
-    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": title}):
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": title}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "constrained_layout not applied")  # names longer than the figure
         figure = Figure(figsize=size, layout="constrained")
         grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
         draw(list(grid[:, 0]))
@@ -65,7 +69,7 @@ def svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float
     drawn = re.sub(r' id="([\w.-]+)"', lambda found: found[0] if found[1] in wanted else "", drawn)
     for colour, variable in _THEME.items():
         drawn = drawn.replace(colour, variable)
-    return drawn.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
+    return drawn.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
 
 
 def legend_below(axes: Axes, columns: int = 1) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.report import contents, markup, plain
 
@@ -26,6 +27,11 @@ def render(given: Sequence[Dataset], *, title: str, traces: int = 2) -> bytes:
     Results are told by task, in the order in which tasks first come, and datasets that are no results beside those whose
     task can use them. Raises `TacpipeError` where none can, and without any result.
     """
+    with model_files.believed("the results"):
+        return _rendered(given, title, traces)
+
+
+def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
     results: dict[str, list[Dataset]] = {}
     others = []
     for one in given:

@@ -48,6 +48,7 @@ class ByteFramer:
         self._usual = framing.size or 0  # size of the last good frame
         self._marked: tuple[int, list[tuple[int, bytes]]] = (0, [])  # marks of frames of the last size, see `_marks`
         self._told = (b"", 0)  # the last header whose size was asked for, and the size
+        self._ruined: set[int] = set()  # where no chain begins, counted from the first byte: not looked at once more
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
         """Take what a link gave; return the frames that are complete now, and what was lost."""
@@ -77,6 +78,7 @@ class ByteFramer:
                     break
                 place = self._skip(place, found, losses)
                 self._locked = self._begun = True
+                self._ruined.clear()
                 self._broken_at = None
             spans, stop, broken = self._chain(place)
             held = 0 if ended and not broken and self.framing.summed else self.framing.confirm
@@ -196,12 +198,18 @@ class ByteFramer:
         possible: int | None = None
         there = len(self._text.data)
         enough = 1 if ended and self.framing.summed else self.framing.lock
+        base = self._text.base
+        self._ruined = {start for start in self._ruined if start >= base + place}
         for start in self._candidates(place):
+            if base + start in self._ruined:
+                continue
             spans, stop, ruined = self._chain(start, self.framing.lock)
             count = sum(found for _, _, found in spans)
             if count >= enough and (count >= self.framing.lock or (stop == there and not ruined)):
                 return self._phase(start)
-            if not ruined and possible is None:
+            if ruined:
+                self._ruined.add(base + start)
+            elif possible is None:
                 possible = start
         return None, there if possible is None else possible
 

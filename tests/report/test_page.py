@@ -61,6 +61,7 @@ def test_what_is_no_result_is_refused() -> None:
         page.render([dataset()], title="t")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_dataset_that_no_task_on_the_page_can_use_is_refused() -> None:
     material = material_fakes.result("minirocket", wrong={"biotac": 1})
     page.render([material, material_fakes.recorded()], title="t")

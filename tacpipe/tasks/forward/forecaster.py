@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,16 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load as load_arrays
-from safetensors.torch import load as load_tensors
 from torch import Tensor, nn
 
+from tacpipe import model_files
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.stretches import INCREMENTS
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import plain
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
-from tacpipe.models.windows import ARM, POSE, Windows
+from tacpipe.models.windows import ARM, POSE, Windows, motion
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.tasks.forward import tracks
@@ -29,6 +28,14 @@ Floats = NDArray[np.floating[Any]]
 Config = dict[str, Any]
 
 TASK = "forward"
+NEEDED = {
+    **dict.fromkeys(("context", "horizon", "params.context", "params.horizon"), int),
+    **dict.fromkeys(("architecture", "codec.kind", "codec.of", "params.actions"), str),
+    **dict.fromkeys(("inputs.tactile", "inputs.layout", "inputs.orientation_reference", "objects"), list),
+    **dict.fromkeys(("scaling.feature_half", "scaling.channel_count"), list),
+    **dict.fromkeys(("params", "trained_on"), dict),
+    "rate_hz": float,
+}
 CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safetensors"
 
 
@@ -94,16 +101,43 @@ class Forecaster:
     @classmethod
     def load(cls, files: Mapping[str, bytes]) -> Forecaster:
         """Return the forecaster among a model's files. Raises `TacpipeError` where they are of another task."""
-        config: Config = json.loads(files[CONFIG])
+        config = model_files.tree(files, CONFIG, {"task": str})
         if config["task"] != TASK:
-            raise TacpipeError(f"This model was trained for {config['task']}, not for {TASK}.")
+            raise TacpipeError(f"This model was trained for {plain(config['task'])}, not for {TASK}.")
+        config = model_files.tree(files, CONFIG, NEEDED)
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))
         codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else codecs.load(files)
-        model = network(config["params"], codec)
-        model.load_state_dict(load_tensors(files[WEIGHTS]))
-        linear = Baselines.from_tensors(load_arrays(files[BASELINES])) if BASELINES in files else None
-        return cls(model.eval(), config, codec, linear)
+        model = model_files.filled(
+            lambda: network(config["params"], codec), model_files.tensors(files[WEIGHTS], WEIGHTS)
+        )
+        with model_files.believed("the model"):
+            found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
+            made = cls(model.eval(), config, codec, None if found is None else Baselines.from_tensors(found))
+            made._try()
+        return made
+
+    def _try(self) -> None:
+        """Foretell a window of nothing, and raise where a part does not fit another."""
+        fits = {
+            "the context": self.context == self.config["params"]["context"] > 0,
+            "the horizon": self.horizon == self.config["params"]["horizon"] > 0,
+            "the scaling": self.feature_half.shape == (len(self.codec.latents),)
+            and self.channel_scale.shape == (len(self.codec.channels),),
+            "the orientation": self.orientation.shape == (4,) and bool(self.orientation.any()),
+        }
+        if not all(fits.values()):
+            raise ValueError(f"{next(name for name, fine in fits.items() if not fine)} is another elsewhere")
+        arm = np.zeros((1, self.context + self.horizon, POSE))
+        arm[..., -1] = 1
+        touch = np.zeros((1, self.context, len(self.codec.channels)))
+        self.predict(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :])
+        if self.baselines is not None:
+            parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
+            moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
+            told = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
+            if any(one.shape != (1, self.horizon, touch.shape[2]) for one in told.values()):
+                raise ValueError("the baselines tell another number of steps or channels")
 
     def predict(self, window: Floats, plan: Floats) -> Floats:
         """Return the touch to come in counts above rest, float64: (horizon, channel), or (window, horizon, channel).

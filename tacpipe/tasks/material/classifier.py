@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load as load_arrays
-from safetensors.torch import load as load_tensors
 
+from tacpipe import model_files
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.excerpt import plain
 from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
@@ -30,6 +30,13 @@ if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
 TASK = "material"
+CHOSEN = ".chosen"  # ends the name of what a readout was chosen by, which may be NaN
+MOST_FRAMES = 100_000  # of a slide
+NEEDED = {
+    **dict.fromkeys(("classes", "quantities"), list),
+    **dict.fromkeys(("sensors", "params", "trained_on"), dict),
+    "architecture": str,
+}
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
 ROCKET, SPECTRA = "minirocket", "spectra"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
@@ -115,14 +122,14 @@ class Classifier:
     """Readers of one or more sensors that name the material of a slide."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
-        config: Config = json.loads(files[CONFIG])
-        self.config = config
+        config = model_files.tree(files, CONFIG, NEEDED)
+        self.config: Config = config
         self.architecture: str = config["architecture"]
         self.classes: tuple[int, ...] = tuple(config["classes"])
         self.quantities = tuple(config["quantities"])
         self.layouts = {name: Layout.from_told(name, told) for name, told in config["sensors"].items()}
-        self.readers: dict[str, Reader] = self._readers(files[WEIGHTS])
-        self.last = self._readers(files[LAST]) if LAST in files else {}
+        self.readers: dict[str, Reader] = self._readers(files[WEIGHTS], WEIGHTS)
+        self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files[BASELINES]) if BASELINES in files else {}
 
     @classmethod
@@ -130,10 +137,29 @@ class Classifier:
         """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task."""
         if CONFIG not in files:
             raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train material`.")
-        task = json.loads(files[CONFIG]).get("task")
+        task = model_files.tree(files, CONFIG).get("task")
         if task != TASK:
-            raise TacpipeError(f"This model is of the task {task}, not {TASK}. Give one of `tacpipe train material`.")
-        return cls(files)
+            told = plain(str(task))
+            raise TacpipeError(f"This model is of the task {told}, not {TASK}. Give one of `tacpipe train material`.")
+        with model_files.believed("the model"):
+            made = cls(files)
+            made._try()
+        return made
+
+    def _try(self) -> None:
+        """Read a slide of noise of each sensor, and raise where a part does not fit another."""
+        if not self.layouts or not self.classes or len({*self.classes}) != len(self.classes):
+            raise ValueError(f"there are {len(self.layouts)} sensors and {len(self.classes)} classes")
+        for name, layout in self.layouts.items():
+            if not 0 < layout.frames <= MOST_FRAMES:
+                raise ValueError(f"slides of {name} have {layout.frames} frames")
+            noise = np.random.default_rng(0).normal(size=(2, layout.frames, len(layout.channels))).astype(np.float32)
+            if self.baselines:
+                self.baselines[MEAN_LEVEL][name].scores(noise)
+            found = [reader[name].tell(noise).scores for reader in (self.readers, self.last) if reader]
+            told = [scores.shape for scores in found if not np.isnan(scores).any()] or [(0, 0)]
+            if any(shape != (len(noise), len(self.classes)) for shape in told):
+                raise ValueError(f"slides of {name} get scores of {told}, not of {len(self.classes)} classes")
 
     def predict(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Materials:
         """Return the material of each slide: ``slides`` are device counts (slide, time, channel), or one (time, channel).
@@ -202,15 +228,15 @@ class Classifier:
         partner: str = names[(names.index(sensor) + 1) % len(names)]
         return partner
 
-    def _readers(self, content: bytes) -> dict[str, Reader]:
+    def _readers(self, content: bytes, file: str) -> dict[str, Reader]:
         if self.architecture == ROCKET:
-            arrays = load_arrays(content)
+            arrays = model_files.arrays(content, file, but=CHOSEN)
             return {
                 name: RocketReader(Strong.from_tensors(under(f"{name}.", arrays)), self.classes)
                 for name in self.layouts
             }
         if self.architecture == SPECTRA:
-            arrays, told = load_arrays(content), self.config["spectra"]
+            arrays, told = model_files.arrays(content, file), self.config["spectra"]
             bands = Bands(told["way_m"], np.array(told["edges_per_m"]))
             return {
                 name: SpectraReader(
@@ -222,18 +248,21 @@ class Classifier:
                 )
                 for name, layout in self.layouts.items()
             }
-        tensors = load_tensors(content)
+        tensors = model_files.tensors(content, file)
         readers: dict[str, Reader] = {}
         for name in self.layouts:
-            network = recurrent_autoencoder.build(self.architecture, Shape(**self.config["shapes"][name]))
-            network.load_state_dict(under(f"{name}.", tensors))
+            shape = Shape(**self.config["shapes"][name])
+            weights = under(f"{name}.", tensors)
+            network = model_files.filled(
+                functools.partial(recurrent_autoencoder.build, self.architecture, shape), weights
+            )
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
-            readers[name] = NetworkReader(network, Affine.from_tensors(scaling))
+            readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
 
     def _baselines(self, content: bytes) -> dict[str, dict[str, Level | Strong]]:
         """Return the baselines by name and sensor."""
-        arrays = load_arrays(content)
+        arrays = model_files.arrays(content, BASELINES, but=CHOSEN)
         permuted = Strong if self.architecture == ROCKET else Level
         kinds: dict[str, type[Level] | type[Strong]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: permuted}
         return {

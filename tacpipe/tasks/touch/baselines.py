@@ -30,6 +30,12 @@ class Baselines:
         """Return the baselines that training grasps give."""
         return cls(grasps.felt, grasps.objects, grasps.t_ns)
 
+    def check(self) -> None:
+        """Raise `ValueError` where arrays are not as long as there are training grasps, or of another width."""
+        for name, felt in self.felt.items():
+            if felt.shape != (len(self.objects), biotac_sp.width(name)) or self.t_ns.shape != felt.shape[:1]:
+                raise ValueError(f"baselines of {name} are {felt.shape} for {len(self.objects)} grasps")
+
     def foretell(self, grasps: Grasps) -> dict[str, dict[str, Floats]]:
         """Return each baseline's values by target (grasp, value), device counts.
 

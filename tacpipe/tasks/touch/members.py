@@ -24,6 +24,7 @@ from tacpipe.training.scaling import Affine
 
 Floats = NDArray[np.float64]
 Params = Mapping[str, Any]
+LARGEST = 100_000  # points of a cloud, and times that they are drawn
 
 
 class Member(Protocol):
@@ -107,6 +108,13 @@ def network(params: Params, targets: Sequence[str]) -> nn.Module:
     sizes = {"backbone": params["backbone"], "hidden": params["hidden"], "dropout": params["dropout"]}
     near = patches(params)
     return PatchNetwork(near.channels, near.grasp_numbers, outputs, **sizes)
+
+
+def checked(params: Params) -> None:
+    """Raise `ValueError` for sizes that no params of `tacpipe train touch` come near."""
+    for name in ("draws", "points"):
+        if not 0 < int(params[name]) <= LARGEST:
+            raise ValueError(f"{name} is {params[name]}")
 
 
 def inputs(params: Params) -> Inputs:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,12 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load as load_arrays
-from safetensors.torch import load as load_tensors
 
-from tacpipe import biotac_sp
+from tacpipe import biotac_sp, model_files
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.excerpt import excerpt
 from tacpipe.models.forest import Forest
 from tacpipe.models.tensors import under
 from tacpipe.tasks.touch import members
@@ -30,6 +28,11 @@ Config = dict[str, Any]
 TASK = "touch"
 CONFIG, WEIGHTS, HISTORY, BASELINES = "config.json", "model.safetensors", "history.jsonl", "baselines.safetensors"
 FOREST, NETWORK = "forest", "network"
+NEEDED = {
+    **dict.fromkeys(("members", "targets", "objects"), list),
+    "params": dict,
+    "trained_on": dict,
+}
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,21 @@ class Predictor:
     @classmethod
     def load(cls, files: Mapping[str, bytes]) -> Predictor:
         """Return the model among these files, as `tacpipe train touch` wrote them."""
-        config = json.loads(files[CONFIG])
-        tensors = load_tensors(files[WEIGHTS])
+        config = model_files.tree(files, CONFIG, NEEDED)
+        tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        found = [
-            _member(config, about, under(f"{number}.", tensors), device)
-            for number, about in enumerate(config["members"])
-        ]
-        baselines = None
-        if BASELINES in files:
-            baselines = Baselines.from_tensors(load_arrays(files[BASELINES]), tuple(config["learned_objects"]))
+        with model_files.believed("the model"):
+            found = [
+                _member(config, about, under(f"{number}.", tensors), device)
+                for number, about in enumerate(config["members"])
+            ]
+            baselines = None
+            if BASELINES in files:
+                told = model_files.arrays(files[BASELINES], BASELINES, but="")
+                baselines = Baselines.from_tensors(told, tuple(config["learned_objects"]))
+                baselines.check()
+            if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
+                raise ValueError(f"its members do not foretell {excerpt(config['targets'])}")
         return cls(config, found, baselines)
 
     @cached_property
@@ -112,12 +120,19 @@ class Predictor:
 
 def _member(config: Config, about: Mapping[str, Any], tensors: dict[str, Any], device: str) -> members.Member:
     targets = tuple(about["targets"])
+    width = sum(biotac_sp.width(target) for target in targets)
     if about["kind"] == FOREST:
         forests = tuple(
             (tuple(group), Forest.of(under(f"{number}.", tensors))) for number, group in enumerate(about["groups"])
         )
+        for group, forest in forests:
+            forest.check(len(about["features"]), sum(biotac_sp.width(target) for target in group))
+        if {target for group, _ in forests for target in group} != {*targets}:
+            raise ValueError(f"the forests do not foretell {excerpt(targets)}")
         return members.ForestMember(targets, forests, about["coloured"], about["placed"], tuple(about["features"]))
     scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
-    network = members.network(config["params"], targets)
-    network.load_state_dict(under("network.", tensors))
+    if scale.offset.shape != (width,) or scale.scale.shape != (width,):
+        raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
+    network = model_files.filled(lambda: members.network(config["params"], targets), under("network.", tensors))
+    members.checked(config["params"])
     return members.NetworkMember(targets, network.to(device).eval(), scale, config["params"])

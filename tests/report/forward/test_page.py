@@ -30,6 +30,7 @@ def test_the_same_results_give_the_same_bytes(judged: Any) -> None:
     assert page.render([judged], title="t") == page.render([judged], title="t")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_says_what_came_out_and_where_it_comes_from(judged: Any) -> None:
     text = page.render([judged], title="a <b>").decode()
     assert "a &lt;b&gt;" in text
@@ -40,6 +41,7 @@ def test_the_page_says_what_came_out_and_where_it_comes_from(judged: Any) -> Non
     assert "nan" not in re.sub(r"<svg.*?</svg>", "", text, flags=re.DOTALL).lower()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_single_result_tells_known_objects_and_unseen_ones_apart(judged: Any) -> None:
     text = page.render([judged], title="t").decode()
     row = re.search(r"<td>known objects \(2 recordings\), skill</td><td>([^<]+)</td>", text)
@@ -47,6 +49,7 @@ def test_a_single_result_tells_known_objects_and_unseen_ones_apart(judged: Any) 
     assert "unseen objects (2 recordings), skill" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_results_of_before_groups_were_renamed_are_still_read(judged: Any) -> None:
     old = json.loads(judged.files["metrics.json"])
     for name in ("model", "persistence", "train_mean", "codec"):
@@ -59,6 +62,7 @@ def test_results_of_before_groups_were_renamed_are_still_read(judged: Any) -> No
     assert "model, all" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_simulated_results_say_so_and_others_do_not(judged: Any) -> None:
     badge = '<span class="badge">simulated</span>'
     assert badge in page.render([judged], title="t").decode()
@@ -68,6 +72,7 @@ def test_simulated_results_say_so_and_others_do_not(judged: Any) -> None:
     assert badge not in page.render([measured], title="t").decode()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_number_of_traces_is_the_readers_choice(judged: Any) -> None:
     drawn = [page.render([judged], title="t", traces=count).decode().count("Predictions beside") for count in (0, 1, 2)]
     assert drawn == [0, 1, 2]
@@ -107,7 +112,7 @@ def test_many_results_begin_with_a_comparison_and_only_a_few_are_told_in_full() 
         for name, ratio in (("PCA-20", 1.5), ("AE-C1-8", 1.2), ("raw", 0.5))
         for seed in range(3)
     ]
-    text = page.render(several, title="t").decode()
+    text = page.render(several, title="t", traces=1).decode()
     assert "<h2>3 methods in 9 results</h2>" in text
     assert re.findall(r"<h2>\d\. ([^<]+)</h2>", text) == ["forward: recurrent · raw", "forward: recurrent · PCA-20"]
     elements = Elements()
@@ -115,9 +120,10 @@ def test_many_results_begin_with_a_comparison_and_only_a_few_are_told_in_full() 
     assert elements.open == []
     assert all(one.startswith("#") for one in elements.loads)
     assert "nan" not in re.sub(r"<svg.*?</svg>", "", text, flags=re.DOTALL).lower()
-    assert page.render(several, title="t").decode() == text
+    assert page.render(several, title="t", traces=1).decode() == text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_two_results_are_compared_and_both_told_in_full(judged: Any) -> None:
     text = page.render([judged, result_fakes.result("raw")], title="t").decode()
     assert "2 methods in 2 results" in text
@@ -125,6 +131,7 @@ def test_two_results_are_compared_and_both_told_in_full(judged: Any) -> None:
     assert text.index('<span class="badge">') < text.index("<h2>1.")  # one simulated result marks the comparison
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_results_without_error_sums_stand_beside_those_that_are_compared() -> None:
     plain: Any = FakeDataset(
         files={"metrics.json": b'{"counts": {"recordings": 0}}', "config.json": b'{"task": "forward"}'},
@@ -136,6 +143,7 @@ def test_results_without_error_sums_stand_beside_those_that_are_compared() -> No
     assert "2 methods" not in page.render([result_fakes.result(), plain], title="t").decode()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_results_on_recordings_that_were_all_trained_on_are_not_compared() -> None:
     seen = []
     for seed in range(2):
@@ -146,6 +154,7 @@ def test_results_on_recordings_that_were_all_trained_on_are_not_compared() -> No
     assert "methods in" not in page.render(seen, title="t").decode()  # type: ignore[arg-type]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_latents_given_besides_results_tell_of_the_sweep_alone(judged: Any) -> None:
     text = page.render([judged, result_fakes.codec(2, loss=0.75), result_fakes.codec(4, loss=0.5)], title="t").decode()
     assert "Reconstruction error by number of latents" in text

@@ -46,6 +46,7 @@ def test_the_page_is_whole_and_the_same_results_give_the_same_bytes() -> None:
     assert text == page.render(given, title="t")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_tells_all_that_there_is() -> None:
     text = page.render([*everything(), material_fakes.recorded()], title="t").decode()
     for told in (
@@ -67,6 +68,7 @@ def test_the_page_tells_all_that_there_is() -> None:
         assert told in text, told
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("simulated", [False, True])
 def test_every_table_of_accuracies_says_what_they_cannot_show(simulated: bool) -> None:
     text = page.render(everything(simulated), title="t").decode()

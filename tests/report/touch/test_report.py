@@ -51,6 +51,7 @@ def test_all_parts_are_told_on_one_page_that_is_the_same_each_time() -> None:
         assert part in text, part
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("simulated", [False, True])
 def test_the_page_says_what_its_errors_cannot_show(simulated: bool) -> None:
     text = unescape(page.render(everything(simulated), title="t").decode())

@@ -1,0 +1,48 @@
+"""Tests within bounds: what takes too much memory or never ends is a failed test, and not a dead computer."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import signal
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+GIB = 1 << 30
+ENDS_S = 300  # for which a single piece of work may last, on a computer that is busy with other things
+LONGEST = 900  # letters of a sentence, a path of a test's folder in it
+
+
+@contextlib.contextmanager
+def bounded(memory: int = 2 * GIB) -> Iterator[None]:
+    """Let what runs in the block take so many bytes more of address space, and end."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = signal.signal(signal.SIGALRM, _overdue)
+    resource.setrlimit(resource.RLIMIT_AS, (held + memory, hard))
+    signal.alarm(ENDS_S)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def some(cases: Iterable[Any], quick: int) -> list[Any]:
+    """Return cases for `pytest.mark.parametrize`, all but the first ``quick`` with the mark ``faults``."""
+    return [case if row < quick else pytest.param(case, marks=pytest.mark.faults) for row, case in enumerate(cases)]
+
+
+def _overdue(*_: Any) -> None:
+    raise AssertionError("This did not end.")
+
+
+def is_sentence(text: str) -> bool:
+    """Return whether a text tells a reader something in three lines or less, and nothing to a terminal."""
+    lines = text.split("\n")
+    readable = all(line.isprintable() for line in lines)
+    return 10 < len(text) < LONGEST and len(lines) <= 3 and readable and "Traceback" not in text

@@ -1,0 +1,282 @@
+"""All that reads what others wrote, each as a function of bytes with valid examples: what hypothesis and atheris try.
+
+A function returns, or raises a `TacpipeError`; anything else is a defect. A format, a sensor or a kind of cloud that is
+registered is here by itself, or a test says that it is missing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import io
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tacpipe import manifest, params, registry
+from tacpipe.clouds import files as cloud_files
+from tacpipe.clouds.depth_frame import DepthFrame
+from tacpipe.codecs import codec as codecs
+from tacpipe.codecs.pca import fit
+from tacpipe.formats import pcd, ply
+from tacpipe.hashing import digest
+from tacpipe.links import report_descriptor
+from tacpipe.recording import rig, spool
+from tacpipe.sensors.framing import Chunks
+from tacpipe.tables import from_parquet, to_parquet
+from tests.formats import grasp_files, slide_files, xela_files
+from tests.promises import decoding
+from tests.sensors.test_every_sensor import CASES
+
+HERE = Path(__file__).parents[2]
+NAMED = Path("given")
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that reads bytes."""
+
+    name: str
+    run: Callable[[bytes], object]  # raises a TacpipeError for what it cannot read
+    examples: Callable[[], Sequence[bytes]]  # that it can
+    slow: bool = False  # a try takes more than a few milliseconds
+
+
+def targets() -> dict[str, Target]:
+    """Return all of them by name."""
+    found = [
+        Target("parquet", from_parquet, _parquets),
+        Target("manifest", lambda data: manifest.parse(data, "given"), _manifests),
+        Target("params", _params, lambda: [(HERE / "params.yaml").read_bytes(), b"synchronize: {rate_hz: 50}\n"]),
+        Target("rig", _rig, lambda: [path.read_bytes() for path in sorted((HERE / "rigs").glob("*.toml"))]),
+        Target("spool", _spool, _spools),
+        Target("pcd", lambda data: pcd.parsed(NAMED, data), _pcds),
+        Target("ply", lambda data: ply.parsed(NAMED, data), _plys),
+        Target("depth-frame", lambda data: DepthFrame.of_bytes(data).points(), _frames),
+        Target("report-descriptor", report_descriptor.parse, _descriptors),
+        Target("codec", _codec, lambda: _parts(_codec_files())),
+    ]
+    of = functools.partial
+    found += [Target(f"cloud{end}", of(_cloud, end), of(_clouds, end), True) for end in cloud_files.SUFFIXES]
+    found += [Target(f"format {name}", of(_format, name), of(_trees, name), True) for name in TREES]
+    found += [Target(f"sensor {case}", of(decoding.run, case), of(decoding.examples, case)) for case in CASES]
+    return {re.sub(r"[^a-z0-9.]+", "-", target.name): target for target in found}
+
+
+@functools.cache
+def _folder() -> Path:
+    """Return a folder of this process."""
+    return _temporary("fuzz")
+
+
+def _temporary(name: str) -> Path:
+    """Return a new folder, which goes when the process ends."""
+    folder = tempfile.mkdtemp(prefix=f"tacpipe-{name}-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def _written(name: str, data: bytes) -> Path:
+    path = _folder() / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+@functools.cache
+def _parquets() -> list[bytes]:
+    rng = np.random.default_rng(0)
+    columns = {
+        "t_ns": pa.array(np.arange(50) * 20_000_000),
+        "taxel": pa.array(rng.integers(0, 60_000, 50).astype(np.uint16)),
+        "force": pa.array(rng.normal(size=50)),
+        "event": pa.array(["start", "stop"] * 25),
+        "contact": pa.array([True, False] * 25),
+    }
+    field = pa.field("taxel", pa.uint16(), metadata={"unit": "count"})
+    small = pa.table({"taxel": columns["taxel"]}, pa.schema([field]))
+    foreign = io.BytesIO()
+    pq.write_table(pa.table(columns), foreign)
+    return [to_parquet(pa.table(columns)), to_parquet(small), to_parquet(small.slice(0, 0)), foreign.getvalue()]
+
+
+CHAIN = [{"stage": "ingest.xela-flat", "version": 1, "params": {}, "fitted": None}]
+
+
+@functools.cache
+def _manifests() -> list[bytes]:
+    shard = {"digest": digest("a"), "rows": 5, "bytes": 500}
+    entry = {"attributes": {"material": "cork", "trial": 3}, "shards": {"xela1": shard, "robot": shard}}
+    whole = manifest.Manifest(
+        "synchronize", 2, {"rate_hz": 50.0}, recordings={"trial-01": entry}, files={"codec.json": shard}, chain=CHAIN
+    )
+    return [whole.content, manifest.Manifest("split", 1).content]
+
+
+def _params(data: bytes) -> object:
+    stage = registry.load("synchronize")
+    return params.build("synchronize", stage, file=_written("params.yaml", data))
+
+
+def _rig(data: bytes) -> object:
+    found = rig.read(_written("rig.toml", data))
+    return [stream.sensor.fields() for stream in found.streams.values()]
+
+
+HEADER = {"output": "o", "recording": "r", "attributes": {}, "rig": "", "streams": ["a", "b"]}
+HEADER |= {"clock": {"monotonic_ns": 1, "utc_ns": 2}}
+
+
+def _spool(data: bytes) -> object:
+    """Read a spool whose header, or whose blocks are ``data``, as its first byte tells."""
+    headed = data[:1] == b"\1"
+    _written("spool/header.json", data[1:] if headed else json.dumps(HEADER).encode())
+    _written("spool/bytes", _spools()[0][1:] if headed else data[1:])
+    found = spool.Spooled(_folder() / "spool")
+    read = list(found.blocks())
+    for _, block in read:
+        if isinstance(block, Chunks):
+            assert sum(map(len, block.packets())) == len(block.data)
+    assert sum(damage.bytes for damage in found.damage) <= len(data) + len(_spools()[0])
+    return found.tallied()
+
+
+@functools.cache
+def _spools() -> list[bytes]:
+    made = spool.Spool(_folder(), HEADER, ["a", "b"])
+    for number in range(5):
+        made.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
+        made.note(spool.Note(number, "a", "lost", "unplugged"))
+    made.write()
+    content = (made.folder / "bytes").read_bytes()
+    made.close()
+    return [b"\0" + content, b"\1" + json.dumps(HEADER).encode()]
+
+
+@functools.cache
+def _pcds() -> list[bytes]:
+    points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
+    rows = "".join(f"{x:g} {y:g} {z:g} 4.2e+06\n" for x, y, z in points.tolist())
+    whole = grasp_files.header(8).encode() + grasp_files.packed(points, colours)
+    return [whole, whole + bytes(64), (grasp_files.header(8, "ascii") + rows).encode()]
+
+
+@functools.cache
+def _plys() -> list[bytes]:
+    points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
+    whole = ply.packed(points, colours)
+    text = whole[: whole.index(b"end_header")].replace(b"binary_little_endian", b"ascii") + b"end_header\n"
+    rows = "".join(f"{x:g} {y:g} {z:g} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(points, colours, strict=True))
+    return [whole, ply.packed(points, None), text + rows.encode()]
+
+
+@functools.cache
+def _frames() -> list[bytes]:
+    depth = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    coloured = DepthFrame(depth, (4.0, 4.0), (2.0, 1.5), 0.001, np.zeros((3, 4, 3), np.uint8))
+    return [coloured.to_bytes(), DepthFrame(depth, (4.0, 4.0), (2.0, 1.5), 0.001).to_bytes()]
+
+
+def _descriptors() -> list[bytes]:
+    return [bytes.fromhex("06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0")]
+
+
+@functools.cache
+def _codec_files() -> dict[str, bytes]:
+    names = [f"taxel{number}" for number in range(5)]
+    rows = np.random.default_rng(0).normal(size=(40, 5))
+    return dict(sorted(fit(rows, names, [{"stream": "xela1"}] * 5, components=2).to_files().items()))
+
+
+def _codec(data: bytes) -> object:
+    return codecs.load(replaced(_codec_files(), data))
+
+
+def replaced(files: dict[str, bytes], data: bytes) -> dict[str, bytes]:
+    """Return ``files`` with the content of one of them, as the first byte of ``data`` tells, taken from the rest."""
+    names = list(files)
+    return files | {names[data[0] % len(names)]: data[1:]} if data else files
+
+
+def _parts(files: dict[str, bytes]) -> list[bytes]:
+    return [bytes([number]) + content for number, content in enumerate(files.values())]
+
+
+def _cloud(suffix: str, data: bytes) -> object:
+    return cloud_files.read(_written(f"cloud{suffix}", data))
+
+
+@functools.cache
+def _clouds(suffix: str) -> list[bytes]:
+    from tests.clouds.test_files import write
+
+    points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
+    ways: list[dict[str, Any]] = [{}]
+    ways += [{"write_ascii": True}] if suffix in (".ply", ".pcd") else []
+    ways += [{"compressed": True}] if suffix == ".pcd" else []
+    normals = "".join(f"{x:g} {y:g} {z:g} 0 0 1\n" for x, y, z in points.tolist()).encode()
+    if suffix == ".xyzn":
+        return [normals]
+    return [write(_folder() / f"made{suffix}", points, colours, **way).read_bytes() for way in ways]
+
+
+def _biotac(folder: Path) -> None:
+    slide_files.write_biotac(folder)
+
+
+def _roboskin(folder: Path) -> None:
+    slide_files.write_roboskin(folder, slide_files.felt(1, 20))
+
+
+def _grasps(folder: Path) -> None:
+    grasp_files.write_grasp(folder)
+
+
+TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of each format
+    "biotac-slide": _biotac,
+    "roboskin": _roboskin,
+    "vision2tactile": _grasps,
+    "xela-flat": lambda folder: xela_files.write_flat(folder / "data_sample_a"),
+    "xela-psc": lambda folder: xela_files.write_psc(folder / "data_sample_a"),
+}
+
+
+@functools.cache
+def tree(name: str) -> tuple[Path, list[Path]]:
+    """Return a valid source of a format and the files in it, in order."""
+    folder = _temporary(name)
+    TREES[name](folder)
+    return folder, sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _format(name: str, data: bytes) -> object:
+    """Ingest a source one of whose files, as the first byte tells, holds the rest of ``data``."""
+    folder, paths = tree(name)
+    path = paths[data[0] % len(paths) if data else 0]
+    whole = path.read_bytes()
+    path.write_bytes(data[1:])
+    try:
+        return ingested(name, folder)
+    finally:
+        path.write_bytes(whole)
+
+
+def ingested(name: str, folder: Path) -> list[Any]:
+    """Return the recordings that a format reads in a folder."""
+    stage = registry.load(f"ingest.{name}")
+    assert stage.discover is not None
+    given = stage.params()
+    return [stage(given, files=files) for files in list(stage.discover(given, folder).values())[:3]]
+
+
+def _trees(name: str) -> list[bytes]:
+    return [bytes([number]) + path.read_bytes() for number, path in enumerate(tree(name)[1])]

@@ -1,0 +1,376 @@
+"""A model or codec from a stranger: JSON and safetensors are looked at first, and nothing else is opened."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import pickle
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load, save
+
+import tacpipe
+from tacpipe import registry
+from tacpipe.errors import TacpipeError
+from tacpipe.models.forest import Forest
+from tacpipe.tasks import forward, material, touch
+from tests import chain
+from tests.conftest import tacpipe as ran
+from tests.promises.counts import count
+from tests.promises.limits import GIB, bounded, is_sentence, some
+from tests.promises.mutations import mutated
+from tests.stages.learning_fakes import FakeDataset
+from tests.tasks.forward import trials
+from tests.tasks.material import textures
+from tests.tasks.touch import handmade
+
+Files = dict[str, bytes]
+SMALL = GIB  # memory that refusing a model may take
+ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}
+TASKS: Mapping[str, Any] = {"forward": forward, "material": material, "touch": touch}
+KINDS = ("forward recurrent", "touch strong", "forward gru", "material minirocket", "material raec", "touch pointnet")
+
+
+@functools.cache
+def _folder() -> Path:
+    import tempfile
+
+    return Path(tempfile.mkdtemp())
+
+
+@functools.cache
+def made(kind: str) -> Files:
+    """Return the files of a small model."""
+    task, _, architecture = kind.partition(" ")
+    folder = _folder() / kind.replace(" ", "-")
+    if kind == "forward recurrent":
+        latents = trials.compressed(*(trials.motion(seed) for seed in range(2)))
+        watched = trials.compressed(trials.motion(10), files=latents.files)
+        return dict(trials.trained(folder, latents, watched, architecture=architecture, epochs=1))
+    if task == "forward":
+        return dict(trials.trained(folder, architecture=architecture, epochs=1))
+    if task == "material":
+        return dict(textures.trained(folder, architecture=architecture, epochs=1))
+    changed = {**handmade.POINTNET, **ALL, "epochs": 1} if architecture == "pointnet" else {}
+    return dict(handmade.trained(folder, **changed))
+
+
+def loaded(kind: str, files: Mapping[str, bytes]) -> Any:
+    return TASKS[kind.partition(" ")[0]].load(files)
+
+
+def judged(kind: str, files: Mapping[str, bytes]) -> Any:
+    """Evaluate a model on a recording that fits it."""
+    task = kind.partition(" ")[0]
+    if task == "forward":
+        one = trials.motion(11)
+        latents = made(kind)  # of the codec as it was
+        given = trials.compressed(one, files=latents) if "codec.json" in latents else trials.dataset(one)
+    else:
+        given = textures.slides(8, 1) if task == "material" else handmade.recordings(6, 1)
+    stage: Any = registry.load("evaluate")
+    return stage(stage.params(), model=FakeDataset(files=files), recordings=given)
+
+
+@pytest.fixture(autouse=True)
+def _models_are_trained_before_memory_is_bounded(request: pytest.FixtureRequest) -> None:
+    told = getattr(getattr(request.node, "callspec", None), "params", {})
+    for kind in [told["kind"]] if "kind" in told else ["forward recurrent", "touch strong"]:
+        made(kind)
+    if "size" in told:
+        made(SIZES[told["case"]][0])
+
+
+def refused(read: Callable[[], object], match: str | None = None) -> None:
+    with bounded(SMALL), pytest.raises(TacpipeError, match=match) as error:
+        read()
+    assert is_sentence(str(error.value)), str(error.value)
+    count("hostile inputs refused")
+
+
+def with_config(files: Files, change: Callable[[dict[str, Any]], Any], name: str = "config.json") -> Files:
+    config = json.loads(files[name])
+    change(config)
+    return files | {name: json.dumps(config).encode()}
+
+
+def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the path of every value within values; of lists the first."""
+    if path:
+        yield path
+    children = tree.items() if isinstance(tree, dict) else list(enumerate(tree))[:1] if isinstance(tree, list) else ()
+    for key, value in children:
+        yield from leaves(value, (*path, key))
+
+
+def put(tree: Any, path: tuple[Any, ...], value: Any) -> None:
+    for key in path[:-1]:
+        tree = tree[key]
+    if value is DROPPED:
+        del tree[path[-1]]
+    else:
+        tree[path[-1]] = value
+
+
+DROPPED = object()
+VALUES: tuple[Any, ...] = (
+    DROPPED,
+    None,
+    -1,
+    10**9,
+    10**30,
+    1.5,
+    "x" * 1000,
+    "",
+    [],
+    {},
+    True,
+    [[1]],
+    float("nan"),
+    "../../x",
+    "\x1b[2J",
+)
+
+
+@pytest.mark.parametrize("kind", some(KINDS, 2))
+def test_a_model_that_nobody_changed_is_loaded_and_judged(kind: str) -> None:
+    with bounded(2 * SMALL):
+        assert loaded(kind, made(kind)) is not None
+        assert "metrics.json" in judged(kind, made(kind)).files
+
+
+def try_config(kind: str, name: str, share: float) -> None:
+    """Change each value of a JSON file in several ways: the model is refused, or judges as it should."""
+    random = Random(0)
+    tree = json.loads(made(kind)[name])
+    tried = 0
+    with bounded(2 * SMALL):
+        for path in leaves(tree):
+            for value in VALUES:
+                if random.random() > share:
+                    continue
+                files = with_config(made(kind), lambda config, at=path, new=value: put(config, at, new), name)  # type: ignore[misc]
+                tried += 1
+                try:
+                    with np.errstate(all="ignore"):
+                        judged(kind, files)
+                except TacpipeError as error:
+                    assert is_sentence(str(error)), str(error)
+    count("hostile inputs refused", tried)
+
+
+@pytest.mark.parametrize("kind", some(KINDS, 1))
+def test_a_configuration_that_was_changed_gives_a_sentence_or_a_result(kind: str) -> None:
+    try_config(kind, "config.json", 0.02)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_configuration_that_was_changed_anyhow_gives_a_sentence_or_a_result(kind: str) -> None:
+    try_config(kind, "config.json", 0.15)
+
+
+@pytest.mark.faults
+def test_a_codec_that_was_changed_anyhow_gives_a_sentence_or_a_result() -> None:
+    try_config("forward recurrent", "codec.json", 1.0)
+
+
+@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"null", b'{"task": []}', b"[" * 100_000, b"\xff\xfe", b'{"task": "os"}']
+)
+def test_a_configuration_that_is_none_is_refused(kind: str, content: bytes) -> None:
+    refused(lambda: loaded(kind, made(kind) | {"config.json": content}))
+
+
+SIZES: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "hidden units of a forecaster": ("forward gru", ("params", "hidden")),
+    "hidden units of the paper's": ("forward recurrent", ("params", "hidden")),
+    "context": ("forward gru", ("context",)),
+    "horizon": ("forward gru", ("horizon",)),
+    "hidden units of an autoencoder": ("material raec", ("shapes", "biotac", "hidden")),
+    "channels": ("material raec", ("shapes", "biotac", "channels")),
+    "frames": ("material raec", ("sensors", "biotac", "frames")),
+    "points": ("touch pointnet", ("params", "points")),
+    "draws": ("touch pointnet", ("params", "draws")),
+}
+
+
+@pytest.mark.parametrize("case", some(sorted(SIZES, key=lambda case: SIZES[case][0] not in KINDS[:2]), 1))
+@pytest.mark.parametrize("size", [10**7, 10**9, 10**12, 1 << 70])
+def test_a_size_that_the_weights_do_not_have_is_refused_before_memory_is_taken(case: str, size: int) -> None:
+    kind, path = SIZES[case]
+    refused(lambda: loaded(kind, with_config(made(kind), lambda config: put(config, path, size))))
+
+
+def weights(files: Files, change: Callable[[dict[str, torch.Tensor]], Any], name: str = "model.safetensors") -> Files:
+    tensors = {key: value.clone() for key, value in load(files[name]).items()}
+    change(tensors)
+    return files | {name: save(tensors)}
+
+
+@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_weights_that_are_not_finite_are_refused(kind: str, value: float) -> None:
+    def spoil(tensors: dict[str, torch.Tensor]) -> None:
+        name = next(key for key, one in sorted(tensors.items()) if one.is_floating_point() and "chosen" not in key)
+        tensors[name].view(-1)[0] = value
+
+    refused(lambda: loaded(kind, weights(made(kind), spoil)))
+
+
+@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("how", ["lost", "another shape", "transposed", "one more axis", "empty", "whole numbers"])
+def test_weights_of_other_shapes_are_refused(kind: str, how: str) -> None:
+    def spoil(tensors: dict[str, torch.Tensor]) -> None:
+        name = max(tensors, key=lambda key: (tensors[key].dim(), tensors[key].numel()))
+        one = tensors.pop(name)
+        if how != "lost":
+            tensors[name] = {
+                "another shape": torch.cat([one, one]),
+                "transposed": one.flatten()[: one.numel() - 1],
+                "one more axis": one[None].clone(),
+                "empty": one[:0].clone(),
+                "whole numbers": (one.flatten() * 0 + 1 << 20).to(torch.int64)
+                if not one.is_floating_point()
+                else one[..., :-1],
+            }[how].contiguous()
+
+    refused(lambda: judged(kind, weights(made(kind), spoil)))
+
+
+def safetensors(header: Any, body: bytes = b"", length: int | None = None) -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return struct.pack("<Q", len(text) if length is None else length) + text + body
+
+
+def a_tensor(kind: str = "F32", shape: Any = (2,), offsets: Any = (0, 8)) -> dict[str, Any]:
+    return {"a": {"dtype": kind, "shape": shape, "data_offsets": offsets}}
+
+
+HEADERS = {
+    "nothing": b"",
+    "a length beyond the file": safetensors({}, length=1 << 62),
+    "a length of half the memory": safetensors({}, length=1 << 30),
+    "no JSON": safetensors(b"{" * 1000),
+    "brackets": safetensors(b'{"a":' + b"[" * 100_000),
+    "a shape of terabytes": safetensors(a_tensor(shape=(1 << 20, 1 << 20, 1 << 20)), bytes(8)),
+    "a shape that overflows": safetensors(a_tensor(shape=(1 << 32, 1 << 32)), bytes(8)),
+    "a negative shape": safetensors(a_tensor(shape=(-1, -2)), bytes(8)),
+    "offsets beyond the file": safetensors(a_tensor(offsets=(0, 1 << 40)), bytes(8)),
+    "offsets that run backwards": safetensors(a_tensor(offsets=(8, 0)), bytes(8)),
+    "a type that is none": safetensors(a_tensor(kind="O"), bytes(8)),
+    "a pickle": pickle.dumps({"a": 1}),
+    "an archive, as torch.save writes": b"PK\x03\x04" + bytes(500),
+}
+
+
+@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("case", HEADERS)
+def test_weights_whose_header_lies_are_refused(kind: str, case: str) -> None:
+    refused(lambda: loaded(kind, made(kind) | {"model.safetensors": HEADERS[case]}), "safetensors")
+
+
+@pytest.mark.parametrize("case", HEADERS)
+@pytest.mark.parametrize("name", ["codec.safetensors", "baselines.safetensors"])
+def test_codecs_and_baselines_whose_header_lies_are_refused(case: str, name: str) -> None:
+    files = made("forward recurrent")
+    refused(lambda: loaded("forward recurrent", files | {name: HEADERS[case]}), "safetensors")
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_of_a_model_changed_in_hundreds_of_ways_give_a_sentence_or_a_result(kind: str) -> None:
+    files, random = made(kind), Random(0)
+    with bounded(2 * SMALL):
+        for _ in range(150):
+            name = random.choice(list(files))
+            try:
+                with np.errstate(all="ignore"):
+                    judged(kind, files | {name: mutated(files[name], list(files.values()), random)})
+            except TacpipeError as error:
+                assert is_sentence(str(error)), str(error)
+    count("inputs fuzzed", 150)
+
+
+def test_trees_whose_nodes_lead_back_are_refused_and_not_gone_round_for_ever() -> None:
+    def spoil(tensors: dict[str, torch.Tensor]) -> None:
+        name = next(key for key in tensors if key.endswith("children"))
+        tensors[name][3] = torch.tensor([0, 0], dtype=tensors[name].dtype)
+
+    refused(lambda: loaded("touch strong", weights(made("touch strong"), spoil)), "children of a forest")
+
+
+@pytest.mark.parametrize("part", ["roots", "children", "features"])
+@pytest.mark.parametrize("value", [-2, 1 << 30])
+def test_trees_that_point_beyond_their_nodes_are_refused(part: str, value: int) -> None:
+    def spoil(tensors: dict[str, torch.Tensor]) -> None:
+        name = next(key for key in tensors if key.endswith(part))
+        tensors[name].view(-1)[0] = value
+
+    refused(lambda: loaded("touch strong", weights(made("touch strong"), spoil)), "forest")
+
+
+def test_a_forest_as_it_was_grown_is_one() -> None:
+    rng = np.random.default_rng(0)
+    grown = Forest.fitted(rng.normal(size=(60, 4)), rng.normal(size=(60, 3)), trees=5, leaf=2, seed=0)
+    grown.check(4, 3)
+    for features, values in ((3, 3), (4, 2)):
+        with pytest.raises(ValueError):
+            grown.check(features, values)
+
+
+# ---- as commands
+
+
+class Opened:
+    """A pickle of this leaves a folder behind when it is opened."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (os.mkdir, (str(self.trace),))
+
+
+EVIL = (
+    "model.pt",
+    "model.pkl",
+    "model.bin",
+    "pytorch_model.bin",
+    "checkpoint.pt",
+    "config.pkl",
+    "codec.pkl",
+    "weights.npy",
+)
+
+
+@pytest.mark.faults
+def test_programs_beside_a_model_are_never_opened(chained: Path) -> None:
+    """Pickles lie in the folder of a model and of latents, and beside them; all that reads models reads these."""
+    trace = chained / "opened"
+    for folder in ("models/forward", "data/latents", "results/forward", "."):
+        for name in EVIL:
+            (chained / folder / name).write_bytes(pickle.dumps(Opened(trace)))
+        torch.save({"a": Opened(trace)}, chained / folder / "last.pt")
+    for command in (
+        "evaluate models/forward data/latents --split data/split -o results/again",
+        "predict models/forward data/latents --split data/split -o results/told",
+        "report results/forward -o again.html",
+        f"{chain.TRAIN} --epochs 1 --init models/forward -o models/on",
+    ):
+        done = ran(chained, command)
+        assert done.returncode == 0, done.stderr
+    assert tacpipe.load(chained / "models/forward") is not None
+    assert not trace.exists()
+    pickle.loads((chained / "models/forward/model.pkl").read_bytes())  # what a careless reader does
+    assert trace.exists()
+    count("hostile inputs refused", 4 * (len(EVIL) + 1))

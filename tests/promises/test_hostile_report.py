@@ -1,0 +1,150 @@
+"""Names and labels are text on the page of results, whatever they hold: nothing of them is run."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from html.parser import HTMLParser
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tacpipe.report import drawing, page
+from tests.promises.counts import count
+from tests.promises.limits import some
+from tests.report import elements
+from tests.report.forward import result_fakes
+from tests.report.material import material_fakes
+from tests.report.stream_shard import StreamShard
+from tests.report.test_page import other
+from tests.report.touch import touch_fakes
+from tests.stages.learning_fakes import FakeDataset, FakeShard
+
+HOSTILE = "\"'><script>alert('x')</script><img src=x onerror=alert(1)>&lt;svg onload=alert(2)> $\\frac{$ </style></svg>"
+Words = Mapping[str, str]
+
+
+class Tags(HTMLParser):
+    """Counts the elements of a page, and collects attributes that a browser would run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.runs: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.runs += [name for name, value in attrs if name.startswith("on") or "javascript:" in (value or "")]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def renamed(value: Any, words: Words) -> Any:
+    """Return a value with these words replaced wherever they stand as a text, a name, or the first part of one."""
+    if isinstance(value, str):
+        for word, new in words.items():
+            if value == word or value.startswith(f"{word}-") or value == f"object of {word}":
+                return value.replace(word, new)
+    if isinstance(value, Mapping):
+        return {renamed(key, words): renamed(one, words) for key, one in value.items()}
+    if isinstance(value, list):
+        return [renamed(one, words) for one in value]
+    return value
+
+
+def table(content: pa.Table, words: Words) -> pa.Table:
+    return pa.table({name: renamed(content.column(name).to_pylist(), words) for name in content.column_names})
+
+
+def file(name: str, content: bytes, words: Words) -> bytes:
+    if name.endswith(".json"):
+        return json.dumps(renamed(json.loads(content), words)).encode()
+    if name.endswith(".jsonl"):
+        return b"".join(json.dumps(renamed(json.loads(line), words)).encode() + b"\n" for line in content.splitlines())
+    text = io.StringIO()
+    if name.endswith(".csv"):
+        csv.writer(text).writerows(renamed(list(csv.reader(io.StringIO(content.decode()))), words))
+        return text.getvalue().encode()
+    binary = io.BytesIO()
+    pq.write_table(table(pq.read_table(io.BytesIO(content)), words), binary)
+    return binary.getvalue()
+
+
+def shard(one: Any, words: Words) -> Any:
+    name, attributes = (
+        renamed(one.name, words),
+        {**renamed(one.attributes, words), "note": words[NOTE], "object": words[NOTE]},
+    )
+    if isinstance(one, StreamShard):
+        return StreamShard(name, {stream: table(one.table(stream), words) for stream in one.streams}, attributes)
+    return FakeShard(name, one.content, attributes)
+
+
+def poisoned(result: Any, words: Words) -> Any:
+    """Return a result in which these words are others; its recordings get labels of the same."""
+    shards = [shard(one, words) for one in result.shards.values()]
+    files = {name: file(name, content, words) for name, content in result.files.items()}
+    return FakeDataset({one.name: one for one in shards}, files, renamed(result.manifest, words))
+
+
+NOTE = "note"
+RESULTS: dict[str, tuple[Callable[[], list[Any]], tuple[str, ...]]] = {  # results, and what is named by users in them
+    "forward": (lambda: [result_fakes.result()], ("r1", "r3", "PCA-20", "recurrent", "ab" * 32, "synchronize")),
+    "several forward": (
+        lambda: [result_fakes.result(seed=0), result_fakes.result("PCA-8", seed=1, ratio=0.4)],
+        ("r1", "PCA-20", "PCA-8", "rate_hz"),
+    ),
+    "material": (
+        lambda: [
+            material_fakes.result("raec", wrong={"biotac": 2, "roboskin": 1}, epochs=2),
+            material_fakes.recorded(),
+        ],
+        ("moved at 12 mm/s", "segment.slides", "cd" * 32),
+    ),
+    "touch": (
+        lambda: [touch_fakes.result("strong", novel=("drill",)), touch_fakes.recorded()],
+        ("bleach", "drill", "segment.grasps"),
+    ),
+    "of another task": (
+        lambda: [other("touch2", simulated=True)],
+        ("touch2", "graph_net", "near", "model", "evaluate"),
+    ),
+}
+
+
+def rendered(case: str, new: str) -> Tags:
+    make, names = RESULTS[case]
+    words = {name: f"{new}{place}" for place, name in enumerate(names)} | {NOTE: new}
+    text = page.render([poisoned(one, words) for one in make()], title=new).decode()
+    elements.check(text.replace("<line", "<line").replace(" nan", ""))
+    found = Tags()
+    found.feed(text)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+@pytest.mark.parametrize("case", some(sorted(RESULTS, key=lambda case: case != "of another task"), 2))
+def test_nothing_that_a_label_holds_becomes_an_element_of_the_page(case: str) -> None:
+    found, harmless = rendered(case, HOSTILE), rendered(case, "harmless")
+    assert found.tags == harmless.tags
+    assert found.runs == []
+    assert HOSTILE in found.text
+    count("hostile inputs refused", len(RESULTS[case][1]))
+
+
+def test_the_title_of_a_figure_is_text_too() -> None:
+    def draw(axes: list[Any]) -> None:
+        axes[0].plot([0, 1], [1, 0], label=HOSTILE)
+        axes[0].set_title(HOSTILE)
+        drawing.legend_below(axes[0])
+
+    found = Tags()
+    found.feed(drawing.svg(draw, HOSTILE, (4, 3)))
+    assert not found.tags & {"script", "img"} and found.runs == []
+    assert "alert('x')" in found.text
