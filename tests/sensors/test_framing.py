@@ -141,6 +141,97 @@ def test_after_noise_cuts_and_bursts_no_frame_is_wrong_and_few_are_lost(
     assert len(found) >= len(sent) - 2 - len(harmed) - 4 * len(faults)
 
 
+@st.composite
+def mixtures(draw: st.DrawFn, kind: str) -> bytes:
+    """Draw a stream of frames in which anything stands between them, whole frames, parts of frames and marks included."""
+    sent = made(kind, 30, draw(st.integers(0, 1000)))
+    framing = KINDS[kind]
+    parts = st.tuples(st.integers(0, 29), st.integers(0, 60), st.integers(0, 60))
+    between = (
+        st.binary(max_size=80)
+        | st.sampled_from([framing.marker, framing.tail, framing.marker * 3 + framing.tail])
+        | parts.map(lambda part: sent[part[0]][part[1] : part[1] + part[2]])
+        | st.integers(0, 29).map(lambda number: sent[number])
+    )
+    junk = draw(st.dictionaries(st.integers(0, 30), st.lists(between, max_size=3), max_size=5))
+    return b"".join(b"".join(junk.get(row, [])) + (sent[row] if row < 30 else b"") for row in range(31))
+
+
+sizes_of_pieces = st.lists(st.integers(1, 90) | st.integers(200, 2000), min_size=1, max_size=6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(data=st.data(), sizes=sizes_of_pieces)
+def test_after_every_piece_each_byte_is_framed_lost_or_pending_and_frames_stand_in_the_bytes_in_order(
+    kind: str, data: st.DataObject, sizes: list[int]
+) -> None:
+    stream, framing = data.draw(mixtures(kind)), KINDS[kind]
+    framer = ByteFramer(framing)
+    runs: list[Run] = []
+    losses: list[Loss] = []
+    ends: list[int] = []  # of each piece, whose number is the time at which it came
+    for step in range(len(stream) + 1):
+        start = ends[-1] if ends else 0
+        piece = stream[start : start + sizes[step % len(sizes)]]
+        ends.append(start + len(piece))
+        found, lost = framer.feed(Chunks.of([(step, piece)])) if piece else framer.flush()
+        runs, losses = runs + found, losses + lost
+        assert framer.account.received == ends[-1]
+        assert framer.account.framed == sum(map(len, frames_of(runs)))
+        assert framer.account.lost == sum(loss.bytes for loss in losses)
+        assert framer.account.pending >= 0
+        if not piece:
+            break
+    assert framer.account.pending == 0
+    place = 0
+    for frame, t_ns in zip(frames_of(runs), [t_ns for run in runs for t_ns in run.t_ns.tolist()], strict=True):
+        begins = stream.index(frame, place)
+        place = begins + len(frame)
+        assert ends[t_ns] >= place  # it did not come before its last byte
+        assert frame.startswith(framing.marker) and frame.endswith(framing.tail)
+        assert framing.check is None or framing.check(np.frombuffer(frame, np.uint8)[None])[0]
+    assert all(loss.bytes > 0 and loss.frames >= 0 for loss in losses)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(data=st.data(), sizes=sizes_of_pieces)
+def test_how_a_harmed_stream_is_cut_into_pieces_changes_no_frame(
+    kind: str, data: st.DataObject, sizes: list[int]
+) -> None:
+    stream = data.draw(mixtures(kind))
+    found = [frames_of(fed(ByteFramer(KINDS[kind]), stream, pieces)[0]) for pieces in (sizes, [1], [len(stream)])]
+    assert found[0] == found[1] == found[2]
+
+
+@given(st.lists(st.binary(max_size=20) | st.sampled_from([b"\n", b"12\n", b"\r\n", b"x\n"])), sizes_of_pieces)
+def test_lines_too_account_for_every_byte_and_are_the_same_however_they_are_cut(
+    pieces: list[bytes], sizes: list[int]
+) -> None:
+    stream, found = b"".join(pieces), []
+    for cut in (sizes, [1], [max(1, len(stream))]):
+        framer = LineFramer(lambda line: line.isdigit())
+        runs, losses = fed(framer, stream, cut)
+        assert framer.account.pending == 0 and framer.account.received == len(stream)
+        assert framer.account.lost == sum(loss.bytes for loss in losses)
+        found.append([line for run in runs for line in run.frames])
+    whole = [line.strip() for line in stream.split(b"\n")[1:-1]]
+    assert found == [[line for line in whole if line.isdigit()]] * 3
+
+
+@given(st.lists(st.binary(max_size=20) | st.integers(0, 9).map(lambda row: made("strong", 10, 0)[row])))
+def test_packets_are_frames_or_losses_one_for_one(packets: list[bytes]) -> None:
+    framer = PacketFramer([16], sum16_is_right)
+    runs, losses = framer.feed(Chunks.of(list(enumerate(packets))))
+    good = [number for number, packet in enumerate(packets) if packet in made("strong", 10, 0)]
+    assert [t_ns for run in runs for t_ns in run.t_ns.tolist()] == good
+    assert frames_of(runs) == [packets[number] for number in good]
+    bad = [(number, len(packet)) for number, packet in enumerate(packets) if number not in good]
+    assert sorted((loss.t_ns, loss.bytes) for loss in losses) == bad
+    account = framer.account
+    assert (account.framed, account.lost) == (16 * len(good), sum(size for _, size in bad))
+    assert account.pending == 0
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_first_two_frames_after_a_disturbance_are_given_out(kind: str) -> None:
     sent = made(kind, 40, 3)

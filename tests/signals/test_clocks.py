@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import timeit
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -121,6 +122,75 @@ def test_where_the_two_clocks_begin_changes_nothing_but_the_offset(host_ns: int,
     fit, moved = fit_clock(device_ns, arrival_ns), fit_clock(device_ns + boot_ns, arrival_ns + host_ns)
     assert moved.offset_ns == fit.offset_ns + host_ns - boot_ns
     assert moved.drift_ppm == fit.drift_ppm
+
+
+DELAYS: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {  # in the mean one
+    "none": lambda rng, count: np.zeros(count),
+    "exponential": lambda rng, count: rng.exponential(1.0, count),
+    "uniform": lambda rng, count: rng.uniform(0.0, 2.0, count),
+    "heavy": lambda rng, count: np.minimum(rng.lognormal(-0.5, 1.0, count), 10.0),
+    "constant": lambda rng, count: np.ones(count),
+}
+
+
+@st.composite
+def restarting_links(draw: st.DrawFn) -> tuple[Link, list[int], float, int]:
+    """Draw a link of any drift and any delays whose device restarts, where, its drift in ppm and its mean delay in ns."""
+    rate_hz, seconds = draw(st.sampled_from([25, 50, 120, 400])), draw(st.integers(12, 30))
+    ppm, delay_ns = draw(st.floats(-500, 500)), draw(st.sampled_from([20_000, 500_000, 2 * MS]))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    taken_ns = np.rint(np.arange(rate_hz * seconds) * 1e9 / rate_hz).astype(np.int64)
+    late_ns = DELAYS[draw(st.sampled_from(sorted(DELAYS)))](rng, len(taken_ns)) * delay_ns
+    device_ns = BOOT_NS + taken_ns + np.rint(taken_ns * ppm * 1e-6).astype(np.int64)
+    restarts = sorted(draw(st.sets(st.sampled_from([4, 8]), max_size=2)))
+    rows = [rate_hz * second for second in restarts if second + 4 <= seconds]
+    for row in rows:
+        device_ns[row:] -= device_ns[row] - draw(st.integers(0, S))
+    arrival_ns = np.maximum.accumulate(taken_ns + late_ns.astype(np.int64))
+    return (HOST_NS + taken_ns, device_ns, HOST_NS + arrival_ns), rows, ppm, delay_ns
+
+
+@settings(deadline=None, max_examples=60)
+@given(restarting_links())
+def test_whatever_the_drift_the_delays_and_the_restarts_times_are_right_within_a_few_delays(
+    drawn: tuple[Link, list[int], float, int],
+) -> None:
+    (taken_ns, device_ns, arrival_ns), restarts, ppm, delay_ns = drawn
+    fit = fit_clock(device_ns, arrival_ns)
+    assert [one.start for one in fit.segments] == [0, *restarts]
+    found = host_times(fit, device_ns, arrival_ns)
+    longest = fit.longest
+    assert np.abs(found - taken_ns).max() <= 4 * delay_ns + 2
+    span_ns = taken_ns[longest.stop - 1] - taken_ns[longest.start]
+    assert abs(fit.drift_ppm + ppm) <= 0.5 + 1e6 * 4 * delay_ns / span_ns  # half a ppm: 1 / (1 + x) is not 1 - x
+    assert (
+        found <= arrival_ns + delay_ns
+    ).all()  # nothing is felt before it happens, but for stamps held for wrong ones
+
+
+@settings(deadline=None, max_examples=60)
+@given(restarting_links(), st.floats(-200, 200))
+def test_how_fast_the_device_counts_changes_its_drift_and_no_time(
+    drawn: tuple[Link, list[int], float, int], faster_ppm: float
+) -> None:
+    (_, device_ns, arrival_ns), *_ = drawn
+    factor = 1 + faster_ppm * 1e-6
+    other_ns = np.rint((device_ns - device_ns[0]) * factor).astype(np.int64) + device_ns[0]
+    fit, scaled = fit_clock(device_ns, arrival_ns), fit_clock(other_ns, arrival_ns)
+    apart_ns = host_times(scaled, other_ns, arrival_ns) - host_times(fit, device_ns, arrival_ns)
+    assert np.abs(apart_ns).max() <= 2_000
+    assert (1 + scaled.longest.drift) * factor == pytest.approx(1 + fit.longest.drift, abs=1e-7)
+
+
+@settings(deadline=None, max_examples=40)
+@given(restarting_links(), st.integers(-(10**17), 10**17))
+def test_a_link_that_is_slower_by_a_constant_shifts_every_time_by_it(
+    drawn: tuple[Link, list[int], float, int], later_ns: int
+) -> None:
+    (_, device_ns, arrival_ns), *_ = drawn
+    times = host_times(fit_clock(device_ns, arrival_ns), device_ns, arrival_ns)
+    later = arrival_ns + later_ns
+    assert np.array_equal(host_times(fit_clock(device_ns, later), device_ns, later), times + later_ns)
 
 
 def test_one_sample_is_where_it_came() -> None:

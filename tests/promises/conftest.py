@@ -1,0 +1,28 @@
+"""A sound project that took some seconds to make, and copies of it to be harmed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Lab, made_once
+from tests.promises import specimen
+from tests.promises.specimen import Specimen
+
+
+@pytest.fixture
+def made(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound project."""
+
+    def make(folder: Path) -> None:
+        specimen.make(lab)
+        specimen.clone(lab.folder, folder)
+
+    return made_once(tmp_path_factory, "specimen", make)
+
+
+@pytest.fixture
+def one(made: Path, lab: Lab) -> Specimen:
+    """A copy of a sound project."""
+    return specimen.copy(made, lab)

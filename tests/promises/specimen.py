@@ -1,0 +1,166 @@
+"""A project in which all is there that a store can hold, what it held when it was sound, and ways to look at it since."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import tacpipe
+from tacpipe.errors import DAMAGED, TacpipeError, UsageError
+from tacpipe.hashing import bytes_digest
+from tacpipe.manifest import NAME, Manifest, parse
+from tests.any_table import bits
+from tests.conftest import Lab, Ran
+
+CHAIN = (
+    "ingest numbers src -o data/recordings --jobs 1",
+    "simulate toy --trials 2 --rows 6 -o data/simulated --jobs 1",
+    "scale data/recordings -o data/scaled --jobs 1",
+    "named data/simulated -o data/named --jobs 1",
+    "halves data/scaled -o data/split --jobs 1",
+    "centre data/scaled --split data/split -o data/centred --jobs 1",
+    "total data/scaled -o data/total --jobs 1",
+)
+LABEL = "label data/recordings a --set material=foam"  # by hand: no rerun would know it
+Contents = dict[str, Any]  # path within a dataset to bits of a table, or to bytes of a file
+
+
+def make(lab: Lab) -> None:
+    """Run the chain in an empty project."""
+    source = lab.folder / "src"
+    source.mkdir()
+    for number, name in enumerate("abc"):
+        (source / f"{name}.txt").write_text(" ".join(str(value + 5 * number) for value in range(10)))
+    lab.run(CHAIN[0])
+    lab.run(LABEL)
+    for command in CHAIN[1:]:
+        lab.run(command)
+
+
+@dataclass
+class Specimen:
+    """A copy of the project, which is to be harmed, beside what it held before."""
+
+    lab: Lab
+    sound: Mapping[str, bytes]  # every file beneath data/
+    manifests: Mapping[str, Manifest]
+
+    @property
+    def folder(self) -> Path:
+        """The project."""
+        return self.lab.folder
+
+    @property
+    def store(self) -> Path:
+        """The folder of its store."""
+        return self.lab.folder / ".tacpipe"
+
+    def object(self, dataset: str, path: str) -> Path:
+        """Return the object that a dataset names at a path; its own manifest's if the path is empty."""
+        named = dict(self.manifests[dataset].objects())
+        name = named[path] if path else bytes_digest(self.sound[f"{dataset}/{NAME}"])
+        return self.store / "objects" / name[:2] / name
+
+    def needed(self) -> set[str]:
+        """Return the digests of all that the datasets are made of, their manifests included."""
+        named = {name for manifest in self.manifests.values() for _, name in manifest.objects()}
+        return named | {bytes_digest(manifest.content) for manifest in self.manifests.values()}
+
+    def records(self, stage: str, of: str = "stage") -> list[Path]:
+        """Return the records of what a stage made (of its runs: ``of="run"``), by name."""
+        found = [
+            self.store / "records" / key[:2] / f"{key}.json"
+            for key, record in self.lab.store.records()
+            if record["identity"].get(of) == stage
+        ]
+        assert found, stage
+        return found
+
+    def expected(self, dataset: str) -> Contents:
+        """Return what a dataset held."""
+        paths = [path for path, _ in self.manifests[dataset].objects()]
+        return {path: told(self.sound[f"{dataset}/{path}"], path) for path in paths}
+
+    def rerun(self) -> list[Ran]:
+        """Run the chain again, whatever its commands say."""
+        return [self.lab.call(command) for command in CHAIN]
+
+    def shown(self) -> dict[str, bytes]:
+        """Return every file beneath data/ as it is now."""
+        return files(self.folder / "data")
+
+    def served(self) -> dict[str, bool]:
+        """Return of each dataset whether it was read right; otherwise it was refused with the documented code.
+
+        Anything else, above all anything that was not put in, fails.
+        """
+        return {dataset: self._served(dataset) for dataset in self.manifests}
+
+    def _served(self, dataset: str) -> bool:
+        try:
+            found = held(self.folder / "data" / dataset)
+        except TacpipeError as error:
+            sentence = str(error)
+            assert error.exit_code == DAMAGED or (isinstance(error, UsageError) and "no manifest.json" in sentence)
+            assert sentence.endswith(".") and "\n" not in sentence, sentence
+            return False
+        assert found == self.expected(dataset), f"{dataset} holds what nobody put there"
+        return True
+
+
+def held(path: Path) -> Contents:
+    """Return all that a dataset gives to whoever opens it."""
+    dataset = tacpipe.open(path)
+    found: Contents = {}
+    for name, shard in dataset.shards.items():
+        for stream in shard.streams:
+            found[f"{name}/{stream}.parquet" if stream else f"{name}.parquet"] = bits(shard.table(stream))
+    return {**found, **dict(dataset.files)}
+
+
+def told(content: bytes, path: str) -> Any:
+    """Return what a file of a dataset says, read by other means."""
+    return bits(pq.read_table(pa.BufferReader(content))) if path.endswith(".parquet") else content
+
+
+def copy(made: Path, lab: Lab) -> Specimen:
+    """Return a copy of a project that was made, its hard links kept, in place of what is in the folder of ``lab``."""
+    for path in lab.folder.iterdir():
+        shutil.rmtree(path)
+    clone(made, lab.folder)
+    sound = files(made / "data")
+    manifests = {name.parent.name: parse(sound[str(name)], str(name)) for name in map(Path, sound) if name.name == NAME}
+    return Specimen(lab, sound, manifests)
+
+
+def clone(made: Path, folder: Path) -> None:
+    """Copy a project with times, modes and hard links."""
+    subprocess.run(["cp", "-a", f"{made}/.", str(folder)], check=True)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Return the content of every file beneath a folder by its path."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in beneath(folder)}
+
+
+def beneath(folder: Path) -> Iterator[Path]:
+    """Yield every file beneath a folder, sorted."""
+    for place, folders, names in os.walk(folder):
+        folders.sort()
+        yield from (Path(place) / name for name in sorted(names))
+
+
+def age(folder: Path, days: float = 30.0) -> None:
+    """Make every file beneath a folder look old."""
+    then_s = time.time() - days * 86400
+    for path in beneath(folder):
+        os.utime(path, (then_s, then_s))

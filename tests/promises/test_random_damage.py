@@ -1,0 +1,68 @@
+"""Any number of files of a project harmed anyhow: nothing wrong is ever read, and all is healed but what no one knows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tacpipe.errors import DAMAGED
+from tests.conftest import Lab
+from tests.promises import damages, specimen
+from tests.promises.counts import count
+from tests.promises.specimen import CHAIN, Specimen
+
+Harm = tuple[int, str, float, int]  # number of the file, damage, where a bit is flipped and which
+HARMS = st.tuples(st.integers(0, 10**6), st.sampled_from(sorted(damages.ALL)), st.floats(0, 1), st.integers(1, 255))
+FIRST = st.sampled_from(["", "store verify", "store repair", "store gc --recordings --grace-days 0", *CHAIN])
+BY_HAND = "recordings/manifest.json"
+
+
+def harm(one: Specimen, harms: list[Harm]) -> None:
+    """Harm files of the store and beneath data/; the mark of the store's format is left alone."""
+    for number, damage, share, mask in harms:
+        there = [path for path in specimen.beneath(one.store) if path.name != "format"]
+        there += specimen.beneath(one.folder / "data")
+        path = there[number % len(there)]
+        if path.stat().st_size:
+            damages.flip(path, share, mask) if damage == "a bit is flipped" else damages.ALL[damage](path)
+            count("corruptions found")
+
+
+def nothing_wrong_is_read_and_all_is_healed(one: Specimen, harms: list[Harm], first: str) -> None:
+    harm(one, harms)
+    one.served()  # right, or refused
+    commands = [*([first] if first else []), "store verify", "store repair", *CHAIN]
+    for ran in map(one.lab.call, commands):
+        assert ran.code in (0, 2, DAMAGED), ran
+        named = ran.err or any(word in ran.out for word in ("damaged", "missing", "cannot be made"))
+        assert "Traceback" not in ran.err and (ran.code == 0 or named), ran
+    one.served()
+    (one.folder / "data" / BY_HAND).write_bytes(one.sound[BY_HAND])  # as git does: its label may be nowhere else
+    for ran in one.rerun():
+        assert ran.code == 0, ran
+    assert one.shown() == dict(one.sound)
+    assert one.lab.call("store repair").code == 0
+    assert one.lab.call("store verify").code == 0
+    specimen.age(one.folder)
+    assert one.lab.call("store gc --recordings --grace-days 0").code == 0
+    assert all(one.served().values())
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@given(harms=st.lists(HARMS, min_size=1, max_size=8), first=FIRST)
+def test_whatever_is_damaged_nothing_wrong_is_read_and_all_is_healed(
+    made: Path, lab: Lab, harms: list[Harm], first: str
+) -> None:
+    nothing_wrong_is_read_and_all_is_healed(specimen.copy(made, lab), harms, first)
+
+
+@pytest.mark.faults
+@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
+@given(harms=st.lists(HARMS, min_size=1, max_size=40), first=FIRST)
+def test_however_much_is_damaged_nothing_wrong_is_read_and_all_is_healed(
+    made: Path, lab: Lab, harms: list[Harm], first: str
+) -> None:
+    nothing_wrong_is_read_and_all_is_healed(specimen.copy(made, lab), harms, first)
