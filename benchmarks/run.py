@@ -22,6 +22,7 @@ import timing
 MODULES = (
     "startup",
     "small",
+    "verified_reads",
     "synchronization",
     "decode",
     "forward_training",

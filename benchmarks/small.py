@@ -30,7 +30,7 @@ for path in sorted(source.glob("*.parquet")):
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
     """Return what `tacpipe` takes at 1,000 shards that are there, and for each that is not."""
-    plugin = _plugin(folder)
+    plugin = timing.plugin(folder, "small_stages", ENTRY_POINTS)
     project = folder / "small"
     (project / ".tacpipe").mkdir(parents=True)
 
@@ -72,12 +72,3 @@ def _overhead(project: Path, plugin: Path, rounds: int) -> timing.Line:
         "below 5 ms",
         extra < 5.0,
     )
-
-
-def _plugin(folder: Path) -> Path:
-    """Return the folder of an installed plug-in that holds the small stages."""
-    plugin = folder / "plugin"
-    (plugin / "small.egg-info").mkdir(parents=True)
-    (plugin / "small.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
-    shutil.copy(HERE / "small_stages.py", plugin)
-    return plugin

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import statistics
 import subprocess
 import sys
@@ -72,6 +73,15 @@ def run(command: str | Sequence[str], folder: Path | None = None, **environment:
     )
     if done.returncode:
         raise SystemExit(f"{shlex.join(words)} ended with {done.returncode}: {done.stderr}")
+
+
+def plugin(folder: Path, module: str, entry_points: str) -> Path:
+    """Return the folder of an installed plug-in that holds a module which lies beside this one."""
+    place = folder / f"plugin-{module}"
+    (place / "bench.egg-info").mkdir(parents=True)
+    (place / "bench.egg-info" / "entry_points.txt").write_text(entry_points)
+    shutil.copy(Path(__file__).with_name(f"{module}.py"), place)
+    return place
 
 
 def environment_of(**more: str) -> dict[str, str]:

@@ -1,0 +1,268 @@
+"""Faults, each done to any tool in the same way; what became of it is looked at, never assumed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from trust_lab import RECORDINGS, VICTIM, Cell, edited, finished, truncated
+from trust_steps import NOISE, PAUSE
+from trust_tools import TOOLS, Dvc, Tool, removed, up_to
+
+CROWD = 8
+SOON_S = 5.0
+Fault = Callable[[Tool, Path], Cell]
+
+
+# ---- damage
+
+
+def edited_output(tool: Tool, folder: Path) -> Cell:
+    """An output is edited in place, its size and time kept; then the next stage runs."""
+    if not isinstance(tool, Dvc):
+        return _edited_output(tool, folder)
+    plain, linked = _edited_output(tool, folder), _edited_output(Dvc("hardlink"), folder.with_name("hardlink"))
+    return Cell(f"{plain.told}; with cache.type hardlink: {linked.told}", bool(plain.good and linked.good))
+
+
+def _edited_output(tool: Tool, folder: Path) -> Cell:
+    lab = tool.lab(folder)
+    up_to(tool, lab, "scale")
+    place = tool.shown(lab, "scale")
+    victim = tool.stored(lab, "scale") if place is None else next(place.glob(f"{VICTIM}.*"))
+    edited(victim)
+    done = lab.run(tool.words(lab, "total"))
+    where = "it has no workspace, so its cached file was edited; " if place is None else ""
+    if tool.values(lab, "total") == lab.right("total"):
+        again = len(lab.computed("scale")) > len(RECORDINGS)
+        return Cell(f"{where}the sum is right{', the edited recording was made again' if again else ''}", True)
+    told = f"found (exit code {done.code}), not mended" if done.code else "the edited numbers are summed, exit code 0"
+    return Cell(f"{where}{told}", False)
+
+
+def damaged(harm: Callable[[Path], None]) -> Fault:
+    """Return the fault of a cached file that is harmed, before the output is brought back and read on."""
+
+    def fault(tool: Tool, folder: Path) -> Cell:
+        lab = tool.lab(folder)
+        up_to(tool, lab, "scale")
+        harm(tool.stored(lab, "scale"))
+        removed(tool, lab, "scale")
+        done = tool.bring_back(lab, "scale")
+        served = tool.values(lab, "scale")
+        summed = lab.run(tool.words(lab, "total"))
+        if served == lab.right("scale") and tool.values(lab, "total") == lab.right("total"):
+            more = len(lab.computed("scale")) - len(RECORDINGS)
+            told = {0: "the output is right", 1: "found, the recording alone is made again"}
+            return Cell(told.get(more, "found, all recordings are made again"), True)
+        if done.code:
+            return Cell(f"found (exit code {done.code}), not mended", False)
+        after = "the next stage fails on it" if summed.code else "the next stage sums it"
+        return Cell(f"brought back as it is, exit code 0; {after}", False)
+
+    return fault
+
+
+# ---- ends
+
+
+def killed(tool: Tool, folder: Path) -> Cell:
+    """The tool is killed (SIGKILL) with a stage at work; at once it is run again, with another factor."""
+    lab = tool.lab(folder)
+    up_to(tool, lab, "load")
+    process = lab.start_gated(tool.words(lab, "scale"), "scale")
+    process.kill()
+    process.wait()
+    _close(process)
+    goes_on = not lab.still(SOON_S)
+    done = lab.run(tool.words(lab, "scale", 3))
+    lab.open_gate()
+    lab.still(SOON_S)
+    served = tool.values(lab, "scale", 3)
+    again = lab.run(tool.words(lab, "scale", 3))
+    right, right_again = (found == lab.right("scale", 3) for found in (served, tool.values(lab, "scale", 3)))
+    told = [
+        "what it started goes on" if goes_on else "what it started ends with it",
+        f"the next run ends with {done.code}",
+        "and is right" if right else "and what the old one writes ends up in its output",
+    ]
+    if not right:
+        told.append(f"the run after that ({again.code}) {'mends it' if right_again else 'leaves it so'}")
+    return Cell(", ".join(told), done.code == again.code == 0 and right and right_again)
+
+
+def interrupted(tool: Tool, folder: Path) -> Cell:
+    """Ctrl-C, to all that the terminal runs, with a stage at work."""
+    lab = tool.lab(folder)
+    up_to(tool, lab, "load")
+    process = lab.start_gated(tool.words(lab, "scale"), "scale")
+    begun = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    done = finished(process)
+    soon = time.monotonic() - begun < SOON_S
+    still = lab.still(SOON_S)
+    place = tool.shown(lab, "scale")
+    partial = place is not None and any(place.glob("rec-*"))
+    lab.must(tool.words(lab, "scale"))
+    right = tool.values(lab, "scale") == lab.right("scale")
+    told = [
+        f"exit code {done.code} {'at once' if soon else 'late'}",
+        "a traceback" if "Traceback" in done.said else "no traceback",
+        "a partial output stays in the workspace" if partial else "no partial output",
+        "the rerun is right" if right else "the rerun is wrong",
+    ]
+    if not still:
+        told.append("processes stay")
+    return Cell(", ".join(told), done.code != 0 and soon and still and right and not partial)
+
+
+# ---- company
+
+
+def crowd(tool: Tool, folder: Path) -> Cell:
+    """Eight runs of the same stage at once."""
+    lab = tool.lab(folder)
+    up_to(tool, lab, "load")
+    words = tool.words(lab, "scale")
+    processes = [lab.start(words, **{PAUSE: "0.1"}) for _ in range(CROWD)]
+    codes = Counter(finished(process).code for process in processes)
+    times = Counter(lab.computed("scale")).values()
+    right = tool.values(lab, "scale") == lab.right("scale")
+    failed = CROWD - codes[0]
+    told = [
+        f"some fail (exit code {', '.join(str(code) for code in sorted(codes) if code)})" if failed else "all succeed",
+        "each recording is computed once" if max(times) == 1 else "recordings are computed several times",
+        "the result is right" if right else "the result is wrong",
+    ]
+    return Cell(", ".join(told), not failed and max(times) == 1 and right)
+
+
+def collected(tool: Tool, folder: Path) -> Cell:
+    """What is not needed is removed while a stage runs; then the outputs are brought back and read on."""
+    lab = tool.lab(folder)
+    up_to(tool, lab, "load")
+    process = lab.start_gated(tool.words(lab, "scale"), "scale")
+    cleaned = lab.run(tool.cleaning())
+    lab.open_gate()
+    done = finished(process)
+    before = len(lab.computed("scale"))
+    for step in ("load", "scale"):
+        removed(tool, lab, step)
+        tool.bring_back(lab, step)
+    summed = lab.run(tool.words(lab, "total"))
+    right = tool.values(lab, "scale") == lab.right("scale") and tool.values(lab, "total") == lab.right("total")
+    lost = len(lab.computed("scale")) - before
+    knows = tool.shown(lab, "scale") is not None  # what is needed; the other kind frees what it is told to, here all
+    told = [
+        f"the collection ends with {cleaned.code}, the run with {done.code}",
+        "results of the run were removed and are made again" if lost else "nothing needed is removed",
+        "all is right" if right else f"what comes next is wrong (exit code {summed.code})",
+    ]
+    return Cell(", ".join(told), done.code == 0 and right and not (lost and knows))
+
+
+def changed_input(tool: Tool, folder: Path) -> Cell:
+    """An input is written anew while a stage works on it, before and after it was read."""
+    cells = [_changed_input(tool, folder.with_name(f"{folder.name}-{when}"), when) for when in ("before", "after")]
+    if cells[0] == cells[1]:
+        return cells[0]
+    return Cell(
+        "; ".join(f"{when} it was read: {cell.told}" for when, cell in zip(("before", "after"), cells, strict=True)),
+        all(cell.good for cell in cells),
+    )
+
+
+def _changed_input(tool: Tool, folder: Path, when: str) -> Cell:
+    lab = tool.lab(folder)
+    process = lab.start_gated(tool.words(lab, "load"), "load", when)
+    old = lab.raw[VICTIM]
+    lab.write_raw(VICTIM, old + 7)
+    lab.open_gate()
+    done = finished(process)
+    lab.run(tool.words(lab, "load"))
+    under_new = tool.values(lab, "load") == lab.right("load")
+    lab.write_raw(VICTIM, old)
+    lab.run(tool.words(lab, "load"))
+    under_old = tool.values(lab, "load") == lab.right("load")
+    if under_new and under_old:
+        return Cell("the run is refused, the next is right" if done.code else "each content has its result", True)
+    which = "new" if not under_new else "old"
+    return Cell(f"a wrong result is kept under the {which} content, exit code {done.code}", False)
+
+
+def undetermined(tool: Tool, folder: Path) -> Cell:
+    """A stage gives something else each time; the tool is asked. Asked of a stage that gives the same, it must be calm."""
+    lab = tool.lab(folder)
+    up_to(tool, lab, "scale")
+    false_alarm, _ = tool.comparing(lab, "scale")
+    lab.environment[NOISE] = "1"
+    lab.must(tool.words(lab, "scale", 3))
+    tells, how = tool.comparing(lab, "scale", 3)
+    return Cell(f"{how}{', and so it is of a good stage' if false_alarm else ''}", tells and not false_alarm)
+
+
+# ---- room
+
+
+def full(tool: Tool, folder: Path) -> Cell:
+    """The disk is full before a stage has written all; later there is room again. Needs a place that can be mounted on."""
+    folder.mkdir(parents=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(folder)], check=True)
+    lab = tool.lab(folder / "project", rows=20_000)
+    up_to(tool, lab, "load")
+    size = sum(values.nbytes for values in lab.raw.values())
+    ballast, before = folder / "ballast", lab.files()
+    disk = os.statvfs(folder)
+    with ballast.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, int(disk.f_bavail * disk.f_frsize - tool.room * size))
+    done = lab.run(tool.words(lab, "scale"))
+    left = [path for path in lab.files() - before if "tmp" in path.parts or path.suffix in (".tmp", ".draft")]
+    ballast.unlink()
+    lab.run(tool.words(lab, "scale"))
+    right = tool.values(lab, "scale") == lab.right("scale")
+    told = [
+        f"exit code {done.code}",
+        "a traceback" if "Traceback" in done.said else "a warning" if "Warning" in done.said else "a sentence",
+        "drafts stay in its cache" if left else "no draft stays",
+        "with room again the rerun is right" if right else "with room again the rerun is wrong",
+    ]
+    delivered = done.code == 0 and "rec-" in done.out
+    return Cell(", ".join(told), (done.code != 0 or delivered) and right and not left)
+
+
+FAULTS: Mapping[str, tuple[str, Fault]] = {
+    "edited": ("output edited, size and mtime kept; next stage run", edited_output),
+    "flipped": ("a bit flipped in the cache; output brought back", damaged(edited)),
+    "truncated": ("cached file cut in half; output brought back", damaged(truncated)),
+    "deleted": ("cached file deleted; output brought back", damaged(Path.unlink)),
+    "killed": ("`kill -9` at work; run again at once with another factor", killed),
+    "interrupted": ("Ctrl-C at work", interrupted),
+    "crowd": (f"{CROWD} runs of the same stage at once", crowd),
+    "full": ("disk full while a stage writes", full),
+    "changed": ("input written anew while a stage reads it", changed_input),
+    "undetermined": ("a stage that gives something else each time: can the tool tell?", undetermined),
+    "collected": ("garbage collected while a stage runs", collected),
+}
+
+
+def _close(process: subprocess.Popen[str]) -> None:
+    """Let go of a killed command's pipes, which what it started may hold."""
+    for pipe in (process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()
+
+
+def met(fault: str, tool: str, folder: Path) -> Cell:
+    """Do a fault to a tool in a new folder, and remove that."""
+    place = folder / f"{fault}-{tool.split()[0].split('.')[0]}"
+    place.mkdir(parents=True)
+    try:
+        return FAULTS[fault][1](TOOLS[tool], place / "project")
+    finally:
+        shutil.rmtree(place, ignore_errors=True)

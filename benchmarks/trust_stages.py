@@ -1,0 +1,75 @@
+"""The chain of `trust_steps` as stages of tacpipe."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import trust_steps
+
+from tacpipe.stage import Files, Result, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Dataset, Shard
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """No params."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What to scale by."""
+
+    factor: int = 2  # that every number is multiplied by
+
+
+def discover(params: Nothing, source: Path) -> dict[str, dict[str, Path]]:
+    """Find one recording a text file."""
+    return {path.stem: {path.name: path} for path in sorted(source.glob("*.txt"))}
+
+
+@stage(version=1, discover=discover)
+def load(params: Nothing, files: Files) -> pa.Table:
+    """Turn a text into a table."""
+    import pyarrow as pa
+
+    (path,) = files.values()
+    trust_steps.begun("load", path.stem)
+    return pa.table({"x": trust_steps.parsed(path.stem, path.read_text())})
+
+
+@stage(version=1)
+def scale(params: Factor, recording: Shard) -> pa.Table:
+    """Scale a table."""
+    import pyarrow as pa
+
+    trust_steps.begun("scale", recording.name)
+    values = recording.table()["x"].to_numpy()
+    return pa.table({"x": trust_steps.scaled(recording.name, values, params.factor)})
+
+
+@stage(version=1)
+def total(params: Nothing, recordings: Dataset) -> Result:
+    """Sum tables."""
+    trust_steps.begun("total", "all")
+    sums = {name: int(shard.table()["x"].to_numpy().sum()) for name, shard in recordings.shards.items()}
+    return Result(files={"total.json": json.dumps(sums).encode()})
+
+
+def values(directory: str) -> dict[str, list[int]]:
+    """Return what tacpipe serves of a dataset, by recording."""
+    import tacpipe
+
+    return {name: shard.table()["x"].to_pylist() for name, shard in tacpipe.open(directory).shards.items()}
+
+
+if __name__ == "__main__":
+    import sys
+
+    print(json.dumps(values(sys.argv[1])))
