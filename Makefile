@@ -11,6 +11,13 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
 MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
+COUNTS := .cache/counts.jsonl
+SECONDS := 60
+TARGETS :=
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto
+FAULTS := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST)
+PROPERTIES := $(wildcard $(addprefix tests/, test_hashing.py test_keys.py test_dataset.py sensors/test_framing.py \
+    sensors/test_every_sensor.py signals/test_clocks.py))
 OLD_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 
 # Install Debian packages $(1), or say the one command where there are no rights.
@@ -23,7 +30,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo test test-kernel lint types bless bench clean
+.PHONY: help demo rig-demo test test-long test-faults fuzz test-kernel lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -34,8 +41,21 @@ demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with de
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
-test: $(VENV)/.dev ## run all tests
-	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto # a worker a core, a thread a worker
+test: $(VENV)/.dev ## run all tests but the long and the exhaustive ones, in under 6 minutes
+	@$(PYTEST) -m "not faults and not long"
+
+test-long: $(VENV)/.dev ## run the tests that train for long, and DVC's chains of all tasks, in 5 minutes
+	@$(PYTEST) -m long
+
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in under 20 minutes, and print how many
+	@mkdir -p $(dir $(COUNTS)) && : > $(COUNTS)
+	@$(FAULTS) tests/promises
+	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)
+	@$(FAULTS) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
+	@$(BIN)/python -m tests.promises.counts $(COUNTS)
+
+fuzz: $(VENV)/.fuzz ## let atheris look for bytes that a reader stumbles over: make fuzz SECONDS=60 TARGETS="pcd sensor"
+	@OMP_NUM_THREADS=1 $(BIN)/python -m fuzz --seconds $(SECONDS) $(TARGETS)
 
 test-kernel: $(VENV)/.dev ## run the tests of HID on Debian's kernel in a virtual machine, which takes a minute
 	@if ! command -v qemu-system-x86_64 > /dev/null || ! dpkg -s busybox-static > /dev/null 2>&1; then \
@@ -90,3 +110,8 @@ $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 	    ($(call debian,$(MOCKED_DEVICES))) || echo "Until then the tests that need a HID device are skipped." >&2; \
 	fi
 	@touch $(VENV)/.learn $@
+
+$(VENV)/.fuzz: $(VENV)/.dev
+	@echo "Installing tacpipe[fuzz] into $(VENV)"
+	@$(PIP) install -c constraints.txt -e '.[fuzz]'
+	@touch $@

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shlex
 import shutil
@@ -36,10 +37,17 @@ pulse = toy_sensor:Pulse
 """
 
 settings.register_profile("tacpipe", deadline=None)  # nothing is timed in tests
+settings.register_profile("faults", deadline=None, max_examples=500)  # for `make test-faults`
 settings.load_profile("tacpipe")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: programs that the tests interrupt inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return a worker more than there are cores: tests of recording wait for devices while others compute."""
+    return (os.cpu_count() or 1) + 1
 
 
 @dataclass
@@ -92,9 +100,21 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def lab(
-    tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Lab]:
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[str], Ran]:
+    """A function that runs a command in this process."""
+
+    def run(command: str) -> Ran:
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "argv", ["tacpipe", *shlex.split(command)])
+        code = cli.answer(sys.argv[1:])
+        out, err = capsys.readouterr()
+        return Ran(code, out, err)
+
+    return run
+
+
+@pytest.fixture
+def lab(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[[str], Ran]) -> Iterator[Lab]:
     """An empty project, its commands run in this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TACPIPE_STORE", raising=False)
@@ -102,18 +122,6 @@ def lab(
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")]))
     (tmp_path / ".tacpipe").mkdir()
     forget()
-
-    def call(command: str) -> Ran:
-        capsys.readouterr()
-        monkeypatch.setattr(sys, "argv", ["tacpipe", *shlex.split(command)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-        out, err = capsys.readouterr()
-        return Ran(code, out, err)
-
     yield Lab(tmp_path, call)
     forget()
 
@@ -123,9 +131,23 @@ def chained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project in which the forward chain has run; tests may add to it, but change nothing that is there."""
     from tests import chain
 
-    folder = tmp_path_factory.mktemp("chained")
-    chain.run(folder)
-    return folder
+    folder = tmp_path_factory.mktemp("chained") / "project"  # a worker's own: nobody else's commands run there
+    return shutil.copytree(made_once(tmp_path_factory, "chain", chain.run), folder, symlinks=True)
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """Return a folder that ``make`` fills, once for all workers that run tests: who comes second waits for it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"made-{name}"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "whole").exists():
+            shutil.rmtree(folder / "content", ignore_errors=True)  # what failed another worker fails this one too
+            (folder / "content").mkdir()
+            make(folder / "content")
+            (folder / "whole").touch()
+    return folder / "content"
 
 
 def forget() -> None:

@@ -2,7 +2,9 @@
 
 import doctest
 import importlib
+import itertools
 import pkgutil
+from pathlib import Path
 
 import pytest
 
@@ -15,10 +17,18 @@ MODULES = sorted(
 )
 
 
+def tried(name: str) -> doctest.TestResults:
+    """Import a module and run its examples; none are looked for where no line begins one, which takes its time."""
+    module = importlib.import_module(name)
+    found = Path(str(module.__file__)).read_text().count(">>> ")
+    return doctest.testmod(module) if found else doctest.TestResults(0, 0)
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_the_examples_of_a_module_give_what_they_say(name: str) -> None:
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
+    assert tried(name).failed == 0
 
 
 def test_there_are_examples() -> None:
-    assert sum(doctest.testmod(importlib.import_module(name)).attempted for name in MODULES) >= 10
+    counts = itertools.accumulate(tried(name).attempted for name in MODULES)
+    assert any(count >= 10 for count in counts)

@@ -20,7 +20,7 @@ import yaml
 
 import tacpipe
 from tacpipe import registry
-from tests.conftest import Lab
+from tests.conftest import Lab, made_once
 
 HERE = Path(__file__).parents[1]
 NEEDS_DVC = pytest.mark.skipif(
@@ -113,20 +113,23 @@ def environment(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.fixture
-def toy(tmp_path: Path, environment: Mapping[str, str]) -> Project:
-    """A repository whose chain was run with a factor of 2, then of 3, each committed."""
-    project = Project(tmp_path / "toy", environment)
-    project.folder.mkdir()
-    (project.folder / "dvc.yaml").write_text(CHAIN)
-    (project.folder / "params.yaml").write_text(PARAMS)
-    (project.folder / ".gitignore").write_text(".tacpipe/\n*.parquet\n")
-    project.start()
-    project.run("dvc repro")
-    project.commit("factor 2")
-    project.change("factor: 2", "factor: 3")
-    project.run("dvc repro")
-    project.commit("factor 3")
-    return project
+def toy(tmp_path: Path, environment: Mapping[str, str], tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A repository whose chain was run with a factor of 2, then of 3, each committed; copied from one that did."""
+
+    def make(folder: Path) -> None:
+        project = Project(folder, environment)
+        (folder / "dvc.yaml").write_text(CHAIN)
+        (folder / "params.yaml").write_text(PARAMS)
+        (folder / ".gitignore").write_text(".tacpipe/\n*.parquet\n")
+        project.start()
+        project.run("dvc repro")
+        project.commit("factor 2")
+        project.change("factor: 2", "factor: 3")
+        project.run("dvc repro")
+        project.commit("factor 3")
+
+    made = made_once(tmp_path_factory, "dvc", make)
+    return Project(shutil.copytree(made, tmp_path / "toy", symlinks=True), environment)
 
 
 def expected(factor: int) -> dict[str, list[int]]:
@@ -180,6 +183,7 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
     assert max(map(len, contents)) < 5_000_000
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_a_method_of_the_material_chain_runs_once_and_is_reported(
@@ -206,6 +210,7 @@ def test_a_method_of_the_material_chain_runs_once_and_is_reported(
     assert "simulated" in (project.folder / "results/material.html").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(

@@ -1,4 +1,4 @@
-"""A thousand recordings, of which one changes: what has to be done again in each stage of the chain."""
+"""Many recordings, of which one changes: what has to be done again in each stage of the chain."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from tacpipe.manifest import Manifest
 from tacpipe.store import Store
 from tests.conftest import tacpipe as command
 
-RECORDINGS = 1000
+MANY = [100, pytest.param(1000, marks=pytest.mark.faults)]
 STAGES = {
     "synchronize": "synchronize data/recordings -o data/synced --rate-hz 25",
     "segment": "segment contacts data/synced -o data/segments",
@@ -26,17 +26,23 @@ def outcome(folder: Path, words: str) -> tuple[int, int]:
     return value["ran"], value["reused"]
 
 
+@pytest.fixture(scope="module", params=MANY)
+def recordings(request: pytest.FixtureRequest) -> int:
+    number: int = request.param
+    return number
+
+
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("thousand")
+def lab(recordings: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("many")
     (folder / ".tacpipe").mkdir()
     simulate = "simulate forward --duration-s 4 --tactile-rate-hz 25 --robot-rate-hz 50"
-    assert outcome(folder, f"{simulate} --trials {RECORDINGS} -o data/recordings") == (RECORDINGS, 0)
+    assert outcome(folder, f"{simulate} --trials {recordings} -o data/recordings") == (recordings, 0)
     assert outcome(folder, f"{simulate} --trials 1 --seed 1 -o data/other") == (1, 0)
-    assert outcome(folder, STAGES["synchronize"]) == (RECORDINGS, 0)
-    assert outcome(folder, STAGES["segment"]) == (RECORDINGS, 0)
+    assert outcome(folder, STAGES["synchronize"]) == (recordings, 0)
+    assert outcome(folder, STAGES["segment"]) == (recordings, 0)
     assert outcome(folder, "split data/segments -o data/split --scheme random") == (1, 0)
-    assert outcome(folder, STAGES["encode"]) == (RECORDINGS, 0)
+    assert outcome(folder, STAGES["encode"]) == (recordings, 0)
     return folder
 
 
@@ -49,18 +55,18 @@ def record_anew(folder: Path, name: str, entry: dict[str, object]) -> None:
     directory.publish(store, changed, folder / "data/recordings")
 
 
-def test_one_changed_recording_costs_one_shard_in_every_stage(lab: Path) -> None:
+def test_one_changed_recording_costs_one_shard_in_every_stage(lab: Path, recordings: int) -> None:
     split = tacpipe.open(lab / "data/split").to_pandas()
     name = str(split["recording"][split["role"] == "test"].iloc[0])
     entry = tacpipe.open(lab / "data/other").source.recordings["trial-000"]
     record_anew(lab, name, dict(entry))
     for stage, words in STAGES.items():
-        assert outcome(lab, words) == (1, RECORDINGS - 1), stage
+        assert outcome(lab, words) == (1, recordings - 1), stage
 
 
-def test_a_recording_made_anew_with_equal_bytes_costs_nothing(lab: Path) -> None:
+def test_a_recording_made_anew_with_equal_bytes_costs_nothing(lab: Path, recordings: int) -> None:
     entry = tacpipe.open(lab / "data/recordings").source.recordings["trial-007"]
     attributes = {**entry["attributes"], "note": "recorded again"}
     record_anew(lab, "trial-007", {**entry, "attributes": attributes})
     for stage, words in STAGES.items():
-        assert outcome(lab, words) == (0, RECORDINGS), stage
+        assert outcome(lab, words) == (0, recordings), stage

@@ -7,7 +7,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab
+from tests.promises import counts
 from tests.recording import killing, live
 from tests.recording.test_reading import SENSOR, frames
 
@@ -58,18 +59,22 @@ def seqs(lab: Lab) -> dict[str, list[int]]:
     return {name: shard.table("force").column("seq").to_pylist() for name, shard in live.shards(lab.folder).items()}
 
 
+@pytest.mark.parametrize(
+    "after_s", [(3.5,), pytest.param(np.linspace(1.0, 4.2, 17).tolist(), marks=pytest.mark.faults)], ids=["one", "many"]
+)
 def test_killed_recordings_lose_less_than_a_second_and_tell_what_was_read_and_not_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    after_s: Sequence[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TACPIPE_STORE", str(tmp_path / "store"))
     with killing.emulated(tmp_path) as emulator:
-        found = [killing.kill(emulator, tmp_path, after_s, 3.0) for after_s in (2.5, 3.0, 3.5)]
+        found = [killing.kill(emulator, tmp_path, one_s, 3.0) for one_s in after_s]
         costs = [cost for several in found for cost in several or []]
 
         assert costs, "no recording had begun when it was killed"
         assert max(cost.lost_s for cost in costs) < 1
         assert all(cost.recovered > 0 for cost in costs)
         assert all(cost.unread >= 0 for cost in costs)  # no more is told than was sent and is missing
+        counts.count("kills survived", len(after_s))
 
 
 def test_what_was_read_and_never_written_is_told(lab: Lab) -> None:

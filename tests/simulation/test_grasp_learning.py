@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacpipe import biotac_sp, registry
+from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation.grasp_scene import Rig
@@ -56,10 +58,11 @@ def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_ar
             np.testing.assert_allclose(getattr(other, target), getattr(one, target), rtol=1e-3)
 
 
+@pytest.mark.long
 def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_show_it(tmp_path: Path) -> None:
     rig = Rig(spheres=True, effort_spread=0.05, drift_count_day=0.0)
     training, tested = grasps(rig, range(160)), grasps(rig, range(160, 240))
-    pressures = {"targets": "pdc_th,pdc_mf"}
+    pressures = {"targets": "pdc_th,pdc_mf", "together": True}
     scaled = {**POINTNET, **pressures, "normalisation": "minmax", "inputs": "xyzpose", "epochs": 15}
     boxed = judged(training, tested, tmp_path / "boxed", **scaled)
     metric = judged(training, tested, tmp_path / "metric", **pressures)
@@ -80,6 +83,22 @@ def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_c
         assert told["model"]["rmse_counts"][target] < told["constant"]["rmse_counts"][target]
 
 
+@pytest.fixture
+def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The geometry of a grasp is worked out once, however many models read it."""
+    real, known = geometry.features, dict[bytes, dict[str, float]]()
+
+    def features(cloud: Cloud, grasp: Grasp) -> dict[str, float]:
+        key = pickle.dumps((cloud, grasp))
+        if key not in known:
+            known[key] = real(cloud, grasp)
+        return dict(known[key])
+
+    monkeypatch.setattr(geometry, "features", features)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("remembered")
 def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
     made = grasps(Rig(drift_count_day=0.0), range(240))
     names = list(made.shards)
@@ -96,14 +115,16 @@ def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
         assert np.mean(gain) <= np.std(gain, ddof=1) / np.sqrt(len(gain)) + 1e-3
 
 
+@pytest.mark.long
 def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and_who_is_told_can(
     tmp_path: Path,
 ) -> None:
     rig = Rig(one_pose=True, shift=1.0, drift_count_day=0.0, families="cone,bow", objects=2, stiffness="rigid")
     training, tested = grasps(rig, range(400)), grasps(rig, range(400, 600))
+    small = {**POINTNET, "targets": "e_th,e_mf", "together": True, "points": 32, "epochs": 20}
     errors = {}
     for inputs in ("xyz", "xyzcont"):
-        told = judged(training, tested, tmp_path / inputs, **{**POINTNET, "inputs": inputs, "targets": "e_th,e_mf"})
+        told = judged(training, tested, tmp_path / inputs, **{**small, "inputs": inputs})
         errors[inputs] = told["model"]["rmse"]
     mean = told["object_mean"]["rmse"]
     for target in ("e_th", "e_mf"):
@@ -117,6 +138,7 @@ def _parted(names: list[str], fold: int) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in tested], tested
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("points", [32, 256])
 def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_were_drawn(
     points: int, tmp_path: Path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ def synced(recording: Recording, **params: Any) -> Recording:
     return found
 
 
+@cache
 def labelled(trial: int, **rig: Any) -> pa.Table:
     table = synced(recorded(trial, **rig)).streams[""]
     return slips(slips.params(), FakeShard({"": contacts(contacts.params(), FakeShard({"": table}))}))

@@ -41,7 +41,7 @@ SMALL = {
     "hidden": 64,
     "dropout": 0.0,
     "batch": 32,
-    "epochs": 14,
+    "epochs": 11,
     "learning_rate": 4e-3,
     "stride": 6,
     "baselines": False,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tacpipe.simulation.slide import Rig
 from tacpipe.simulation.texture_likelihood import likelihood_accuracy
@@ -81,18 +82,21 @@ def joint(pairing: str) -> dict[str, Any]:
     return {**metrics, "history": [json.loads(line) for line in result.files["history.jsonl"].splitlines()]}
 
 
+@pytest.mark.long
 def test_the_network_reaches_four_fifths_of_what_can_be_known() -> None:
     for sensor in BOTH:
         bound = likelihood_accuracy(SEED, indices(FEWER, [sensor], TESTED), FEWER)
         assert accuracy(joint("random"))[sensor] >= 0.8 * bound, sensor
 
 
+@pytest.mark.long
 def test_exchanging_the_classifiers_of_joint_networks_costs_little() -> None:
     metrics = joint("random")
     for sensor in BOTH:
         assert accuracy(metrics)[sensor] - accuracy(metrics, "swapped")[sensor] <= 0.05, sensor
 
 
+@pytest.mark.long
 def test_pairs_of_other_materials_align_and_swap_as_well_so_that_sharing_is_driven_by_labels() -> None:
     true, permuted = joint("random"), joint("permuted")
     before, after = (permuted["history"][at]["alignment"] for at in (9, -1))
