@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.files import sync_folders, write_whole
+from tacpipe.files import sync_folder, sync_folders, write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import MissingError, Store
@@ -30,7 +30,7 @@ def publish(store: Store, manifest: Manifest, directory: Path) -> None:
     if not shown(store, manifest, directory):
         with changing(store, directory):
             publish_alone(store, manifest, directory)
-    store.set_root(directory, bytes_digest(manifest.content))
+    store.roots.set(directory, bytes_digest(manifest.content))
 
 
 def shown(store: Store, manifest: Manifest, directory: Path) -> bool:
@@ -42,7 +42,7 @@ def shown(store: Store, manifest: Manifest, directory: Path) -> bool:
 def changing(store: Store, directory: Path) -> Iterator[None]:
     """Change what ``directory`` shows while nobody else does, whoever reads its manifest first to change it included."""
     directory = directory.absolute()
-    with store.leases.hold(digest(["output", *store.named(directory)]), f"the output {directory}"):
+    with store.leases.hold(digest(["output", *store.roots.named(directory)]), f"the output {directory}"):
         yield
 
 
@@ -59,7 +59,7 @@ def publish_alone(store: Store, manifest: Manifest, directory: Path, *, damaged:
     gone = _named(directory) - set(wanted)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
-        store.set_root(directory, bytes_digest(manifest.content), durable=True)
+        store.roots.set(directory, bytes_digest(manifest.content), durable=True)
         sweep(directory)
         for path in stale:
             with contextlib.suppress(*([MissingError] if damaged else [])):
@@ -68,7 +68,7 @@ def publish_alone(store: Store, manifest: Manifest, directory: Path, *, damaged:
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
         if manifest.recorded:
-            settle(store, manifest, directory)
+            _settle(store, directory, stale)
 
 
 def sweep(directory: Path) -> None:
@@ -83,12 +83,12 @@ def sweep_beside(path: Path) -> None:
         draft.unlink(missing_ok=True)
 
 
-def settle(store: Store, manifest: Manifest, directory: Path) -> None:
-    """Have what ``directory`` shows outlast a loss of power: recordings and their labels cannot be made again."""
+def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
+    """Have what was written in ``directory`` outlast a loss of power: recordings and their labels cannot be made again."""
+    for folder in {(directory / path).parent for path in paths} - {directory}:
+        sync_folder(str(folder))
     project = store.root.parent
-    top = project if directory.is_relative_to(project) else directory.parent
-    for folder in sorted({directory, *((directory / path).parent for path, _ in manifest.objects())}):
-        sync_folders(str(folder), str(top))
+    sync_folders(str(directory), str(project if directory.is_relative_to(project) else directory.parent))
 
 
 @contextlib.contextmanager
@@ -130,7 +130,7 @@ def check_output(store: Store, directory: Path) -> None:
     directory = directory.absolute()
     if directory.is_file():
         raise UsageError(f"{directory} is a file; give -o a directory.")
-    if not directory.is_dir() or (directory / NAME).exists() or store.get_root(directory) is not None:
+    if not directory.is_dir() or (directory / NAME).exists() or store.roots.get(directory) is not None:
         return
     for path in directory.rglob("*"):  # a project that was moved: its shards are known, its path is not
         if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):

@@ -20,7 +20,8 @@ from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
 from tacpipe.files import readable_errors
 from tacpipe.hashing import bytes_digest
-from tacpipe.store import ASIDE, PUSHED, Store
+from tacpipe.roots import PUSHED
+from tacpipe.store import ASIDE, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
@@ -58,7 +59,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False)
         found.objects |= run.objects
         wanted += run.manifests
     contents: dict[str, bytes] = {}
-    for root in store.roots():
+    for root in store.roots.all():
         path = Path(root["path"])
         here, reached = None, root["kind"] == PUSHED
         if not reached:
@@ -70,7 +71,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False)
         expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
-    damaged = store.damaged_roots()
+    damaged = store.roots.damaged()
     if damaged:
         raise DamagedError(
             f"{len(damaged)} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
@@ -116,7 +117,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
                 os.rename(path, store.aside(path.name))  # noqa: PTH104
                 aside.append(path.name)
     if aside:
-        shown = {root["manifest"] for root in store.roots()}
+        shown = {root["manifest"] for root in store.roots.all()}
         aside.sort(key=lambda name: name not in shown)  # no manifest is there that names what is gone
         _remove(store, aside, live(store, grace_days).objects, collected)
     _sweep(store, needed, collected, grace_days, dry_run=dry_run)
@@ -236,7 +237,7 @@ def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: 
     if since_s != root.get("missing_since_s") and not dry_run:
         kept = {key: value for key, value in root.items() if key != "missing_since_s"}
         with contextlib.suppress(TacpipeError):
-            store.write_root(kept if since_s is None else {**kept, "missing_since_s": since_s})
+            store.roots.write(kept if since_s is None else {**kept, "missing_since_s": since_s})
     if since_s is None:
         return False
     return grace_days <= 0 or now_s - since_s > grace_days * 86400

@@ -16,14 +16,14 @@ _SHOWN = 5  # names listed before the rest is counted
 def of(path: Path) -> dict[str, Any]:
     """Return the lineage of the dataset (or report) at ``path`` as a tree, and what changed against the run before."""
     store = locate(path if path.is_dir() else path.absolute().parent)
-    root = store.get_root((path.parent if path.name == manifest_of.NAME else path).absolute())
+    root = store.roots.get((path.parent if path.name == manifest_of.NAME else path).absolute())
     if path.is_file() and path.name != manifest_of.NAME:
         if root is None:
             raise UsageError(f"{path} was not written by tacpipe, or into another store than {store.root}.")
         found = manifest_of.Found(path.parent, store.read(root["manifest"]))
     else:
         found = manifest_of.find(path)
-    places = {other["manifest"]: other["path"] for other in store.roots()}
+    places = {other["manifest"]: other["path"] for other in store.roots.all()}
     tree = _node(store, found.manifest, found.digest, places)
     changed = _changes(store, root, found.manifest)
     return {**tree, "provenance": _provenance(store, found.digest), "changes": changed}

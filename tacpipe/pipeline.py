@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe import directory, execution, executors, keys, manifest, progress, provenance, registry
+from tacpipe import directory, execution, executors, keys, manifest, output, progress, provenance, registry
 from tacpipe import params as params_of
 from tacpipe import request as request_of
 from tacpipe.dataset import Dataset
-from tacpipe.errors import FAILED, LOCKED, DamagedError, LockedError, TacpipeError, UsageError, WouldChangeError
+from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.execution import Done, Task
-from tacpipe.hashing import bytes_digest, digest, file_digest
+from tacpipe.hashing import digest
 from tacpipe.manifest import Entry, Manifest
 from tacpipe.request import Inputs, Request
 from tacpipe.stage import ROLES
@@ -52,17 +52,17 @@ def run(request: Request) -> Outcome:
     identity = inputs.identity()
     outcome = Outcome(request.output, digest(identity))
     hit = None if request.compare else _answer(store, outcome.key)
-    if hit is not None and (request.check or _shown(store, request, hit)):
-        made, outcome.reused = _keep_labels(store, request, hit), len(hit.recordings) or 1
+    if hit is not None and (request.check or output.shown(store, request, hit)):
+        made, outcome.reused = output.labelled(store, request, hit), len(hit.recordings) or 1
     elif request.check or request.compare:
-        made = _keep_labels(store, request, _Run(request, store, inputs, outcome).make())
+        made = output.labelled(store, request, _Run(request, store, inputs, outcome).make())
     else:
         with store.at_work([found.digest for found in inputs.used]):
             made = _make(request, store, inputs, identity, outcome)
     outcome.notes = sorted(set(inputs.notes))
     outcome.rows = made.rows
     if request.check:
-        _check(store, request, made)
+        output.check(store, request, made)
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome
 
@@ -79,7 +79,7 @@ def _make(request: Request, store: Store, inputs: Inputs, identity: Mapping[str,
         else:
             outcome.reused = len(made.recordings) or 1
         try:
-            return _publish(store, request, made)
+            return output.publish(store, request, made)
         except MissingError:  # damaged in the store, which shows when it is linked: then it is made again
             if not first:
                 raise
@@ -101,23 +101,6 @@ def _answer(store: Store, key: str) -> Manifest | None:
     found = manifest.parse(content, "the stored manifest", verified=True)
     store.announce(wanted for _, wanted in found.objects())
     return found if all(store.has(name, size) for name, size in found.sizes()) else None
-
-
-def _shown(store: Store, request: Request, hit: Manifest) -> bool:
-    """Return whether the output holds the answer already and nothing is to be written; a dataset's root too is known."""
-    root = store.get_root(request.output.absolute())
-    if root is None:
-        return False
-    if request.single_file:
-        wanted = hit.files[_single(request, hit)]["digest"]
-        return (
-            root["manifest"] == bytes_digest(hit.content)
-            and request.output.exists()
-            and file_digest(request.output) == wanted
-        )
-    shown = _keep_labels(store, request, hit)
-    known = root["manifest"] == bytes_digest(shown.content) and store.has(root["manifest"])
-    return known and directory.shown(store, shown, request.output.absolute())
 
 
 class _Run:
@@ -351,76 +334,9 @@ def _error(exit_code: int, sentence: str) -> TacpipeError:
     return error
 
 
-def _keep_labels(store: Store, request: Request, made: Manifest) -> Manifest:
-    """Return recordings with the labels that were set by hand on those they replace.
-
-    Raises `DamagedError` if these cannot be told: no rerun would bring them back.
-    """
-    if not made.recorded or not (request.output / manifest.NAME).exists():
-        return made
-    try:
-        before = manifest.find(request.output).manifest
-    except TacpipeError as error:
-        before = _before(store, request.output, error)
-    return made.labelled(before.labels) if before.labels else made
-
-
-def _before(store: Store, output: Path, error: TacpipeError) -> Manifest:
-    """Return the manifest that was written at ``output``, which is damaged now, from the store."""
-    root = store.get_root(output.absolute())
-    try:
-        if root is not None:
-            return manifest.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
-    except TacpipeError:
-        pass
-    raise DamagedError(
-        f"{error} Labels that were set by hand may stand in it, and would be lost: bring it back with git, or remove it to "
-        f"go on without them."
-    )
-
-
-def _check(store: Store, request: Request, made: Manifest) -> None:
-    root = store.get_root(request.output.absolute())
-    if root is None or root["manifest"] != bytes_digest(made.content):
-        raise WouldChangeError(f"{request.output} would change: it was made from other inputs or params.")
-
-
 def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome: Outcome) -> None:
     """Store the manifest, and the run if every recording was good: then a rerun is answered at once."""
     stored = vars(store.put(made.content, durable=made.recorded))
     if not outcome.bad:
         result = {"recordings": {}, "files": {manifest.NAME: stored}}
         store.commit(identity, result, provenance.of(0.0), replace=True)
-
-
-def _publish(store: Store, request: Request, made: Manifest) -> Manifest:
-    """Return the manifest that the output shows now."""
-    if request.single_file:
-        _publish_file(store, request, made)
-        return made
-    if not made.recorded:
-        directory.publish(store, made, request.output)
-        return made
-    with directory.changing(store, request.output):  # somebody may be about to label what is there
-        made = _keep_labels(store, request, made)
-        store.put(made.content)
-        directory.publish_alone(store, made, request.output)
-    return made
-
-
-def _publish_file(store: Store, request: Request, made: Manifest) -> None:
-    output = request.output.absolute()
-    wanted = made.files[_single(request, made)]["digest"]
-    with directory.changing(store, output), directory.writing(output):
-        if not output.exists() or file_digest(output) != wanted:
-            directory.sweep_beside(output)
-            directory.place(store, wanted, output, copy=True)
-        store.set_root(output, bytes_digest(made.content))
-
-
-def _single(request: Request, made: Manifest) -> str:
-    """Return the name of the file that is asked for in place of a dataset."""
-    name = next((name for name in made.files if name.endswith(request.output.suffix)), None)
-    if name is None:
-        raise UsageError(f"{request.name} makes no {request.output.suffix} file; give -o a directory.")
-    return name

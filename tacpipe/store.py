@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.files import listed, read_json, readable_errors, sentence, sync_folders, write_whole
+from tacpipe.files import listed, readable_errors, sentence, sync_folders, write_whole
 from tacpipe.hashing import bytes_digest, digest
 from tacpipe.leases import Announcing, Leases
+from tacpipe.roots import BESIDE_NAME, Roots
 
 FORMAT = "1"
-BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
 ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
-BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -48,6 +47,7 @@ class Store:
         self.root = Path(root)
         self._root = str(root)
         self.leases = Leases(self.root / "leases")
+        self.roots = Roots(self)
         self._run = Announcing(run) if run else None
 
     # ---- places
@@ -134,7 +134,7 @@ class Store:
         if not there:
             self.write_file(path, content, mode=0o444)
         if durable:  # whoever put it there
-            self._sync(path)
+            self.sync(path)
         return Object(name, len(content))
 
     def read(self, name: str) -> bytes:
@@ -174,15 +174,6 @@ class Store:
         """Return whether an object of this digest was damaged, lies in quarantine, and was not made again."""
         return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
 
-    def damaged_roots(self) -> list[str]:
-        """Return the names of roots that were damaged and not written anew: nobody knows which datasets they stood for."""
-        names = {path.name[len("root-") :].partition(".")[0] for path in self.listed("quarantine", "root-*")}
-        return sorted(name for name in names if not (self.root / "roots" / f"{name}.json").exists())
-
-    def is_root_of(self, name: str, path: Path) -> bool:
-        """Return whether the root of this name stands for the dataset at ``path``."""
-        return self._root_file(*self.named(path)).stem == name
-
     def aside(self, name: str) -> str:
         """Return where a collection keeps an object between its first look at what is needed and its second."""
         return f"{self._root}/tmp/{ASIDE}{name}"
@@ -195,7 +186,7 @@ class Store:
             return False
         return True
 
-    def _sync(self, path: str | Path) -> None:
+    def sync(self, path: str | Path) -> None:
         """Have the name of a file of the store outlast a loss of power, as its content does."""
         with readable_errors(self.root):
             sync_folders(os.path.dirname(path), self._root)  # noqa: PTH120
@@ -259,7 +250,7 @@ class Store:
                 record = there
                 break
         if durable:
-            self._sync(path)
+            self.sync(path)
         return record
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -268,73 +259,6 @@ class Store:
             record = self.record(path.stem)
             if record is not None:
                 yield path.stem, record
-
-    # ---- roots
-
-    def set_root(self, path: Path, manifest: str, *, pushed: bool = False, durable: bool = False) -> None:
-        """Note that ``path`` now holds ``manifest``; the one before stays known for `explain`.
-
-        A dataset that was ``pushed`` here has a name instead of a path, and is kept until `forget`.
-        """
-        kind, name = self.named(path, pushed=pushed)
-        known = self.get_root(path, pushed=pushed) or {"manifest": None, "previous": None}
-        if known["manifest"] != manifest:
-            root = {"path": name, "kind": kind, "manifest": manifest, "previous": known["manifest"]}
-            self.write_root({**root, "written_s": int(time.time())})
-        if durable:
-            self._sync(self._root_file(kind, name))
-
-    def get_root(self, path: Path, *, pushed: bool = False) -> dict[str, Any] | None:
-        """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
-        return self.root_at(self._root_file(*self.named(path, pushed=pushed)))
-
-    def roots(self) -> list[dict[str, Any]]:
-        """Return all roots. Damaged ones are quarantined: the next run of their stage writes them anew."""
-        found = (self.root_at(path) for path in self.listed("roots", "*.json"))
-        return [root for root in found if root is not None]
-
-    def write_root(self, root: Mapping[str, Any]) -> None:
-        """Replace a root, as `roots` gave it or with more to say."""
-        kind, name = root.get("kind", ABSOLUTE), str(root["path"])
-        if kind == BESIDE and Path(name).is_absolute():
-            name = os.path.relpath(name, self.root.parent)
-        content = {key: value for key, value in root.items() if key != "check"} | {"path": name, "kind": kind}
-        text = json.dumps({**content, "check": digest(content)}, sort_keys=True)
-        self.write_file(self._root_file(kind, name), text.encode())
-
-    def forget(self, name: str) -> bool:
-        """Drop the roots of this path or pushed name; return whether there was one."""
-        wanted = [self.named(Path(name).absolute()), self.named(Path(name), pushed=True)]
-        files = [self._root_file(*found) for found in wanted]
-        there = [file for file in files if file.exists()]
-        for file in there:
-            with readable_errors(self.root):
-                file.unlink(missing_ok=True)
-        return bool(there)
-
-    def named(self, path: Path, *, pushed: bool = False) -> tuple[str, str]:
-        """Return kind and name of a root: relative where the dataset lies beside its store, so that both can move."""
-        if pushed:
-            return PUSHED, str(path)
-        if self.root.name == BESIDE_NAME and path.is_relative_to(self.root.parent):
-            return BESIDE, str(path.relative_to(self.root.parent))
-        return ABSOLUTE, str(path)
-
-    def _root_file(self, kind: str, name: str) -> Path:
-        return self.root / "roots" / f"{digest(name if kind == ABSOLUTE else [kind, name])}.json"
-
-    def root_at(self, file: Path) -> dict[str, Any] | None:
-        """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
-        with readable_errors(self.root):
-            if not file.exists():
-                return None
-            root = read_json(file) or {}
-        check = root.pop("check", None)
-        if check is None or check != digest(root):
-            self.quarantine(file)
-            return None
-        beside = root["kind"] == BESIDE
-        return {**root, "path": str(self.root.parent / root["path"])} if beside else root
 
 
 def _sound(record: dict[str, Any], key: str) -> bool:

@@ -94,12 +94,12 @@ def gc(
 
 
 def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
-    known = {str(root["path"]) for root in store.roots()}
+    known = {str(root["path"]) for root in store.roots.all()}
     for name in names:
         if not {name, str(Path(name).absolute())} & known:
             raise UsageError(f"{store.root} keeps no dataset {name}; it keeps {', '.join(sorted(known)) or 'nothing'}.")
         if not dry_run:
-            store.forget(name)
+            store.roots.forget(name)
 
 
 def link(datasets: Paths) -> None:

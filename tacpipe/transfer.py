@@ -36,7 +36,7 @@ def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
         with here.at_work([found.digest]), there.at_work([found.digest]):
             here.put(found.content)
             _copy(here, there, found.digest, done, beside=(str(found.directory.absolute()),), ancestors=ancestors)
-            there.set_root(_name(found.directory), found.digest, pushed=True, durable=True)
+            there.roots.set(_name(found.directory), found.digest, pushed=True, durable=True)
     return done
 
 
@@ -61,9 +61,9 @@ def _found(directory: Path, there: Store) -> manifest_of.Found:
     """Return the manifest at the directory, else that which was pushed from there."""
     if (directory / manifest_of.NAME).exists():
         return manifest_of.find(directory)
-    root = there.get_root(_name(directory), pushed=True)
+    root = there.roots.get(_name(directory), pushed=True)
     if root is None:
-        known = ", ".join(sorted(other["path"] for other in there.roots())) or "nothing"
+        known = ", ".join(sorted(other["path"] for other in there.roots.all())) or "nothing"
         raise UsageError(f"{there.root} has no dataset {_name(directory)}; it has {known}.")
     return manifest_of.Found(directory, there.read(root["manifest"]))
 

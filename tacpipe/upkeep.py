@@ -15,7 +15,8 @@ from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
 from tacpipe.files import write_whole
 from tacpipe.hashing import bytes_digest, file_digest
-from tacpipe.store import PUSHED, MissingError, Store, locate
+from tacpipe.roots import PUSHED
+from tacpipe.store import MissingError, Store, locate
 
 
 @dataclass
@@ -62,7 +63,7 @@ def verify(store: Store) -> Soundness:
         if store.record(path.stem) is None:
             found.damaged.append(path.stem)
     for path in store.listed("roots", "*.json"):
-        if store.root_at(path) is None:
+        if store.roots.at(path) is None:
             found.damaged.append(f"root {path.stem}")
     found.missing = sorted(set(_wanted(store)) - set(found.damaged))
     return found
@@ -73,7 +74,7 @@ def repair(store: Store) -> Soundness:
     with store.at_work():
         found = verify(store)
         found.repaired += _roots_again(store)
-        roots = store.roots()
+        roots = store.roots.all()
         found.repaired += [name for root in roots for name in _manifest_again(store, root)]
         manifests = [one for one in (_find(root) for root in roots) if one is not None]
         for one in manifests:
@@ -94,7 +95,7 @@ def repair(store: Store) -> Soundness:
 
 def _roots_again(store: Store) -> list[str]:
     """Write damaged roots anew whose datasets lie beside the store; return their names."""
-    names, found = store.damaged_roots(), []
+    names, found = store.roots.damaged(), []
     for place, folders, files in os.walk(store.root.parent) if names else ():
         folders[:] = [folder for folder in folders if not folder.startswith(".")]
         if manifest_of.NAME not in files:
@@ -103,8 +104,8 @@ def _roots_again(store: Store) -> list[str]:
         if one is None:
             continue
         for name in names:
-            if store.is_root_of(name, Path(place)):
-                store.set_root(Path(place), one.digest)
+            if store.roots.is_of(name, Path(place)):
+                store.roots.set(Path(place), one.digest)
                 found.append(f"root {name}")
     return found
 
@@ -144,7 +145,7 @@ def link(path: Path) -> int:
             for name, digest in stale:
                 directory_of.place(store, digest, directory / name, copy=manifest.recorded)
         store.put(found.content)
-        store.set_root(directory.absolute(), found.digest)
+        store.roots.set(directory.absolute(), found.digest)
     return len(stale)
 
 
@@ -154,7 +155,7 @@ def status(store: Store) -> dict[str, Any]:
     for name in ("objects", "records", "quarantine", "tmp", "checkpoints"):
         files = [path for path in (store.root / name).rglob("*") if path.is_file()]
         folders[name] = {"files": len(files), "bytes": sum(path.stat().st_size for path in files)}
-    roots = [{**root, "reachable": root["kind"] == PUSHED or Path(root["path"]).exists()} for root in store.roots()]
+    roots = [{**root, "reachable": root["kind"] == PUSHED or Path(root["path"]).exists()} for root in store.roots.all()]
     return {"store": str(store.root), **folders, "roots": roots, "running": [run.note for run in store.leases.runs()]}
 
 
@@ -190,7 +191,7 @@ def _sound(directory: Path) -> manifest_of.Found | None:
 def _wanted(store: Store) -> dict[str, str]:
     """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name."""
     wanted = {}
-    for root in store.roots():
+    for root in store.roots.all():
         found = _find(root)
         try:
             content = store.read(root["manifest"]) if found is None else found.content

@@ -146,14 +146,14 @@ def test_nothing_is_removed_while_a_manifest_that_something_descends_from_is_dam
 def test_nothing_is_removed_while_a_root_is_damaged(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
-    root = lab.store.get_root(lab.folder / "data/s")
+    root = lab.store.roots.get(lab.folder / "data/s")
     (file,) = (path for path in lab.store.root.glob("roots/*") if "data/s" in path.read_text())
     file.write_text(file.read_text().replace("data/s", "data/z"))
     age(lab)
     failed = lab.call("store gc")
     assert failed.code == 4 and "1 roots" in failed.err
     assert counts(lab.run("scale data/r -o data/s --json").out) == (0, 4)
-    assert lab.store.get_root(lab.folder / "data/s") == {**(root or {}), "written_s": ANY}
+    assert lab.store.roots.get(lab.folder / "data/s") == {**(root or {}), "written_s": ANY}
     assert collected(lab)["objects"] == 0
 
 
@@ -214,13 +214,13 @@ def test_a_root_that_cannot_be_reached_counts_for_fourteen_days(lab: Lab) -> Non
     Path("data/s").rename("elsewhere")
     age(lab)
     assert collected(lab)["objects"] == 0
-    root = lab.store.get_root(lab.folder / "data/s")
+    root = lab.store.roots.get(lab.folder / "data/s")
     assert root is not None and "missing_since_s" in root
     root["missing_since_s"] -= 13 * 86400
-    lab.store.write_root(root)
+    lab.store.roots.write(root)
     assert collected(lab)["objects"] == 0
     root["missing_since_s"] -= 2 * 86400
-    lab.store.write_root(root)
+    lab.store.roots.write(root)
     assert collected(lab)["objects"] > 0
 
 
@@ -230,11 +230,11 @@ def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: La
     Path("data/s").rename("elsewhere")
     age(lab)
     collected(lab)
-    root = lab.store.get_root(lab.folder / "data/s") or {}
-    lab.store.write_root({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400})
+    root = lab.store.roots.get(lab.folder / "data/s") or {}
+    lab.store.roots.write({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400})
     Path("elsewhere").rename("data/s")
     collected(lab)
-    assert "missing_since_s" not in (lab.store.get_root(lab.folder / "data/s") or {})
+    assert "missing_since_s" not in (lab.store.roots.get(lab.folder / "data/s") or {})
     Path("data/s").rename("elsewhere")
     assert collected(lab)["objects"] == 0
 

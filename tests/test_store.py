@@ -140,11 +140,18 @@ def test_runs_are_seen_while_they_last(store: Store) -> None:
 
 
 def test_a_root_remembers_what_was_at_its_path_before(store: Store, tmp_path: Path) -> None:
-    store.set_root(tmp_path / "data", "first")
-    store.set_root(tmp_path / "data", "second")
-    store.set_root(tmp_path / "data", "second")
-    root = store.get_root(tmp_path / "data")
+    store.roots.set(tmp_path / "data", "first")
+    store.roots.set(tmp_path / "data", "second")
+    store.roots.set(tmp_path / "data", "second")
+    root = store.roots.get(tmp_path / "data")
     assert root is not None and (root["manifest"], root["previous"]) == ("second", "first")
+
+
+@pytest.mark.parametrize(("path", "kind"), [("/lab/data/s", "absolute"), ("data/s", "pushed")])
+def test_a_root_as_it_was_once_written_is_read(store: Store, path: str, kind: str) -> None:
+    old = {"path": path, "manifest": "ab" * 32, "previous": None, "written_s": 1}
+    (store.root / "roots" / "old.json").write_text(json.dumps(old))
+    assert store.roots.all() == [{**old, "kind": kind}]
 
 
 def test_a_store_of_another_format_is_refused(store: Store) -> None:

@@ -136,7 +136,7 @@ class State:
             files,
             frozenset(path.name for store in stores for path in store.root.glob("objects/*/*")),
             {f"{store.root.name}/{key}": record["result"] for store in stores for key, record in store.records()},
-            {f"{store.root.name}/{root['path']}": root["manifest"] for store in stores for root in store.roots()},
+            {f"{store.root.name}/{root['path']}": root["manifest"] for store in stores for root in store.roots.all()},
         )
 
     def differences(self, other: State) -> list[str]:

@@ -186,7 +186,7 @@ class Trials:
             store = Store(root)
             known |= {f"{root.name} object {path.name}": True for path in root.glob("objects/*/*")}
             known |= {f"{root.name} record {key}": record["result"] for key, record in store.records()}
-            known |= {f"{root.name} root {found['path']}": found["manifest"] for found in store.roots()}
+            known |= {f"{root.name} root {found['path']}": found["manifest"] for found in store.roots.all()}
             known |= {f"{root.name} spool {path.parent.name}": True for path in root.glob("spool/*/header.json")}
             checkpoints = (path.name for path in root.glob("checkpoints/*"))  # gc removes those of keys that are made
             known |= {f"{root.name} checkpoint {key}": True for key in checkpoints if store.record(key) is None}
