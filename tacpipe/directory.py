@@ -6,7 +6,7 @@ import contextlib
 import glob
 import os
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from tacpipe.errors import TacpipeError, UsageError
@@ -46,10 +46,10 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
         yield
 
 
-def publish_alone(store: Store, manifest: Manifest, directory: Path, *, damaged: bool = False) -> None:
+def publish_alone(store: Store, manifest: Manifest, directory: Path, *, may_lack: Collection[str] = ()) -> None:
     """Do as `publish` does, in the block of `changing`.
 
-    Where ``damaged`` shards may be, those stay as they are: a recording that is lost must not hinder the next one.
+    Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
     """
     directory = directory.absolute()
     check_output(store, directory)
@@ -62,7 +62,7 @@ def publish_alone(store: Store, manifest: Manifest, directory: Path, *, damaged:
         store.roots.set(directory, bytes_digest(manifest.content), durable=True)
         sweep(directory)
         for path in stale:
-            with contextlib.suppress(*([MissingError] if damaged else [])):
+            with contextlib.suppress(*([MissingError] if path in may_lack else [])):
                 place(store, wanted[path], directory / path, copy=manifest.recorded)
         _remove(directory, gone)
         if not current:

@@ -60,7 +60,7 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
         changed = found.manifest.labelled({name: dict(labels) for name in _matching(found, patterns)})
         store.put(found.content)
         store.put(changed.content, durable=True)
-        directory_of.publish_alone(store, changed, directory, damaged=True)
+        directory_of.publish_alone(store, changed, directory, may_lack=dict(changed.objects()))
     return directory
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tacpipe.errors import TacpipeError
 
 MAGIC = b"TPDF"
+NEAREST, FARTHEST = 1e-3, 1e7  # of a focal length, and of the image's centre, in pixels
 HEADER = struct.Struct("<4sHHBxxx5f")  # magic, width, height, whether colours follow; focal lengths, centre, unit
 
 
@@ -50,12 +51,14 @@ class DepthFrame:
             raise TacpipeError(f"{len(content)} bytes are no depth frame; it must begin with {MAGIC.decode()}.")
         _, width, height, coloured, *optics = HEADER.unpack_from(content)
         pixels = width * height
-        if len(content) != HEADER.size + pixels * (5 if coloured else 2) or not (
-            np.isfinite(optics).all() and all(optics)
-        ):
+        if len(content) != HEADER.size + pixels * (5 if coloured else 2):
             raise TacpipeError(
                 f"A depth frame of {width} x {height} pixels came with {len(content)} bytes; it was cut off."
             )
+        if not (all(NEAREST <= one <= FARTHEST for one in optics[:2]) and max(map(abs, optics[2:4])) <= FARTHEST):
+            raise TacpipeError(f"A depth frame has the optics {optics[:4]}, pixels; no camera has.")
+        if not 0 < optics[4] <= 1:
+            raise TacpipeError(f"A depth frame counts in units of {optics[4]:g} m; it must be above 0 and at most 1.")
         depth = np.frombuffer(content, "<u2", pixels, HEADER.size).reshape(height, width).astype(np.uint16)
         start = HEADER.size + 2 * pixels
         colours = np.frombuffer(content, np.uint8, 3 * pixels, start).reshape(height, width, 3) if coloured else None

@@ -60,25 +60,30 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     }
     made = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
     store.commit(identity, result, made, durable=True)
-    output = output.absolute()
+    output, named = output.absolute(), f"rig-{text['digest'][:8]}.toml"
     with directory.changing(store, output):
         before = existing(output)
         there = {} if before is None else before.recordings
         known = next((name for name, other in there.items() if other["shards"] == shards), None)
         if before is not None and known is not None:  # a crash came between this and the spool's end
-            directory.publish_alone(store, before, output, damaged=True)
+            directory.publish_alone(store, before, output, may_lack=_others(before, known, named))
             return known
         name = _free(spooled.header["recording"], there)
         now = before or Manifest(ACQUIRE, VERSION)
         now = replace(
             now,
             recordings=dict(sorted({**now.recordings, name: entry}.items())),
-            files=dict(sorted({**now.files, f"rig-{text['digest'][:8]}.toml": text}.items())),
+            files=dict(sorted({**now.files, named: text}.items())),
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
         store.put(now.content, durable=True)
-        directory.publish_alone(store, now, output, damaged=True)
+        directory.publish_alone(store, now, output, may_lack=_others(now, name, named))
     return name
+
+
+def _others(manifest: Manifest, name: str, rig: str) -> set[str]:
+    """Return the paths of all recordings and rig files but these."""
+    return {path for path, _ in manifest.objects() if not path.startswith(f"{name}/") and path != rig}
 
 
 def _refuse(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:

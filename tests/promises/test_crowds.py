@@ -139,7 +139,7 @@ def test_who_waits_for_a_stopped_process_is_told_whom_and_gives_up(scene: Scene)
     tidy(Store(scene.project / ".tacpipe"))
 
 
-@pytest.mark.parametrize("times", [3, pytest.param(40, marks=pytest.mark.faults)])
+@pytest.mark.parametrize("times", [3, pytest.param(20, marks=pytest.mark.faults)])
 @pytest.mark.parametrize("words", ["scale data/r -o data/s", "label data/r trial-000 --set material=foam"])
 def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs(
     scene: Scene, words: str, times: int

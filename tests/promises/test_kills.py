@@ -101,7 +101,7 @@ def test_every_stage_survives_kills_at_all_of_its_moments(tmp_path: Path, learne
 def test_a_pool_of_workers_survives_kills_at_all_of_its_moments(scene: Scene) -> None:
     scene.run("simulate toy --trials 24 --rows 4 -o data/r")
     strikes = {**kills.KILLS, **kills.WORKERS}
-    kills.survive(scene, POOL, strikes, 5 * len(strikes), fresh=True)
+    kills.survive(scene, POOL, strikes, 3 * len(strikes), fresh=True)
 
 
 @pytest.mark.parametrize("name", ["SIGKILL", "Ctrl-C", "SIGTERM"])

@@ -41,6 +41,9 @@ def nothing_wrong_is_read_and_all_is_healed(one: Specimen, harms: list[Harm], fi
         assert "Traceback" not in ran.err and (ran.code == 0 or named), ran
     one.served()
     (one.folder / "data" / BY_HAND).write_bytes(one.sound[BY_HAND])  # as git does: its label may be nowhere else
+    refused = one.lab.call(CHAIN[1])
+    if refused.code == DAMAGED and "remove it" in refused.err:  # labels may have stood in it: a person decides
+        (one.folder / "data/simulated/manifest.json").unlink()
     for ran in one.rerun():
         assert ran.code == 0, ran
     assert one.shown() == dict(one.sound)
@@ -60,7 +63,7 @@ def test_whatever_is_damaged_nothing_wrong_is_read_and_all_is_healed(
 
 
 @pytest.mark.faults
-@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(harms=st.lists(HARMS, min_size=1, max_size=40), first=FIRST)
 def test_however_much_is_damaged_nothing_wrong_is_read_and_all_is_healed(
     made: Path, lab: Lab, harms: list[Harm], first: str
