@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.ahead import Ahead
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.hashing import digest
 from tacpipe.manifest import Manifest, shard_path
@@ -77,19 +76,11 @@ class LazyFiles(Mapping[str, bytes]):
 class Dataset:
     """A dataset opened for reading: recordings by name, files by name."""
 
-    def __init__(
-        self,
-        manifest: Manifest,
-        read: Reader,
-        names: Iterable[str] | None = None,
-        place: Callable[[str], str]
-        | None = None,  # where the content of a digest lies; without it nothing is read ahead
-    ) -> None:
+    def __init__(self, manifest: Manifest, read: Reader, names: Iterable[str] | None = None) -> None:
         included = manifest.included
         chosen = sorted(included if names is None else names)
-        reading = read if place is None else Ahead(read, place, self._sequences)
         self.source = manifest
-        self.shards: dict[str, Shard] = {name: Shard(name, included[name], reading) for name in chosen}
+        self.shards: dict[str, Shard] = {name: Shard(name, included[name], read) for name in chosen}
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
 
     @property
@@ -145,14 +136,6 @@ class Dataset:
         import torch
 
         return {name: torch.from_numpy(values) for name, values in self.to_numpy(stream, columns).items()}
-
-    def _sequences(self) -> Iterator[Sequence[tuple[str, str]]]:
-        """Yield digest and path of the shards of each stream, in the order of the recordings."""
-        found: dict[str, list[tuple[str, str]]] = {}
-        for shard in self.shards.values():
-            for stream, name in shard.digests.items():
-                found.setdefault(stream, []).append((name, shard_path(shard.name, stream)))
-        yield from found.values()
 
     def _only_stream(self) -> str:
         streams = {stream for shard in self.shards.values() for stream in shard.streams}

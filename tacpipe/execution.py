@@ -228,9 +228,9 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
         if kind == "Shard":
             found[name] = Shard(task.recording, inputs[name], read)
         elif kind in ("Dataset", "Model"):
-            found[name] = _dataset(store, inputs[name], read) if inputs[name] is not None else None
+            found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
-            found[name] = tuple(_dataset(store, value, read) for value in inputs[name])
+            found[name] = tuple(_dataset(value, read) for value in inputs[name])
         elif kind == "Fitted":
             found[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
@@ -248,7 +248,7 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
             raise TacpipeError(f"{path} changed while it was read. Run the same command again.")
 
 
-def _dataset(store: Store, value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
+def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
     lineage = value["lineage"]
     manifest = Manifest(
         stage=lineage["stage"],
@@ -258,7 +258,7 @@ def _dataset(store: Store, value: Mapping[str, Any], read: Callable[[str, str], 
         recordings=value["recordings"],
         files={name: {"digest": file} for name, file in value["files"].items()},
     )
-    return Dataset(manifest, read, place=store.object_path)
+    return Dataset(manifest, read)
 
 
 def read_roles(content: bytes) -> dict[tuple[str, int], str]:

@@ -39,9 +39,7 @@ class Outcome:
 def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
     found = manifest.find(path)
-    store = locate(found.directory)
-    read = execution.reader(store, (str(found.directory.absolute()),))
-    return Dataset(found.manifest, read, place=store.object_path)
+    return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),)))
 
 
 def run(request: Request) -> Outcome:
