@@ -41,13 +41,13 @@ demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with de
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
-test: $(VENV)/.dev ## run all tests but the long and the exhaustive ones, in under 6 minutes
+test: $(VENV)/.dev ## run all tests but the long and the exhaustive ones
 	@$(PYTEST) -m "not faults and not long"
 
-test-long: $(VENV)/.dev ## run the tests that train for long, and DVC's chains of all tasks, in 5 minutes
+test-long: $(VENV)/.dev ## run the tests that train for long, DVC's chains of all tasks and the README's commands
 	@$(PYTEST) -m long
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in under 20 minutes, and print how many
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes, and print how many
 	@mkdir -p $(dir $(COUNTS)) && : > $(COUNTS)
 	@$(FAULTS) tests/promises
 	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)

@@ -77,6 +77,7 @@ def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> Non
     assert not [name for name, text in told.items() if not re.fullmatch(r"[A-Z].+\.", text)]
 
 
+@pytest.mark.long
 def test_the_commands_of_the_readme_print_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (ROOT / "README.md").read_text()
     sixty, own = section(text, "Sixty seconds on simulated recordings"), section(text, "Your own stage")

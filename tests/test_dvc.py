@@ -142,6 +142,7 @@ def cached(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in (folder / ".dvc" / "cache").rglob("*") if path.is_file()]
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_params_and_plots(

@@ -274,17 +274,20 @@ def from_row(shard: FakeShard, row: int, values: Floats | float) -> Floats:
     return added
 
 
+@pytest.mark.long
 def test_who_knows_the_plan_foresees_most_of_the_change_of_load(forecasters: dict[str, Forecaster]) -> None:
     assert skill_at_the_end(forecasters["planned"]) >= 0.8
     assert skill_at_the_end(forecasters["planned"], everywhere=True) >= 0.8
 
 
+@pytest.mark.long
 def test_without_the_plan_no_more_is_foreseen_than_acceleration_can_be(forecasters: dict[str, Forecaster]) -> None:
     bound = bound_without_plan()
     assert skill_at_the_end(forecasters["none"]) <= bound
     assert skill_at_the_end(forecasters["planned"]) > bound + 0.05
 
 
+@pytest.mark.long
 def test_plans_of_other_windows_help_no_more_than_none(forecasters: dict[str, Forecaster]) -> None:
     without = skill_at_the_end(forecasters["none"])
     assert skill_at_the_end(forecasters["shuffled"]) <= without + 0.05
@@ -308,6 +311,7 @@ def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
     assert (model <= 2.0).all()
 
 
+@pytest.mark.long
 def test_touch_that_is_to_come_changes_no_forecast(forecasters: dict[str, Forecaster]) -> None:
     forecaster, shard, row = forecasters["planned"], recorded(TESTED[0], **STICK), 300
     rng = np.random.default_rng(3)
@@ -321,6 +325,7 @@ def test_touch_that_is_to_come_changes_no_forecast(forecasters: dict[str, Foreca
     assert np.abs(after[now == row + 1] - before[now == row + 1]).max() > 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ahead", [1, 4, 10])
 def test_a_plan_changes_no_forecast_before_its_own_step(ahead: int, forecasters: dict[str, Forecaster]) -> None:
     forecaster, shard, row = forecasters["planned"], recorded(TESTED[0], **STICK), 300
@@ -333,12 +338,14 @@ def test_a_plan_changes_no_forecast_before_its_own_step(ahead: int, forecasters:
     assert np.abs(after[now < row + ahead - HORIZON] - before[now < row + ahead - HORIZON]).max() < 0.01
 
 
+@pytest.mark.long
 def test_a_slip_that_the_plan_makes_is_announced_to_who_knows_it(forecasters: dict[str, Forecaster]) -> None:
     lead = median_lead(forecasters["planned"], PLANNED_SLIP)
     assert lead >= 5
     assert median_lead(forecasters["none"], PLANNED_SLIP) <= lead - 5
 
 
+@pytest.mark.long
 def test_nobody_announces_that_the_grip_gives_way(forecasters: dict[str, Forecaster]) -> None:
     assert median_lead(forecasters["planned"], GRIP_LOSS) <= 0
     assert median_lead(forecasters["none"], GRIP_LOSS) <= 0
