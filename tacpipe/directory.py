@@ -26,11 +26,11 @@ def publish(store: Store, manifest: Manifest, directory: Path) -> None:
     something that tacpipe did not write.
     """
     directory = directory.absolute()
-    check_output(store, directory)
-    if not shown(store, manifest, directory):
-        with changing(store, directory):
-            publish_alone(store, manifest, directory)
-    store.roots.set(directory, bytes_digest(manifest.content))
+    if shown(store, manifest, directory):
+        store.roots.set(directory, bytes_digest(manifest.content))
+        return
+    with changing(store, directory):
+        publish_alone(store, manifest, directory)
 
 
 def shown(store: Store, manifest: Manifest, directory: Path) -> bool:
@@ -188,7 +188,7 @@ def _matches(path: Path, store: Store, name: str) -> bool:
 def _current(directory: Path, content: bytes) -> bool:
     try:
         return (directory / NAME).read_bytes() == content
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
 
 

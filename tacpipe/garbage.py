@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
 from tacpipe.files import readable_errors
-from tacpipe.hashing import bytes_digest
+from tacpipe.hashing import DIGEST, bytes_digest
 from tacpipe.roots import PUSHED
 from tacpipe.store import ASIDE, Store
 
@@ -194,7 +193,7 @@ def _doubtful(store: Store) -> set[str]:
         if path.name.startswith("root-") or store.record(path.name.partition(".")[0]) is not None:
             continue
         with contextlib.suppress(FileNotFoundError):
-            found.update(re.findall(r"[0-9a-f]{64}", path.read_bytes().decode("latin-1")))
+            found.update(DIGEST.findall(path.read_bytes().decode("latin-1")))
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from tacpipe import regular
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import excerpt
 
+DIGEST = re.compile(r"[0-9a-f]{64}")  # as it is written, in whole or within a text
 SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
 _remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system said of the file, its digest
 

@@ -12,14 +12,13 @@ from typing import Any
 
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.excerpt import excerpt, plain
-from tacpipe.hashing import bytes_digest, digest
+from tacpipe.hashing import DIGEST, bytes_digest, digest
 from tacpipe.stage import Attribute
 
 FORMAT = 1
 NAME = "manifest.json"
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
 NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add to it
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 _PART = r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*"
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 _PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
@@ -195,7 +194,7 @@ def _expect_mapping(value: object, what: str) -> None:
 
 
 def _expect_digest(name: object) -> None:
-    if not isinstance(name, str) or not _DIGEST.fullmatch(name):
+    if not isinstance(name, str) or not DIGEST.fullmatch(name):
         raise ValueError(f"{str(name)[:80]!r} is no digest")
 
 

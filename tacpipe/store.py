@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,14 +14,13 @@ from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.files import listed, readable_errors, sentence, sync_folders, write_whole
-from tacpipe.hashing import bytes_digest, digest
+from tacpipe.hashing import DIGEST, bytes_digest, digest
 from tacpipe.leases import Announcing, Leases
 from tacpipe.roots import BESIDE_NAME, Roots
 
 FORMAT = "1"
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
 ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class MissingError(DamagedError):
@@ -57,7 +55,7 @@ class Store:
 
         Raises `DamagedError` for a name that is no digest: it would lead out of the store.
         """
-        if not _DIGEST.fullmatch(name):
+        if not DIGEST.fullmatch(name):
             raise DamagedError(f"{name[:80]!r} is no digest (64 hex digits): what names it is damaged or was made up.")
         return f"{self._root}/objects/{name[:2]}/{name}"
 

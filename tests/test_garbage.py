@@ -31,6 +31,17 @@ def collected(lab: Lab, options: str = "") -> dict[str, int]:
     return value
 
 
+def replaced_recording(lab: Lab) -> str:
+    """Ingest a recording, then another in its place; return the digest of the first, which nothing names any more."""
+    Path("src").mkdir()
+    Path("src/a.txt").write_text("1 2 3")
+    lab.run("ingest numbers src -o data/r")
+    (name,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
+    Path("src/a.txt").write_text("4 5 6")
+    lab.run("ingest numbers src -o data/r")
+    return str(name)
+
+
 def test_nothing_that_a_root_or_its_ancestors_need_is_removed(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
@@ -158,12 +169,7 @@ def test_nothing_is_removed_while_a_root_is_damaged(lab: Lab) -> None:
 
 
 def test_a_recording_whose_record_was_damaged_is_kept_though_nothing_names_it(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
-    lab.run("ingest numbers src -o data/r")
-    (name,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
-    Path("src/a.txt").write_text("4 5 6")
-    lab.run("ingest numbers src -o data/r")
+    name = replaced_recording(lab)
     (record,) = (path for path in lab.store.root.glob("records/*/*") if name in path.read_text())
     record.write_text(record.read_text().replace("irreplaceable", "irreplaceablf"))
     age(lab)
@@ -197,12 +203,7 @@ def test_a_project_that_was_moved_keeps_its_datasets(lab: Lab, monkeypatch: pyte
 
 
 def test_recordings_that_nothing_names_are_kept_unless_asked_for(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
-    lab.run("ingest numbers src -o data/r")
-    (name,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
-    Path("src/a.txt").write_text("4 5 6")
-    lab.run("ingest numbers src -o data/r")
+    name = replaced_recording(lab)
     age(lab)
     assert collected(lab)["kept_recordings"] == 1 and lab.store.has(name)
     assert collected(lab, "--recordings")["objects"] >= 1 and not lab.store.has(name)
