@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,10 +44,15 @@ _KINDS = ("Shard", "Dataset", "Datasets", "Model", "Fitted", "Files", "Trial", "
 
 @dataclass(frozen=True)
 class Recording:
-    """What a stage returns for one recording: a table, or one a stream, and attributes to add."""
+    """What a stage returns for one recording: a table, or one a stream, attributes to add, and notes for the user.
+
+    A note is a sentence about a result that is valid but probably not what was wanted. Commands print it as a warning, on
+    a cache hit too; it is kept in the record and is part of no key or digest.
+    """
 
     tables: pa.Table | Mapping[str, pa.Table]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
     @property
     def streams(self) -> dict[str, pa.Table]:
@@ -57,10 +62,11 @@ class Recording:
 
 @dataclass(frozen=True)
 class Result:
-    """What a stage over whole datasets returns: recordings, files, or both."""
+    """What a stage over whole datasets returns: recordings, files, or both, and notes for the user (see `Recording`)."""
 
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
