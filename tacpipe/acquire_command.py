@@ -115,7 +115,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
         raise UsageError("--trials needs --duration or --stop, or the first trial never ends.")
     store.prepare()
     directory.check_output(store, plan.output)
-    appending.existing(plan.output)
+    appending.refuse_taken(plan.output, plan.names)
     recorder = Recorder(rig)
     with Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(ended)

@@ -6,11 +6,12 @@ torch, pyarrow, pandas, scikit-learn or open3d. What it takes to build one comes
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from tacpipe import interruption
+from tacpipe import failures, interruption, places
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.files import told
 
@@ -76,38 +77,62 @@ def main() -> None:
 
 
 def answer(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit code, one of those that are documented."""
+    """Run one command line and return its exit code, one of those that are documented.
+
+    With ``--json`` among the arguments an error is one object on stdout too: ``schema_version``, ``error``, ``exit_code``.
+    """
     try:
-        code = _call(arguments)
+        code, sentence = _call(arguments)
     except TacpipeError as error:
-        if not interruption.wished():
-            print(f"tacpipe: {error}", file=sys.stderr)
-            return error.exit_code
-        code = INTERRUPTED
+        code, sentence = error.exit_code, str(error)
+        _complain(sentence)
     except KeyboardInterrupt:
-        code = INTERRUPTED
+        code, sentence = INTERRUPTED, ""
     except BrokenPipeError:
         return DONE
     except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
-        if not interruption.wished():
-            print(f"tacpipe: {told(error)}", file=sys.stderr)
-            return FAILED
-        code = INTERRUPTED
-    except Exception:
-        if not interruption.wished():
+        code, sentence = FAILED, told(error)
+        _complain(sentence)
+    except Exception as error:
+        found = failures.text(error)
+        if found is None and not interruption.wished():
             raise
-        code = INTERRUPTED
-    if code == INTERRUPTED:
+        code, sentence = FAILED, str(found)
+        _complain(sentence)
+    if code == INTERRUPTED or (code != DONE and interruption.wished()):
         interruption.tell()
+        code, sentence = INTERRUPTED, "The command was interrupted."
+    if sentence and "--json" in arguments:
+        print(json.dumps({"schema_version": 1, "error": sentence, "exit_code": code}))
     return code
 
 
-def _call(arguments: Sequence[str]) -> int:
+def _complain(sentence: str) -> None:
+    if not interruption.wished():
+        print(f"tacpipe: {sentence}", file=sys.stderr)
+
+
+def _call(arguments: Sequence[str]) -> tuple[int, str]:
+    """Return the exit code of a command line, and what was wrong with how it is written."""
+    import typer
+
+    program = app(arguments)
+    places.expect_local(program)
     try:
-        app(arguments)(arguments, prog_name="tacpipe")
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-    return DONE
+        code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
+    except typer.Abort:
+        return FAILED, ""
+    except _misuse() as error:
+        error.show()
+        return error.exit_code, error.format_message()
+    return code if isinstance(code, int) else DONE, ""
+
+
+def _misuse() -> type[Any]:
+    """Return what click raises for a command line that it cannot read; typer may bring a click of its own."""
+    import typer
+
+    return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
 def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: Sequence[str]) -> None:

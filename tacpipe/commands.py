@@ -18,7 +18,7 @@ SUMMARIES = {
     "show": "Show what is in a dataset: recordings, streams, rates, gaps, saturation, labels.",
     "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
     "sensors": "Look after sensors: list those that are known, find out which one speaks on a port, emulate a rig.",
-    "store": "Look after the store: status, verify, repair, gc, link, push, pull.",
+    "store": "Manage the store: status, list, checkout, verify, repair, gc, link, push, pull.",
     "candidates": "List grasps that two fingers could make on an object, and what a model says each would feel.",
     "demo": "Run the main job on the simulated rig, small, from recordings to a report.",
 }
@@ -34,10 +34,19 @@ def _label(program: typer.Typer) -> None:
         set_: Annotated[list[str] | None, typer.Option("--set", help="name=value; a value of null removes it.")] = None,
         exclude: Annotated[str | None, typer.Option("--exclude", help="Leave out of every stage, and why.")] = None,
         include: Annotated[bool, typer.Option("--include", help="Take back an --exclude.")] = False,
+        as_json: AsJson = False,
     ) -> None:
         from tacpipe import labels
 
-        print(labels.change(dataset, names, labels.parse(set_ or [], exclude, include=include)))
+        wanted = labels.parse(set_ or [], exclude, include=include)
+        changed = labels.change(dataset, names, wanted)
+        value = {
+            "schema_version": 1,
+            "output": str(changed.directory),
+            "recordings": changed.recordings,
+            "labels": wanted,
+        }
+        print(json.dumps(value) if as_json else changed.directory)
 
 
 def _show(program: typer.Typer) -> None:

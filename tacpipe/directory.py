@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
+from tacpipe import replacing
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.files import sync_folder, sync_folders, write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
@@ -46,10 +47,14 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
         yield
 
 
-def publish_alone(store: Store, manifest: Manifest, directory: Path, *, may_lack: Collection[str] = ()) -> None:
+def publish_alone(
+    store: Store, manifest: Manifest, directory: Path, *, may_lack: Collection[str] = (), relabelled: bool = False
+) -> None:
     """Do as `publish` does, in the block of `changing`.
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
+    What the dataset before held and cannot be computed again stays in the store, and so does its manifest; of one that was
+    ``relabelled``, nothing is gone.
     """
     directory = directory.absolute()
     check_output(store, directory)
@@ -59,7 +64,11 @@ def publish_alone(store: Store, manifest: Manifest, directory: Path, *, may_lack
     gone = _named(directory) - set(wanted)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
-        store.roots.set(directory, bytes_digest(manifest.content), durable=True)
+        before = None if current else replacing.outgoing(store, directory)
+        lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
+        if before is not None and lasting:
+            replacing.adopt(store, directory, before)
+        store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
         sweep(directory)
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in may_lack else [])):
@@ -130,9 +139,16 @@ def check_output(store: Store, directory: Path) -> None:
     directory = directory.absolute()
     if directory.is_file():
         raise UsageError(f"{directory} is a file; give -o a directory.")
-    if not directory.is_dir() or (directory / NAME).exists() or store.roots.get(directory) is not None:
+    if (directory / NAME).exists() or store.roots.get(directory) is not None:
+        return
+    around = next((folder for folder in directory.parents if (folder / NAME).is_file()), None)
+    if around is not None:
+        raise UsageError(f"{directory} lies within the dataset {around}. Give -o a directory outside of it.")
+    if not directory.is_dir():
         return
     for path in directory.rglob("*"):  # a project that was moved: its shards are known, its path is not
+        if path.name == NAME and path.is_file():
+            raise UsageError(f"{directory} holds the dataset {path.parent}. Give -o a directory of its own.")
         if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):
             raise UsageError(
                 f"{directory} has no {NAME} and holds {path.relative_to(directory)}, which tacpipe did not write. "

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tacpipe import failures, provenance, registry
 from tacpipe import params as params_of
-from tacpipe import provenance, registry
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
 from tacpipe.hashing import bytes_digest, digest, remembered_file_digest
@@ -33,6 +33,7 @@ class Task:
     beside: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
+    rerun: bool = False  # compute although a result is stored
     run: str = ""  # the lease of the run that it is part of
 
 
@@ -53,16 +54,18 @@ def compute(task: Task) -> Done:
     store, key = Store(task.store, task.run), digest(task.identity)
     try:
         if task.dry:
-            return Done(task.recording, {"result": execute(task, store, _Scratch())})
+            result, _ = execute(task, store, _Scratch())
+            return Done(task.recording, {"result": result, "provenance": {}})
         with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
             record = store.record(key)
-            if record is not None and complete(store, record):
+            if record is not None and not task.rerun and complete(store, record):
                 return Done(task.recording, record, made=False)
             started = time.perf_counter()
             replace = task.replace or record is not None
-            result = execute(task, store, store)
+            result, notes = execute(task, store, store)
             stage = stage_of(task.name)
             made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+            made |= {"code": provenance.code(stage), "notes": notes}
             record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
             shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
             return Done(task.recording, record)
@@ -80,15 +83,15 @@ class _Scratch:
         return Object(bytes_digest(content), len(content))
 
 
-def execute(task: Task, store: Store, sink: Store | _Scratch) -> dict[str, Any]:
-    """Call the stage for the task and return what a record's ``result`` holds, its content put into ``sink``."""
+def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str, Any], list[str]]:
+    """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
     stage = stage_of(task.name)
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments:
         try:
             returned = stage(params, **arguments)
         except Exception as error:
-            error.add_note(f"in stage {task.name}, recording {task.recording or 'all'}")
+            failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
     if not isinstance(returned, Result):
         returned = (
@@ -98,7 +101,8 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> dict[str, Any]:
         name: _entry(recording, sink, durable=stage.source) for name, recording in sorted(returned.recordings.items())
     }
     files = {name: vars(sink.put(content)) for name, content in sorted(returned.files.items())}
-    return {"recordings": recordings, "files": files}
+    notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
+    return {"recordings": recordings, "files": files}, notes
 
 
 def stage_of(name: str) -> Stage:

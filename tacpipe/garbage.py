@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import manifest as manifest_of
+from tacpipe import replacing
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
 from tacpipe.files import readable_errors
 from tacpipe.hashing import DIGEST, bytes_digest
 from tacpipe.roots import PUSHED
-from tacpipe.store import ASIDE, Store
+from tacpipe.store import ASIDE, MissingError, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
@@ -44,15 +45,17 @@ class Live:
     """What is needed: by roots, by what lies at their paths, by running processes, and by what these descend from."""
 
     objects: set[str] = field(default_factory=set)  # digests, of manifests too
+    lasting: set[str] = field(default_factory=set)  # digests of what was replaced and cannot be computed again
+    replaced: set[str] = field(default_factory=set)  # digests of the manifests that name it
     runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
 
 
-def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False) -> Live:
-    """Return what is needed.
+def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> Live:
+    """Return what is needed, with ``lasting`` also what was replaced and cannot be computed again.
 
     Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
     """
-    found, wanted = Live(), []
+    found, wanted, replaced = Live(), [], []
     for run in store.leases.runs():  # before the roots: a run that ends meanwhile has written its root by then
         found.runs.add(run.path.stem)
         found.objects |= run.objects
@@ -70,6 +73,9 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False)
         expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
+        if lasting:
+            replaced += [one["manifest"] for one in root.get("history", []) if one["lasting"]]
+            replaced += [root["manifest"]] if here is None and expired and _lasting(store, root["manifest"]) else []
     damaged = store.roots.damaged()
     if damaged:
         raise DamagedError(
@@ -78,7 +84,18 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False)
             f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
         )
     found.objects |= _closure(store, wanted, contents) | _doubtful(store)
+    found.lasting = _closure(store, list(replaced), contents) - found.objects
+    found.replaced = set(replaced)
     return found
+
+
+def _lasting(store: Store, name: str) -> bool:
+    """Return whether a manifest whose directory is gone holds recordings or labels that cannot be computed again."""
+    try:
+        manifest = manifest_of.parse(store.read(name), name, verified=True)
+    except MissingError:
+        return False
+    return replacing.irreplaceable(manifest) or bool(manifest.labels)
 
 
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
@@ -93,18 +110,18 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    needed = live(store, grace_days, dry_run=dry_run)
+    needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
-    kept: set[str] = set()
+    kept = set(needed.lasting)
     for key, record in list(store.records()):
         names = set(named(record["result"]))
-        if names <= needed.objects:
+        if names <= needed.objects or names <= kept:
             continue
         if record["provenance"].get("irreplaceable") and not recordings:
             kept |= names - needed.objects
             continue
         collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
-    collected.kept_recordings = len(kept)
+    collected.kept_recordings = len(kept - needed.replaced)
     aside = []
     for path in store.listed("objects", "*", "*"):
         if path.name in needed.objects or path.name in kept or _young(path):

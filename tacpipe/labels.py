@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from math import isfinite
 from pathlib import Path
@@ -47,8 +48,16 @@ def _value(text: str) -> Attribute:
     return found if isinstance(found, str | int | float | None) else text
 
 
-def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Path:
-    """Set ``labels`` on the recordings whose names match and return the dataset's directory.
+@dataclass(frozen=True)
+class Changed:
+    """The dataset whose labels were changed, and the recordings that have new ones."""
+
+    directory: Path
+    recordings: list[str]
+
+
+def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Changed:
+    """Set ``labels`` on the recordings whose names match and return the dataset's directory and their names.
 
     Raises `UsageError` if a pattern matches no recording.
     """
@@ -57,11 +66,12 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
     _refuse_made(found.manifest, directory)
     with store.at_work([found.digest]), directory_of.changing(store, directory):
         found = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
-        changed = found.manifest.labelled({name: dict(labels) for name in _matching(found, patterns)})
+        names = _matching(found, patterns)
+        changed = found.manifest.labelled({name: dict(labels) for name in names})
         store.put(found.content)
         store.put(changed.content, durable=True)
-        directory_of.publish_alone(store, changed, directory, may_lack=dict(changed.objects()))
-    return directory
+        directory_of.publish_alone(store, changed, directory, may_lack=dict(changed.objects()), relabelled=True)
+    return Changed(directory, names)
 
 
 def _refuse_made(manifest: Manifest, directory: Path) -> None:

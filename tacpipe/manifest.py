@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from tacpipe import places
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.excerpt import excerpt, plain
 from tacpipe.hashing import DIGEST, bytes_digest, digest
@@ -227,7 +228,7 @@ class Found:
 
 def find(path: Path | str) -> Found:
     """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself)."""
-    given = Path(path)
+    given = places.local(path)
     file = given if given.name == NAME else given / NAME
     try:
         if file.exists() and not file.is_file():

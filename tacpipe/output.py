@@ -1,15 +1,15 @@
-"""What lies at a command's output, and making it show a result: a dataset with its labels, or one file of it."""
+"""What is at a command's output, and making it show a result: a dataset with its labels, or one file of it."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping
 
-from tacpipe import directory
-from tacpipe import manifest as manifest_of
-from tacpipe.errors import DamagedError, TacpipeError, UsageError, WouldChangeError
+from tacpipe import directory, replacing
+from tacpipe.errors import UsageError, WouldChangeError
 from tacpipe.hashing import bytes_digest, file_digest
 from tacpipe.manifest import Manifest
 from tacpipe.request import Request
+from tacpipe.stage import Attribute
 from tacpipe.store import Store
 
 
@@ -21,41 +21,38 @@ def shown(store: Store, request: Request, hit: Manifest) -> bool:
     if request.single_file:
         known = root["manifest"] == bytes_digest(hit.content) and request.output.exists()
         return known and file_digest(request.output) == hit.files[_single(request, hit)]["digest"]
-    wanted = labelled(store, request, hit)
+    wanted = settled(store, request, hit)
     known = root["manifest"] == bytes_digest(wanted.content) and store.has(root["manifest"])
     return known and directory.shown(store, wanted, request.output.absolute())
 
 
-def labelled(store: Store, request: Request, made: Manifest) -> Manifest:
-    """Return recordings with the labels that were set by hand on those they replace.
+def settled(store: Store, request: Request, made: Manifest) -> Manifest:
+    """Return the manifest that the output shows after the command gave ``made``.
 
-    Raises `DamagedError` if these cannot be told: no rerun would bring them back.
+    Recordings have the labels that were set on them by hand, also where their directory was deleted in the meantime;
+    ingested ones are appended to those that are there. Raises `DamagedError` if what is there cannot be read.
     """
-    if not made.recorded or not (request.output / manifest_of.NAME).exists():
+    if not made.recorded:
         return made
-    try:
-        before = manifest_of.find(request.output).manifest
-    except TacpipeError as error:
-        before = _before(store, request.output, error)
-    return made.labelled(before.labels) if before.labels else made
+    before = replacing.occupant(store, request.output)
+    if before is None:
+        known = replacing.former(store, request.output)
+        return made if known is None else _labelled(made, replacing.returning_labels(known, made))
+    if before.stage != made.stage:
+        return made
+    if replacing.irreplaceable(made) and not request.replace:
+        made = replacing.appended(before, made)
+    return _labelled(made, before.labels)
 
 
-def _before(store: Store, output: Path, error: TacpipeError) -> Manifest:
-    """Return the manifest that was written at ``output``, which is damaged now, from the store."""
-    root = store.roots.get(output.absolute())
-    try:
-        if root is not None:
-            return manifest_of.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
-    except TacpipeError:
-        pass
-    raise DamagedError(
-        f"{error} Labels that were set by hand may stand in it, and would be lost: bring it back with git, or remove it to "
-        f"go on without them."
-    )
+def _labelled(made: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
+    return made.labelled(labels) if labels else made
 
 
 def check(store: Store, request: Request, made: Manifest) -> None:
-    """Raise `WouldChangeError` where the output was made from anything else."""
+    """Raise `WouldChangeError` where the output was made from anything else, `UsageError` where it would be refused."""
+    if not (request.single_file or request.replace):
+        replacing.refuse_losses(replacing.occupant(store, request.output), request.output, made)
     root = store.roots.get(request.output.absolute())
     if root is None or root["manifest"] != bytes_digest(made.content):
         raise WouldChangeError(f"{request.output} would change: it was made from other inputs or params.")
@@ -66,14 +63,35 @@ def publish(store: Store, request: Request, made: Manifest) -> Manifest:
     if request.single_file:
         _publish_file(store, request, made)
         return made
-    if not made.recorded:
-        directory.publish(store, made, request.output)
+    if not made.recorded and directory.shown(store, made, request.output.absolute()):
+        store.roots.set(request.output.absolute(), bytes_digest(made.content))
         return made
     with directory.changing(store, request.output):  # somebody may be about to label what is there
-        made = labelled(store, request, made)
-        store.put(made.content)
+        made = settled(store, request, made)
+        if not request.replace:
+            replacing.refuse_losses(replacing.occupant(store, request.output), request.output, made)
+        if made.recorded:
+            store.put(made.content)
         directory.publish_alone(store, made, request.output)
     return made
+
+
+def refuse(store: Store, request: Request, plan: replacing.Plan) -> None:
+    """Raise `UsageError` if the command would replace what it must not, before it computes anything."""
+    if request.single_file:
+        _refuse_file(store, request)
+        return
+    directory.check_output(store, request.output)
+    if not request.replace:
+        replacing.refuse_plan(replacing.occupant(store, request.output), request.output, plan)
+
+
+def _refuse_file(store: Store, request: Request) -> None:
+    output = request.output.absolute()
+    if request.replace or not output.is_file() or store.roots.get(output) is not None:
+        return
+    if not store.has(file_digest(output)):
+        raise UsageError(f"{request.output} is a file that tacpipe did not write. Give -o another name, or --replace.")
 
 
 def _publish_file(store: Store, request: Request, made: Manifest) -> None:

@@ -8,7 +8,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe import directory, execution, executors, keys, manifest, output, progress, provenance, registry
+from tacpipe import (
+    execution,
+    executors,
+    keys,
+    manifest,
+    output,
+    progress,
+    provenance,
+    registry,
+    replacing,
+)
 from tacpipe import params as params_of
 from tacpipe import request as request_of
 from tacpipe.dataset import Dataset
@@ -19,6 +29,8 @@ from tacpipe.manifest import Entry, Manifest
 from tacpipe.request import Inputs, Request
 from tacpipe.stage import ROLES
 from tacpipe.store import MissingError, Store, locate
+
+_NAMED = 5  # recordings that a note names
 
 
 @dataclass
@@ -34,6 +46,8 @@ class Outcome:
     bad: dict[str, str] = field(default_factory=dict)
     differs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    said: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
+    code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
 
 
 def open_dataset(path: Path | str) -> Dataset:
@@ -45,19 +59,25 @@ def open_dataset(path: Path | str) -> Dataset:
 def run(request: Request) -> Outcome:
     """Make the dataset that ``request`` asks for, doing only what was not done before."""
     started = time.perf_counter()
+    if request.rerun and (request.check or request.compare):
+        raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")
+    replacing.refuse_inputs(request)
     store = locate()
     inputs = Inputs(request, store)
     identity = inputs.identity()
     outcome = Outcome(request.output, digest(identity))
-    hit = None if request.compare else _answer(store, outcome.key)
-    if hit is not None and (request.check or output.shown(store, request, hit)):
-        made, outcome.reused = output.labelled(store, request, hit), len(hit.recordings) or 1
+    hit = None if request.compare or request.rerun else _answer(store, outcome)
+    shown = hit is not None and output.shown(store, request, hit)
+    if not shown and not request.compare:
+        output.refuse(store, request, inputs.plan())
+    if hit is not None and (request.check or shown):
+        made, outcome.reused = output.settled(store, request, hit), len(hit.recordings) or 1
     elif request.check or request.compare:
-        made = output.labelled(store, request, _Run(request, store, inputs, outcome).make())
+        made = output.settled(store, request, _Run(request, store, inputs, outcome).make())
     else:
         with store.at_work([found.digest for found in inputs.used]):
             made = _make(request, store, inputs, identity, outcome)
-    outcome.notes = sorted(set(inputs.notes))
+    outcome.notes = [*sorted(set(inputs.notes)), *_notes(outcome)]
     outcome.rows = made.rows
     if request.check:
         output.check(store, request, made)
@@ -67,10 +87,8 @@ def run(request: Request) -> Outcome:
 
 def _make(request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any], outcome: Outcome) -> Manifest:
     """Return the manifest that the output shows afterwards, answered by the store or made; nothing of it is collected."""
-    if not request.single_file:
-        directory.check_output(store, request.output)
     for first in (True, False):
-        made = _answer(store, outcome.key)
+        made = None if request.rerun and first else _answer(store, outcome)
         if made is None:
             made = _Run(request, store, inputs, outcome).make()
             _remember(store, identity, made, outcome)
@@ -82,12 +100,13 @@ def _make(request: Request, store: Store, inputs: Inputs, identity: Mapping[str,
             if not first:
                 raise
             outcome.ran = outcome.reused = 0
+            outcome.said, outcome.code = {}, {}
     raise AssertionError
 
 
-def _answer(store: Store, key: str) -> Manifest | None:
+def _answer(store: Store, outcome: Outcome) -> Manifest | None:
     """Return the manifest that this run gave before, if everything it names is still there."""
-    record = store.record(key)
+    record = store.record(outcome.key)
     if record is None:
         return None
     name = record["result"]["files"][manifest.NAME]["digest"]
@@ -98,7 +117,31 @@ def _answer(store: Store, key: str) -> Manifest | None:
         return None
     found = manifest.parse(content, "the stored manifest", verified=True)
     store.announce(wanted for _, wanted in found.objects())
-    return found if all(store.has(name, size) for name, size in found.sizes()) else None
+    if not all(store.has(name, size) for name, size in found.sizes()):
+        return None
+    outcome.code = record["provenance"].get("code") or {}
+    outcome.said = record["provenance"].get("notes") or {}
+    return found
+
+
+def _notes(outcome: Outcome) -> list[str]:
+    """Return what the user should know of the results: what stages noted, and which were computed by other code."""
+    count = outcome.ran + outcome.reused
+    found = []
+    for text, names in outcome.said.items():
+        named = ", ".join(sorted(names)[:_NAMED]) + (" …" if len(names) > _NAMED else "")
+        some = f"all {count} recordings" if len(names) == count else f"{len(names)} recordings ({named})"
+        found.append(f"{some}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
+    for name, counts in outcome.code.items():
+        stage = execution.stage_of(name)
+        others = sum(number for code, number in counts.items() if code != provenance.code(stage))
+        if others and provenance.code(stage) is not None:
+            found.append(
+                f"{others} of these results were computed by other code of {name} than there is now in "
+                f"{stage.function.__module__}, under the same version {stage.version}. Raise its version if they differ, "
+                f"or compute them again with --rerun."
+            )
+    return found
 
 
 class _Run:
@@ -193,8 +236,9 @@ class _Run:
         """Return the result of a key over whole datasets, from the store or by running the stage."""
         record = self.store.record(digest(identity))
         known = record is not None and execution.complete(self.store, record)
-        if record is not None and known and not self.request.compare:
+        if record is not None and known and not self.request.compare and not self.request.rerun:
             self.outcome.reused += counted
+            self._heed(name, "", record)
             result: Mapping[str, Any] = record["result"]
             return result
         if self.request.check:
@@ -206,11 +250,13 @@ class _Run:
             beside=self.inputs.beside,
             replace=record is not None,
             dry=self.request.compare,
+            rerun=self.request.rerun,
             run=self.store.run,
         )
         done = execution.compute(task)
         if done.record is None:
             raise _error(done.exit_code, done.error)
+        self._heed(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:
             self.outcome.differs += execution.differences(record["result"], made, name)
@@ -220,6 +266,15 @@ class _Run:
         self.outcome.ran += done.made and counted
         self.outcome.reused += counted and not done.made
         return made
+
+    def _heed(self, name: str, recording: str, record: Mapping[str, Any]) -> None:
+        """Add to the outcome what the record of a result says of it: notes, and the code that it was computed by."""
+        made = record["provenance"]
+        for note in made.get("notes") or ():
+            self.outcome.said.setdefault(note, []).append(recording)
+        if made.get("code"):
+            counts = self.outcome.code.setdefault(name, {})
+            counts[made["code"]] = counts.get(made["code"], 0) + 1
 
     def _fit(self) -> dict[str, Any]:
         """Return the files that the stage's fit made of the training recordings, or those of ``--codec``."""
@@ -237,22 +292,32 @@ class _Run:
 
     # ---- stages recording by recording
 
+    def _again(self, name: str) -> bool:
+        """Return whether results of this stage are to be computed although they are stored."""
+        return self.request.rerun and name == self.request.name
+
     def _map(self, name: str, tasks: Sequence[Task], entries: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return what each task gives, from the store or by running it, with the attributes of ``entries`` before."""
         results: dict[str, Mapping[str, Any]] = {}
         missing: list[Task] = []
         for task in tasks:
             record = self.store.record(digest(task.identity))
-            if record is not None and execution.complete(self.store, record):
+            if record is not None and not self._again(name) and execution.complete(self.store, record):
                 results[task.recording] = record["result"]
+                self._heed(name, task.recording, record)
             else:
-                missing.append(replace(task, replace=record is not None, run=self.store.run))
+                rerun = self._again(name)
+                missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
         if missing and self.request.check:
             raise WouldChangeError(f"{name} would run for {len(missing)} of {len(tasks)} recordings.")
         if self.request.compare:
             missing = [replace(task, dry=True) for task in tasks]
         self.outcome.reused += len(tasks) - len(missing)
         results.update(self._compute(name, missing, results))
+        if not results:
+            raise _error(
+                FAILED, f"{name} could not read any of the {len(tasks)} recordings:\n{_lines(self.outcome.bad)}"
+            )
         recordings: dict[str, Entry] = {}
         for recording, result in sorted(results.items()):
             made = result["recordings"][""]
@@ -274,6 +339,7 @@ class _Run:
                     continue
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
+                self._heed(name, done.recording, done.record)
                 result = results[done.recording] = done.record["result"]
                 if self.request.compare and done.recording in stored:
                     self.outcome.differs += execution.differences(stored[done.recording], result, done.recording)
@@ -291,7 +357,7 @@ class _Run:
         waited = [done.error for done in bad.values() if done.exit_code == LOCKED]
         if waited:  # nothing is wrong with the recording, which another process works on
             raise LockedError(waited[0])
-        lines = "\n".join(f"  {recording}: {bad[recording].error}" for recording in sorted(bad))
+        lines = _lines({recording: bad[recording].error for recording in bad})
         plural = "recordings" if len(bad) > 1 else "recording"
         advice = "mend these." if others else "mend these, or leave them out with --skip-bad."
         raise _error(
@@ -326,6 +392,10 @@ class _Run:
         return given
 
 
+def _lines(bad: Mapping[str, str]) -> str:
+    return "\n".join(f"  {recording}: {bad[recording]}" for recording in sorted(bad))
+
+
 def _error(exit_code: int, sentence: str) -> TacpipeError:
     error = TacpipeError(sentence)
     error.exit_code = exit_code
@@ -337,4 +407,5 @@ def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome
     stored = vars(store.put(made.content, durable=made.recorded))
     if not outcome.bad:
         result = {"recordings": {}, "files": {manifest.NAME: stored}}
-        store.commit(identity, result, provenance.of(0.0), replace=True)
+        made_by = {**provenance.of(0.0), "code": outcome.code, "notes": outcome.said}
+        store.commit(identity, result, made_by, replace=True)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import functools
 import platform
 import sys
+from pathlib import Path
 from typing import Any
 
 from tacpipe.executors import usable_cores
+from tacpipe.hashing import remembered_file_digest
+from tacpipe.stage import Stage
 
 _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
@@ -42,3 +45,19 @@ def of(seconds: float) -> dict[str, Any]:
     torch = sys.modules.get("torch")
     device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
     return {**_here(), "device": device, "seconds": seconds}
+
+
+def code(stage: Stage) -> str | None:
+    """Return the digest of the file that a stage's function is written in; None where it cannot change by itself.
+
+    That is a built-in stage that was installed: it changes with the version of tacpipe alone.
+    """
+    name = stage.function.__module__
+    file = getattr(sys.modules.get(name), "__file__", None)
+    built_in = name.partition(".")[0] in ("tacpipe", "tacpipe_stages")
+    if file is None or (built_in and any(part.endswith("-packages") for part in Path(file).parts)):
+        return None
+    try:
+        return remembered_file_digest(file)
+    except OSError:  # it was removed while it ran
+        return None

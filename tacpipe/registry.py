@@ -11,6 +11,7 @@ from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
+from tacpipe import failures
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
 from tacpipe.stage import Stage
@@ -104,12 +105,17 @@ def _import(name: str, target: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
         loaded = importlib.import_module(module)
-        return getattr(loaded, attribute) if attribute else loaded
     except ImportError as error:
         raise TacpipeError(
             f"{name} needs {error.name or target}, which cannot be imported ({error}). Install it: "
             f"`pip install 'tacpipe[all]'` brings what the built-in stages use."
         ) from error
+    except TacpipeError:
+        raise
+    except Exception as error:  # a mistake in a plug-in's module
+        raise TacpipeError(f"The module {module} of {name} cannot be loaded. {failures.line(error)}") from error
+    try:
+        return getattr(loaded, attribute) if attribute else loaded
     except AttributeError as error:
         raise TacpipeError(f"{module} has no {attribute}, though it is registered as {name}.") from error
 

@@ -13,6 +13,7 @@ from tacpipe import params as params_of
 from tacpipe.errors import UsageError
 from tacpipe.hashing import remembered_file_digest
 from tacpipe.manifest import Entry, Found, Manifest
+from tacpipe.replacing import Plan
 from tacpipe.stage import Stage
 from tacpipe.store import Store
 
@@ -37,6 +38,8 @@ class Request:
     skip_bad: bool = False
     check: bool = False
     compare: bool = False
+    rerun: bool = False  # compute what is stored too, and store what comes out
+    replace: bool = False  # the output may hold another stage's dataset, or recordings and labels that will go
 
     @property
     def single_file(self) -> bool:
@@ -73,6 +76,12 @@ class Inputs:
             "fold": self.request.fold,
             "role": self.request.role,
         }
+
+    def plan(self) -> Plan:
+        """Return what is known of the result before anything is computed."""
+        return Plan(
+            self.request.name, self.stage.version, params_of.to_json(self.request.params), dict(self.source_digests)
+        )
 
     def lineage(self) -> dict[str, list[dict[str, str]]]:
         """Return the inputs as a manifest names them."""

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
-Root = dict[str, Any]  # {"path", "kind", "manifest", "previous", "written_s"}, and "missing_since_s" while out of reach
+Root = dict[
+    str, Any
+]  # {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach
+HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
 
 
 class Roots:
@@ -26,16 +29,21 @@ class Roots:
     def __init__(self, store: Store) -> None:
         self.store = store
 
-    def set(self, path: Path, manifest: str, *, pushed: bool = False, durable: bool = False) -> None:
-        """Note that ``path`` now holds ``manifest``; the one before stays known for `explain`.
+    def set(
+        self, path: Path, manifest: str, *, pushed: bool = False, durable: bool = False, lasting: bool = False
+    ) -> None:
+        """Note that ``path`` now holds ``manifest``; the one before goes into the history of the path.
 
-        A dataset that was ``pushed`` here has a name instead of a path, and is kept until `forget`.
+        That one is ``lasting`` where it held recordings or labels that are not in the new one: `gc` then keeps it. A dataset
+        that was ``pushed`` here has a name instead of a path, and is kept until `forget`.
         """
         kind, name = self.named(path, pushed=pushed)
-        known = self.get(path, pushed=pushed) or {"manifest": None, "previous": None}
-        if known["manifest"] != manifest:
-            root = {"path": name, "kind": kind, "manifest": manifest, "previous": known["manifest"]}
-            self.write({**root, "written_s": int(time.time())})
+        known = self.get(path, pushed=pushed)
+        if known is None or known["manifest"] != manifest:
+            previous = None if known is None else known["manifest"]
+            root = {"path": name, "kind": kind, "manifest": manifest, "previous": previous}
+            history = [] if known is None else _history(known, manifest, lasting=lasting)
+            self.write({**root, "written_s": int(time.time()), "history": history})
         if durable:
             self.store.sync(self._file(kind, name))
 
@@ -101,3 +109,15 @@ class Roots:
 
     def _file(self, kind: str, name: str) -> Path:
         return self.store.root / "roots" / f"{digest(name if kind == ABSOLUTE else [kind, name])}.json"
+
+
+def _history(known: Root, manifest: str, *, lasting: bool) -> list[dict[str, Any]]:
+    """Return what a path held before it held ``manifest``, newest first: all that is lasting, and `HISTORY` others."""
+    newest = {"manifest": known["manifest"], "written_s": known.get("written_s", 0), "lasting": lasting}
+    older = [one for one in known.get("history", []) if one["manifest"] not in (manifest, newest["manifest"])]
+    kept, room = [], HISTORY
+    for one in [newest, *older]:
+        room -= not one["lasting"]
+        if one["lasting"] or room >= 0:
+            kept.append(one)
+    return kept

@@ -86,6 +86,8 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         skip_bad=given["skip_bad"],
         check=given["check"],
         compare=given["compare"],
+        rerun=given["rerun"],
+        replace=given["replace"],
         **paths,
     )
     _report(pipeline.run(request), as_json=given["json_"], quiet=given["quiet"])
@@ -100,6 +102,7 @@ def _report(outcome: pipeline.Outcome, *, as_json: bool, quiet: bool) -> None:
         print(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s", file=sys.stderr)
     if as_json:
         value = {"schema_version": 1, **vars(outcome), "output": str(outcome.output)}
+        del value["said"], value["code"]  # which the notes hold in words
         print(json.dumps(value))
     else:
         print(outcome.output)
@@ -191,6 +194,12 @@ def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
             "compare",
             bool,
             typer.Option(False, "--recompute-and-compare", help="Run again what is stored and name what differs."),
+        ),
+        ("rerun", bool, typer.Option(False, "--rerun", help="Compute what is stored too, and keep the new result.")),
+        (
+            "replace",
+            bool,
+            typer.Option(False, "--replace", help="Replace what -o holds: another dataset, recordings, labels."),
         ),
         ("json_", bool, typer.Option(False, "--json", help="Print one JSON object.")),
         ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tacpipe import places
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.files import listed, readable_errors, sentence, sync_folders, write_whole
 from tacpipe.hashing import DIGEST, bytes_digest, digest
@@ -277,7 +278,7 @@ def locate(start: Path | None = None) -> Store:
     """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` beside the project that ``start`` lies in."""
     named = os.environ.get("TACPIPE_STORE")
     if named:
-        return Store(Path(named).absolute())
+        return Store(places.local(named).absolute())
     return Store(project(start) / BESIDE_NAME)
 
 

@@ -22,8 +22,8 @@ Ancestors = Annotated[bool, typer.Option("--ancestors", help="With the shards of
 def add(program: typer.Typer, summary: str) -> None:
     """Add the group ``store`` to ``program``."""
     group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
-    for command in (status, verify, repair, gc, link, push, pull):
-        group.command(command.__name__)(command)
+    for command in (status, list_, checkout, verify, repair, gc, link, push, pull):
+        group.command(command.__name__.rstrip("_"))(command)
     program.add_typer(group, name="store")
 
 
@@ -36,6 +36,36 @@ def status(as_json: AsJson = False) -> None:
 
     value = upkeep.status(locate())
     _print(value, as_json=as_json, text=upkeep.status_text(value))
+
+
+def list_(as_json: AsJson = False) -> None:
+    """List the datasets that the store knows: stage, time, recordings, labels, last path. Replaced ones are among them.
+
+    Example: tacpipe store list
+    """
+    from tacpipe import checkout as checkouts
+
+    listed = checkouts.known(locate())
+    _print(checkouts.to_json(listed), as_json=as_json, text=checkouts.to_text(listed))
+
+
+def checkout(
+    digest: Annotated[
+        str, typer.Argument(help="Digest of a manifest, or its first digits, as `store list` prints it.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")],
+    replace: Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a dataset that the store knows to a directory, with the labels that were set by hand.
+
+    Example: tacpipe store checkout 3f2a91c0d4e5 -o data/recordings
+    """
+    from tacpipe import checkout as checkouts
+
+    made = checkouts.checkout(digest, output, replace=replace)
+    value = {"schema_version": 1, "output": str(output), "stage": made.stage, "recordings": len(made.recordings)}
+    _print({**value, "labelled": len(made.labels)}, as_json=as_json, text=str(output))
 
 
 def verify(as_json: AsJson = False) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe import directory as directory_of
-from tacpipe import execution, garbage
+from tacpipe import execution, garbage, places
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.store import MissingError, Store, locate, project
@@ -28,7 +28,7 @@ def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
     With ``ancestors`` the shards of those go too. Raises `DamagedError` for a shard that is damaged here and cannot be made
     again.
     """
-    there, done = Store(remote.absolute()), Transferred()
+    there, done = Store(places.local(remote).absolute()), Transferred()
     for path in paths:
         here = locate(path)
         found = manifest_of.find(path)
@@ -42,7 +42,7 @@ def push(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Tra
 
 def pull(remote: Path, paths: Sequence[Path], *, ancestors: bool = False) -> Transferred:
     """Copy datasets from the store at ``remote``: those whose manifest lies at the path, else what was pushed from there."""
-    there, done = Store(remote.absolute()), Transferred()
+    there, done = Store(places.local(remote).absolute()), Transferred()
     if not (there.root / "format").exists():
         raise UsageError(f"{remote} is no store: it has no file `format`. Give a directory that `store push` wrote.")
     for path in paths:

@@ -38,7 +38,7 @@ def replaced_recording(lab: Lab) -> str:
     lab.run("ingest numbers src -o data/r")
     (name,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
     Path("src/a.txt").write_text("4 5 6")
-    lab.run("ingest numbers src -o data/r")
+    lab.run("ingest numbers src -o data/r --replace")
     return str(name)
 
 

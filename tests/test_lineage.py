@@ -38,7 +38,7 @@ def test_the_part_of_the_key_that_changed_is_named(lab: Lab) -> None:
     assert explained(lab, "data/s")["changes"] == ["params.factor: 2 became 3"]
     Path("src/a.txt").write_text("9")
     Path("src/c.txt").write_text("7")
-    lab.run("ingest numbers src -o data/r")
+    lab.run("ingest numbers src -o data/r --replace")
     assert explained(lab, "data/r")["changes"] == ["sources: 1 new (c)", "sources: 1 other (a)"]
     lab.run("scale data/r -o data/s --factor 3")
     assert explained(lab, "data/s")["changes"] == [

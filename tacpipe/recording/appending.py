@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -115,8 +115,19 @@ def existing(output: Path) -> Manifest | None:
     return found
 
 
+def refuse_taken(output: Path, names: Sequence[str]) -> None:
+    """Raise `UsageError` if a recording at ``output`` has one of these names, or if another command made what is there."""
+    before = existing(output)
+    taken = [] if before is None else sorted(set(names) & set(before.recordings))
+    if taken:
+        raise UsageError(
+            f"{output} has recordings of these names already: {', '.join(taken[:5])}. Give another --name, or -o another "
+            f"directory."
+        )
+
+
 def _free(wanted: str, taken: Mapping[str, Any]) -> str:
-    """Return ``wanted``, with a number behind it if a recording has that name already."""
+    """Return ``wanted``, with a number behind it if another process took that name since: what is recorded is kept."""
     name, number = wanted, 2
     while name in taken:
         name, number = f"{wanted}-{number}", number + 1

@@ -34,6 +34,11 @@ class Plan:
     tare: bool = False
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
+    @property
+    def names(self) -> list[str]:
+        """The names of its recordings: that which was given, with the number of the trial where there are several."""
+        return [self.name] if self.trials == 1 else [f"{self.name}-{trial + 1:03d}" for trial in range(self.trials)]
+
 
 @dataclass(frozen=True)
 class Recorded:
@@ -99,7 +104,7 @@ def recover(store: Store, folder: Path) -> Recorded:
 def _record(
     recorder: Recorder, store: Store, plan: Plan, trial: int, stops: triggers.Trigger, view: View, ended: Ended
 ) -> tuple[Recorded, list[str]]:
-    name = plan.name if plan.trials == 1 else f"{plan.name}-{trial + 1:03d}"
+    name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
     header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
     spool = Spool(store.root, {**header, "rig": recorder.rig.text}, list(recorder.stations))

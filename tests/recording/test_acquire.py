@@ -85,7 +85,22 @@ def test_devices_are_not_tared_where_the_operator_says_no(lab: Lab, rig: Emulato
     assert not [more for _, what, more in rig.ledger["force"].events[heard:] if what == "heard" and more[12:14] == "ff"]
 
 
-def test_recordings_of_one_name_are_told_apart(lab: Lab, rig: Emulator) -> None:
+def test_a_name_that_a_recording_has_already_is_refused_before_anything_is_recorded(lab: Lab, rig: Emulator) -> None:
+    lab.run("acquire rig.toml -o rec --duration 0.3 --name same")
+    lab.run("acquire rig.toml -o rec --duration 0.3 --name press --trials 2")
+    before = lab.manifest("rec")
+    single = lab.call("acquire rig.toml -o rec --duration 0.3 --name same")
+    several = lab.call("acquire rig.toml -o rec --duration 0.3 --name press --trials 3")
+
+    assert (single.code, several.code) == (2, 2)
+    assert "names already: same." in single.err and "names already: press-001, press-002." in several.err
+    assert lab.manifest("rec") == before and not live.spools(lab.folder)
+
+
+def test_a_name_that_was_taken_while_it_was_recorded_gets_a_number_and_loses_nothing(
+    lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tacpipe.recording.appending.refuse_taken", lambda output, names: None)
     for _ in range(2):
         lab.run("acquire rig.toml -o rec --duration 0.3 --name same")
 

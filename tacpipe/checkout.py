@@ -1,0 +1,126 @@
+"""Datasets that the store still knows, whatever their directories hold now, and bringing one back."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tacpipe import directory as directory_of
+from tacpipe import execution, replacing
+from tacpipe import manifest as manifest_of
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.hashing import bytes_digest
+from tacpipe.manifest import Manifest
+from tacpipe.roots import PUSHED
+from tacpipe.store import MissingError, Store, locate
+
+SHOWN, REPLACED, GONE, IN_STORE = "at its path", "replaced", "directory gone", "pushed here"
+SHORTEST = 6  # hex digits by which a manifest may be named
+
+
+@dataclass(frozen=True)
+class Known:
+    """A manifest that the store holds, and the path at which it was last written."""
+
+    manifest: str  # digest of the manifest
+    dataset: str  # digest of the dataset
+    stage: str
+    written_s: int  # seconds of UTC since 1970
+    recordings: int
+    labelled: int  # recordings with labels that were set by hand
+    path: str
+    state: str
+
+
+def known(store: Store) -> list[Known]:
+    """Return the manifests that roots of the store name or named before, newest first."""
+    found: dict[tuple[str, str], Known] = {}
+    for root in store.roots.all():
+        for entry in [root, *root.get("history", [])]:
+            name, path = entry["manifest"], str(root["path"])
+            try:
+                manifest = manifest_of.parse(store.read(name), name, verified=True)
+            except TacpipeError:
+                continue  # collected, or damaged
+            state = _state(root, name) if entry is root else REPLACED
+            found[name, path] = Known(
+                name,
+                manifest.digest,
+                manifest.stage,
+                int(entry.get("written_s", 0)),
+                len(manifest.recordings),
+                len(manifest.labels),
+                path,
+                state,
+            )
+    return sorted(found.values(), key=lambda one: (-one.written_s, one.path, one.manifest))
+
+
+def _state(root: dict[str, Any], name: str) -> str:
+    """Return what became of the manifest that was written last at the path of ``root``."""
+    if root["kind"] == PUSHED:
+        return IN_STORE
+    path = Path(root["path"])
+    if path.is_file():
+        return SHOWN
+    try:
+        there = bytes_digest((path / manifest_of.NAME).read_bytes())
+    except OSError:
+        return GONE
+    return SHOWN if there == name else REPLACED
+
+
+def to_json(listed: list[Known]) -> dict[str, Any]:
+    """Return the list as one object."""
+    return {"schema_version": 1, "manifests": [asdict(one) for one in listed]}
+
+
+def to_text(listed: list[Known]) -> str:
+    """Return one line a manifest; times are those of this computer's zone."""
+    lines = [f"{'manifest':<12}  {'written':<16}  {'stage':<20}  {'recordings':>10}  {'labelled':>8}  path"]
+    for one in listed:
+        written = time.strftime("%Y-%m-%d %H:%M", time.localtime(one.written_s))
+        state = "" if one.state == SHOWN else f"  ({one.state})"
+        lines.append(
+            f"{one.manifest[:12]}  {written}  {one.stage:<20}  {one.recordings:>10}  {one.labelled:>8}  {one.path}{state}"
+        )
+    return "\n".join(lines)
+
+
+def checkout(name: str, output: Path, *, replace: bool = False) -> Manifest:
+    """Write the dataset whose manifest (or dataset) has the digest ``name``, or begins so, to ``output``, with its labels.
+
+    Raises `UsageError` if none or several have it, and if ``output`` holds a dataset that would be replaced without
+    ``replace``; `DamagedError` if something of it is damaged and cannot be computed again.
+    """
+    store = locate()
+    wanted = _named(store, name)
+    with store.at_work([wanted]):
+        manifest = manifest_of.parse(store.read(wanted), wanted, verified=True)
+        directory_of.check_output(store, output)
+        if not replace:
+            replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
+        read = execution.reader(store, (str(output.absolute()),))
+        for first in (True, False):
+            try:
+                directory_of.publish(store, manifest, output)
+                return manifest
+            except MissingError:
+                if not first:
+                    raise
+                for path, digest in manifest.objects():
+                    read(digest, path)  # computes what was collected or damaged, where that is possible
+    raise AssertionError
+
+
+def _named(store: Store, name: str) -> str:
+    if len(name) < SHORTEST:
+        raise UsageError(f"{name!r} is too short to name a manifest; give {SHORTEST} or more of its hex digits.")
+    matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
+    if len(matching) > 1:
+        raise UsageError(f"{len(matching)} manifests of {store.root} begin with {name}; give more of its hex digits.")
+    if not matching:
+        raise UsageError(f"{store.root} knows no manifest {name}; `tacpipe store list` names those that it knows.")
+    return matching.pop()

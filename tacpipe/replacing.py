@@ -1,0 +1,231 @@
+"""What a command would replace at its output, and whether it may: recordings and labels cannot be computed again.
+
+The rules, each with exit code 2:
+
+- an output that is one of the command's inputs is always refused;
+- a dataset of another stage, and recordings or hand-set labels that the new dataset would not hold, need ``--replace``;
+- a stage may write its own dataset again: other params and other inputs are what it is for.
+
+What was replaced stays in the store and is listed by `tacpipe store list`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe import manifest as manifest_of
+from tacpipe import places
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.hashing import bytes_digest
+from tacpipe.manifest import ACQUIRE, Manifest
+from tacpipe.store import Store
+
+if TYPE_CHECKING:
+    from tacpipe.request import Request
+
+_SHOWN = 5  # names listed before the rest is counted
+_KEEP = (
+    "Give -o another directory, or --replace: what is there now stays in the store, and `tacpipe store list` names it."
+)
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Names of recordings that a new dataset lacks or has with other content, and of those whose labels it lacks."""
+
+    recordings: Sequence[str] = ()
+    labels: Sequence[str] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.recordings or self.labels)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a command knows of its result before it computes anything."""
+
+    stage: str
+    version: int
+    params: Mapping[str, Any] = field(default_factory=dict)
+    sources: Mapping[str, Any] = field(default_factory=dict)  # of ingest: recording to file to digest
+
+
+def refuse_inputs(request: Request) -> None:
+    """Raise `UsageError` if the output of ``request`` is one of its inputs, or an address."""
+    places.local(request.output)
+    named = {name: getattr(request, name) for name in ("model", "split", "codec", "extend", "init", "source")}
+    inputs = [*request.datasets, *(path for path in named.values() if path is not None)]
+    for path in inputs:
+        if _same(request.output, path.parent if path.name == manifest_of.NAME else path):
+            raise UsageError(
+                f"{request.output} is an input of this command, and writing there would replace it. Give -o another "
+                f"directory."
+            )
+
+
+def _same(output: Path, given: Path) -> bool:
+    return output.resolve() == given.resolve()
+
+
+def occupant(store: Store, output: Path) -> Manifest | None:
+    """Return the manifest of the dataset at ``output``, None if there is none.
+
+    One that is damaged is read from the store. Raises `DamagedError` where that is not possible: nobody knows then what
+    would be replaced.
+    """
+    if not (output / manifest_of.NAME).exists():
+        return None
+    try:
+        return manifest_of.find(output).manifest
+    except TacpipeError as error:
+        known = former(store, output)
+        if known is None:
+            raise DamagedError(
+                f"{error} Labels that were set by hand may be in it, and would be lost: bring it back with git, or remove "
+                f"it to go on without them."
+            ) from None
+        return known
+
+
+def former(store: Store, output: Path) -> Manifest | None:
+    """Return the manifest that was last written at ``output``, whatever is there now; None if the store has none."""
+    root = store.roots.get(output.absolute())
+    try:
+        if root is not None:
+            return manifest_of.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
+    except TacpipeError:
+        pass
+    return None
+
+
+def irreplaceable(manifest: Manifest) -> bool:
+    """Return whether the recordings were ingested or acquired: no stage can compute them from anything in the store."""
+    return manifest.stage == ACQUIRE or bool(manifest.sources)
+
+
+def losses(before: Manifest, after: Manifest) -> Losses:
+    """Return what of ``before`` cannot be computed again and is not in ``after``."""
+    gone = [] if not irreplaceable(before) else [name for name in before.recordings if _gone(name, before, after)]
+    unlabelled = [
+        name
+        for name, labels in before.labels.items()
+        if name not in gone and any(after.labels.get(name, {}).get(key) != value for key, value in labels.items())
+    ]
+    return Losses(sorted(gone), sorted(unlabelled))
+
+
+def _gone(name: str, before: Manifest, after: Manifest) -> bool:
+    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name."""
+    if name not in after.recordings:
+        return True
+    same_files = name in before.sources and before.sources[name] == after.sources.get(name)
+    return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
+
+
+def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
+    """Raise `UsageError` if ``plan`` would replace what it must not, as far as that is known before anything is computed."""
+    if before is None:
+        return
+    if before.stage != plan.stage:
+        raise UsageError(f"{output} holds {_described(before)}; {plan.stage} would replace it. {_KEEP}")
+    changed = [name for name in plan.sources if before.sources.get(name, plan.sources[name]) != plan.sources[name]]
+    if changed:
+        raise UsageError(
+            f"{output} holds recordings of the same name that came from other files: {_few(changed)}. Rename the new ones, "
+            f"or give -o another directory, or --replace, after which {output} holds the recordings of this source alone. "
+            f"{_BACK}"
+        )
+    others = sorted(set(before.recordings) - set(plan.sources))
+    if plan.sources and others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
+        raise UsageError(
+            f"{output} holds {len(others)} recordings that this source does not have ({_few(others)}), and they were made "
+            f"by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them together, or "
+            f"give -o another directory, or --replace, after which {output} holds the recordings of this source alone. "
+            f"{_BACK}"
+        )
+
+
+def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> None:
+    """Raise `UsageError` if ``after`` would replace another stage's dataset, or lose recordings or labels of ``before``."""
+    refuse_plan(before, output, Plan(after.stage, after.version, after.params))
+    lost = Losses() if before is None else losses(before, after)
+    if lost.recordings:
+        count = len(lost.recordings)
+        raise UsageError(
+            f"{output} holds {count} recordings that the new dataset does not have ({_few(lost.recordings)}). {_KEEP}"
+        )
+    if lost.labels:
+        raise UsageError(
+            f"{output} holds labels that were set by hand on recordings that the new dataset does not have or labels "
+            f"differently ({_few(lost.labels)}). {_KEEP}"
+        )
+
+
+def appended(before: Manifest, made: Manifest) -> Manifest:
+    """Return the ingested recordings ``made`` with those of ``before``; where both have a name, ``made`` holds.
+
+    Recordings that could not be read this time stay as they were.
+    """
+    recordings = dict(sorted({**before.recordings, **made.recordings}.items()))
+    skipped = {name: why for name, why in {**before.skipped, **made.skipped}.items() if name not in recordings}
+    sources = dict(sorted({**before.sources, **made.sources}.items()))
+    return replace(made, recordings=recordings, skipped=skipped, sources=sources)
+
+
+def returning_labels(known: Manifest, made: Manifest) -> dict[str, Mapping[str, Any]]:
+    """Return the hand-set labels of ``known`` whose recordings are in ``made`` again, with the same content or raw files."""
+    return {
+        name: labels
+        for name, labels in known.labels.items()
+        if name in known.recordings and known.stage == made.stage and not _gone(name, known, made)
+    }
+
+
+def outgoing(store: Store, directory: Path) -> Manifest | None:
+    """Return the manifest that a publication at ``directory`` replaces, None if there is none.
+
+    It is known to the store afterwards, so that it can be checked out: one that git brought, or a copy, is stored.
+    """
+    known = former(store, directory)
+    try:
+        found = manifest_of.find(directory)
+        here = found.manifest
+    except TacpipeError:
+        return known
+    root = store.roots.get(directory)
+    if root is None or root["manifest"] != found.digest:
+        store.put(found.content, durable=here.recorded)
+        store.roots.set(directory, found.digest, lasting=known is not None and bool(losses(known, here)))
+    return here
+
+
+def adopt(store: Store, directory: Path, manifest: Manifest) -> None:
+    """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
+    for path, name in manifest.objects():
+        if store.has(name):
+            continue
+        with contextlib.suppress(OSError):
+            content = (directory / path).read_bytes()
+            if bytes_digest(content) == name:
+                store.put(content, durable=True)
+
+
+def _described(manifest: Manifest) -> str:
+    count = len(manifest.recordings)
+    recordings = f"{count} recording{'s' if count != 1 else ''}" if count else "files"
+    labels = f" with labels set by hand on {len(manifest.labels)}" if manifest.labels else ""
+    return f"{recordings} written by {manifest.stage}{labels}"
+
+
+def _params(params: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in params.items()) or "no params"
+
+
+def _few(names: Iterable[str]) -> str:
+    listed = sorted(names)
+    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    return ", ".join(listed[:_SHOWN]) + more

@@ -1,0 +1,329 @@
+"""No command replaces recordings, labels or another stage's dataset unless it is asked to, and then they can be had back."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import tacpipe
+from tests.conftest import Lab
+from tests.test_garbage import age
+from tests.test_pipeline import counts
+
+
+def source(name: str, **numbers: str) -> None:
+    Path(name).mkdir(exist_ok=True)
+    for recording, text in numbers.items():
+        Path(name, f"{recording}.txt").write_text(text)
+
+
+def content(folder: str) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+
+
+def refused(lab: Lab, command: str, kept: str, *words: str) -> None:
+    """Check that a command is refused with exit code 2 and these words, and leaves a dataset as it was."""
+    before = content(kept)
+    for more in ("", " --check"):
+        ran = lab.call(command + more)
+        assert ran.code == 2 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1, ran
+        assert all(word in ran.err for word in words), ran.err
+        assert content(kept) == before
+
+
+def listed(lab: Lab) -> list[dict[str, object]]:
+    found: list[dict[str, object]] = json.loads(lab.run("store list --json").out)["manifests"]
+    return found
+
+
+# ---- inputs
+
+
+@pytest.mark.parametrize("spelling", ["data/r", "data/../data/r", "./data/r/", "linked"])
+def test_an_output_that_is_the_input_is_refused_with_and_without_replace(lab: Lab, spelling: str) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    Path("linked").symlink_to("data/r")
+    refused(lab, f"scale data/r -o {spelling}", "data/r", "is an input of this command")
+    refused(lab, f"scale data/r -o {spelling} --replace", "data/r", "is an input of this command")
+    refused(lab, f"scale data/r/manifest.json -o {spelling}", "data/r", "is an input of this command")
+
+
+def test_split_codec_and_source_count_as_inputs_too(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s --factor 1")
+    lab.run("halves data/s -o data/split")
+    lab.run("centre data/s --split data/split -o data/c")
+    refused(lab, "centre data/s --split data/split -o data/split --replace", "data/split", "is an input")
+    refused(lab, "centre data/s --split data/split --codec data/c -o data/c --replace", "data/c", "is an input")
+    source("src", a="1")
+    refused(lab, "ingest numbers src -o src --replace", "src", "is an input")
+
+
+# ---- another stage's dataset
+
+
+def test_a_dataset_of_another_stage_needs_replace_and_can_be_had_back_with_its_labels(lab: Lab) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --set material=cork --exclude dropped")
+    before = content("data/r")
+    refused(
+        lab, "simulate toy -o data/r", "data/r", "2 recordings written by ingest.numbers", "by hand on 1", "--replace"
+    )
+    lab.run("simulate toy -o data/r --replace")
+    assert sorted(lab.manifest("data/r").recordings) == ["trial-000", "trial-001", "trial-002", "trial-003"]
+    assert not Path("data/r/a").exists()
+    (old,) = [one for one in listed(lab) if one["stage"] == "ingest.numbers" and one["labelled"]]
+    assert (old["recordings"], old["state"], old["path"]) == (2, "replaced", str(lab.folder / "data/r"))
+    shutil.rmtree("src")
+    lab.run(f"store checkout {str(old['manifest'])[:12]} -o data/back")
+    assert {name.replace("data/back", "data/r"): value for name, value in content("data/back").items()} == before
+
+
+def test_a_derived_dataset_of_another_stage_needs_replace_too(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    refused(lab, "named data/r -o data/s", "data/s", "4 recordings written by scale", "named would replace it")
+    lab.run("named data/r -o data/s --replace")
+    assert lab.manifest("data/s").stage == "named"
+
+
+def test_a_stage_writes_its_own_dataset_again_with_other_params_and_inputs(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("simulate toy -o data/other --trials 2 --offset 5")
+    lab.run("scale data/r -o data/s")
+    lab.run("scale data/r -o data/s --factor 7")
+    lab.run("scale data/other -o data/s")
+    lab.run("simulate toy -o data/r --trials 2")
+    assert sorted(lab.manifest("data/s").recordings) == sorted(lab.manifest("data/r").recordings) == [
+        "trial-000",
+        "trial-001",
+    ]  # fmt: skip
+
+
+def test_a_rerun_of_what_is_shown_is_never_refused(lab: Lab) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --set material=cork")
+    assert counts(lab.run("ingest numbers src -o data/r --json").out) == (0, 1)
+    assert lab.call("ingest numbers src -o data/r --check").code == 0
+
+
+def test_an_output_within_a_dataset_or_around_one_is_refused(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    refused(lab, "scale data/r -o data/r/scaled", "data", "lies within the dataset")
+    refused(lab, "scale data/r -o data", "data", "holds the dataset")
+
+
+def test_a_page_does_not_replace_a_file_that_tacpipe_did_not_write(lab: Lab, tmp_path: Path) -> None:
+    from tacpipe import output, replacing
+    from tacpipe.errors import UsageError
+    from tacpipe.request import Request
+
+    Path("notes.html").write_text("mine")
+    plan = replacing.Plan("report", 1)
+    with pytest.raises(UsageError, match=r"notes\.html is a file that tacpipe did not write"):
+        output.refuse(lab.store, Request("report", None, Path("notes.html")), plan)
+    output.refuse(lab.store, Request("report", None, Path("notes.html"), replace=True), plan)
+    output.refuse(lab.store, Request("report", None, Path("new.html")), plan)
+
+
+# ---- recordings that are ingested one after another
+
+
+def test_ingest_appends(lab: Lab) -> None:
+    source("monday", a="1 2", b="3 4")
+    source("tuesday", c="5 6")
+    lab.run("ingest numbers monday -o data/r")
+    lab.run("label data/r b --set material=foam")
+    ran, reused = counts(lab.run("ingest numbers tuesday -o data/r --json").out)
+    found = lab.manifest("data/r")
+    assert (ran, reused) == (1, 0) and sorted(found.recordings) == sorted(found.sources) == ["a", "b", "c"]
+    assert found.recordings["b"]["attributes"]["material"] == "foam" and found.labels == {"b": {"material": "foam"}}
+    assert tacpipe.open("data/r").table("left")["x"].to_pylist() == [1, 2, 3, 4, 5, 6]
+    assert counts(lab.run("ingest numbers monday -o data/r --json").out) == (0, 2)
+    assert lab.manifest("data/r") == found and lab.call("ingest numbers tuesday -o data/r --check").code == 0
+
+
+def test_the_order_in_which_recordings_are_ingested_leaves_no_trace(lab: Lab) -> None:
+    source("monday", a="1 2", b="3 4")
+    source("tuesday", c="5 6")
+    for first, second, output in (("monday", "tuesday", "data/one"), ("tuesday", "monday", "data/two")):
+        lab.run(f"ingest numbers {first} -o {output}")
+        lab.run(f"ingest numbers {second} -o {output}")
+    assert Path("data/one/manifest.json").read_bytes() == Path("data/two/manifest.json").read_bytes()
+
+
+def test_a_name_that_exists_with_other_content_is_refused(lab: Lab) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    source("src", b="9")
+    refused(lab, "ingest numbers src -o data/r", "data/r", "of the same name", "other files: b.", "--replace")
+    lab.run("ingest numbers src -o data/r --replace")
+    assert tacpipe.open("data/r").table("left")["x"].to_pylist() == [1, 2, 9]
+
+
+def test_replace_makes_the_dataset_that_of_the_source_alone(lab: Lab) -> None:
+    source("monday", a="1 2", b="3 4")
+    source("tuesday", c="5 6")
+    lab.run("ingest numbers monday -o data/r")
+    lab.run("ingest numbers tuesday -o data/r --replace")
+    assert list(lab.manifest("data/r").recordings) == ["c"] and not Path("data/r/a").exists()
+
+
+def test_a_recording_that_cannot_be_read_this_time_keeps_what_it_was(lab: Lab) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/r")
+    source("more", b="3", c="none")
+    ran = lab.run("ingest numbers more -o data/r --skip-bad")
+    found = lab.manifest("data/r")
+    assert sorted(found.recordings) == ["a", "b"] and list(found.skipped) == ["c"] and "left out c" in ran.err
+
+
+# ---- labels
+
+
+def test_labels_of_recordings_that_would_go_are_refused(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("label data/r trial-003 --set material=foam")
+    refused(lab, "simulate toy -o data/r --trials 3", "data/r", "labels that were set by hand", "trial-003")
+    lab.run("simulate toy -o data/r --trials 3 --replace")
+    (old,) = [one for one in listed(lab) if one["labelled"]]
+    lab.run(f"store checkout {old['manifest']} -o data/back")
+    assert lab.manifest("data/back").recordings["trial-003"]["attributes"]["material"] == "foam"
+
+
+@pytest.mark.parametrize("gone", ["data/r", "data/r/manifest.json"])
+def test_labels_come_back_with_their_recordings_when_the_directory_was_deleted(lab: Lab, gone: str) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --exclude dropped")
+    before = Path("data/r/manifest.json").read_bytes()
+    shutil.rmtree(gone) if Path(gone).is_dir() else Path(gone).unlink()
+    assert counts(lab.run("ingest numbers src -o data/r --json").out) == (0, 2)
+    assert Path("data/r/manifest.json").read_bytes() == before
+    lab.run("scale data/r -o data/s")
+    assert list(lab.manifest("data/s").recordings) == ["b"]
+
+
+def test_labels_do_not_come_back_on_other_recordings_of_the_same_name(lab: Lab) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --exclude dropped")
+    lab.run("label data/r b --set material=cork")
+    shutil.rmtree("data/r")
+    source("src", a="7")
+    lab.run("ingest numbers src -o data/r")
+    assert lab.manifest("data/r").labels == {"b": {"material": "cork"}}
+
+
+# ---- what was replaced
+
+
+def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordings(lab: Lab) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --set material=cork")
+    lab.run("simulate toy -o data/r --replace")
+    (old,) = [one for one in listed(lab) if one["labelled"]]
+    age(lab)
+    assert json.loads(lab.run("store gc --json").out)["kept_recordings"] == 2
+    lab.run(f"store checkout {old['manifest']} -o data/back")
+    assert lab.manifest("data/back").labels == {"a": {"material": "cork"}}
+    shutil.rmtree("data/back")
+    lab.run("store gc --forget data/back")
+    age(lab)
+    lab.run("store gc --recordings --grace-days 0")
+    assert not [one for one in listed(lab) if one["labelled"]]
+    assert lab.call(f"store checkout {old['manifest']} -o data/back").code == 2
+
+
+def test_a_directory_that_was_deleted_keeps_its_recordings_and_labels_in_the_store(lab: Lab) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --set material=cork")
+    before = content("data/r")
+    shutil.rmtree("data/r")
+    shutil.rmtree("src")
+    for _ in range(2):
+        age(lab, 300)
+        lab.run("store gc --grace-days 0")
+    (known,) = [one for one in listed(lab) if one["state"] == "directory gone"]
+    lab.run(f"store checkout {known['dataset']} -o data/r")
+    assert content("data/r") == before
+
+
+def test_a_derived_dataset_that_was_replaced_is_computed_again_when_it_is_checked_out(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s --factor 2")
+    before = content("data/s")
+    lab.run("scale data/r -o data/s --factor 3")
+    old = lab.store.roots.get(lab.folder / "data/s")
+    assert old is not None
+    first = old["history"][0]["manifest"]
+    for name in {
+        shard["digest"] for one in lab.manifest("data/s").recordings.values() for shard in one["shards"].values()
+    }:
+        assert lab.store.has(name)
+    for path in lab.store.root.glob("objects/*/*"):
+        if path.name in {shard for value in [json.loads(lab.store.read(first))] for shard in _shards(value)}:
+            path.unlink()
+    lab.run(f"store checkout {first} -o data/s --replace")
+    assert content("data/s") == before
+
+
+def _shards(manifest: dict[str, dict[str, dict[str, dict[str, dict[str, str]]]]]) -> list[str]:
+    return [shard["digest"] for one in manifest["recordings"].values() for shard in one["shards"].values()]
+
+
+def test_a_checkout_replaces_recordings_only_when_it_is_asked_to(lab: Lab) -> None:
+    source("one", a="1 2")
+    source("two", b="3 4")
+    lab.run("ingest numbers one -o data/one")
+    lab.run("ingest numbers two -o data/two")
+    root = lab.store.roots.get(lab.folder / "data/one")
+    assert root is not None
+    ran = lab.call(f"store checkout {root['manifest']} -o data/two")
+    assert ran.code == 2 and "1 recordings that the new dataset does not have (b)" in ran.err
+    lab.run(f"store checkout {root['manifest']} -o data/two --replace")
+    assert list(lab.manifest("data/two").recordings) == ["a"]
+
+
+def test_a_copy_without_its_store_is_kept_whole_when_it_is_replaced(
+    lab: Lab, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/r")
+    shutil.copytree("data/r", "data/copy")
+    shutil.rmtree(lab.store.root)
+    lab.store.root.mkdir()
+    before = content("data/copy")
+    refused(lab, "simulate toy -o data/copy", "data/copy", "1 recording written by ingest.numbers")
+    lab.run("simulate toy -o data/copy --replace")
+    (old,) = [one for one in listed(lab) if one["stage"] == "ingest.numbers"]
+    lab.run(f"store checkout {old['manifest']} -o data/copy --replace")
+    assert content("data/copy") == before
+
+
+def test_a_hundred_reruns_leave_a_short_history_and_one_loss_stays_in_it(lab: Lab) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/r")
+    root = lab.store.roots.get(lab.folder / "data/r")
+    assert root is not None
+    lab.run("simulate toy -o data/r --trials 1 --rows 3 --replace")
+    for offset in range(1, 101):
+        lab.store.roots.set(lab.folder / "data/r", f"{offset:064x}")
+    history = (lab.store.roots.get(lab.folder / "data/r") or {})["history"]
+    assert len(history) == 21 and [one["manifest"] for one in history if one["lasting"]] == [root["manifest"]]
+
+
+@pytest.mark.parametrize(
+    ("digest", "words"),
+    [("3f2a", "too short"), ("0" * 12, "knows no manifest"), ("../../etc/passwd", "knows no manifest")],
+)
+def test_a_digest_that_names_no_manifest_is_refused(lab: Lab, digest: str, words: str) -> None:
+    lab.run("simulate toy -o data/r")
+    ran = lab.call(f"store checkout {digest} -o data/x")
+    assert ran.code == 2 and words in ran.err and not Path("data/x").exists()
