@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from tacpipe.store import MissingError, Store, locate
 
 SHOWN, REPLACED, GONE, IN_STORE = "at its path", "replaced", "directory gone", "pushed here"
 SHORTEST = 6  # hex digits by which a manifest may be named
+_HEX = re.compile(rf"[0-9a-f]{{{SHORTEST},64}}")
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,9 @@ def to_text(listed: list[Known]) -> str:
 
 
 def checkout(name: str, output: Path, *, replace: bool = False) -> Manifest:
-    """Write the dataset whose manifest (or dataset) has the digest ``name``, or begins so, to ``output``, with its labels.
+    """Write the dataset ``name`` to ``output``, with its labels.
+
+    ``name`` is the digest of its manifest or of the dataset, or how it begins, or the path at which it was last written.
 
     Raises `UsageError` if none or several have it, and if ``output`` holds a dataset that would be replaced without
     ``replace``; `DamagedError` if something of it is damaged and cannot be computed again.
@@ -116,8 +120,15 @@ def checkout(name: str, output: Path, *, replace: bool = False) -> Manifest:
 
 
 def _named(store: Store, name: str) -> str:
-    if len(name) < SHORTEST:
-        raise UsageError(f"{name!r} is too short to name a manifest; give {SHORTEST} or more of its hex digits.")
+    """Return the digest of the manifest that is meant: by its digest, or by the path at which it was last written."""
+    root = store.roots.get(Path(name).absolute())
+    if root is not None:
+        return str(root["manifest"])
+    if not _HEX.fullmatch(name):
+        raise UsageError(
+            f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which {store.root} "
+            f"has seen a dataset; `tacpipe store list` names both."
+        )
     matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
     if len(matching) > 1:
         raise UsageError(f"{len(matching)} manifests of {store.root} begin with {name}; give more of its hex digits.")

@@ -71,7 +71,7 @@ def publish(store: Store, request: Request, made: Manifest) -> Manifest:
         if not request.replace:
             replacing.refuse_losses(replacing.occupant(store, request.output), request.output, made)
         if made.recorded:
-            store.put(made.content)
+            store.put(made.content, durable=True)
         directory.publish_alone(store, made, request.output)
     return made
 

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from tacpipe.request import Request
 
 _SHOWN = 5  # names listed before the rest is counted
-_KEEP = (
-    "Give -o another directory, or --replace: what is there now stays in the store, and `tacpipe store list` names it."
-)
+_BACK = "What is there now stays in the store, and `tacpipe store list` names it."
+_KEEP = f"Give -o another directory, or --replace. {_BACK}"
 
 
 @dataclass(frozen=True)

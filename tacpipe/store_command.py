@@ -50,8 +50,8 @@ def list_(as_json: AsJson = False) -> None:
 
 
 def checkout(
-    digest: Annotated[
-        str, typer.Argument(help="Digest of a manifest, or its first digits, as `store list` prints it.")
+    dataset: Annotated[
+        str, typer.Argument(help="Digest, its first digits, or last path, as `store list` prints them.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")],
     replace: Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")] = False,
@@ -63,7 +63,7 @@ def checkout(
     """
     from tacpipe import checkout as checkouts
 
-    made = checkouts.checkout(digest, output, replace=replace)
+    made = checkouts.checkout(dataset, output, replace=replace)
     value = {"schema_version": 1, "output": str(output), "stage": made.stage, "recordings": len(made.recordings)}
     _print({**value, "labelled": len(made.labels)}, as_json=as_json, text=str(output))
 

@@ -54,6 +54,17 @@ def _numbers(lab: Path) -> None:
     (lab / "src/b.txt").write_text("4 5 6")
 
 
+def _more(lab: Path) -> None:
+    _numbers(lab)
+    (lab / "more").mkdir()
+    (lab / "more/c.txt").write_text("7 8 9")
+
+
+def _lose(lab: Path) -> None:
+    """Remove the directory of an ingested dataset."""
+    shutil.rmtree(lab / "data/i")
+
+
 def _damage(lab: Path) -> None:
     """Damage a shard in the store and beside its manifest, and remove another one from the store."""
     first, second = sorted((lab / "data/s").glob("*.parquet"))
@@ -98,6 +109,7 @@ def _spool(lab: Path) -> None:
     spooled(Lab(lab, lambda command: Ran(0, "", "")), unread=3, count=20)
 
 
+LABEL = "label data/i a --exclude dropped"
 PUSH = "store push remote data/s data/split"
 TOYS = (
     Case("ingest.numbers", NUMBERS, sources=_numbers, durable=True),
@@ -107,6 +119,17 @@ TOYS = (
     Case("store status", "store status", TOY[:2]),
     Case("store verify", "store verify", TOY[:2]),
     Case("store repair", "store repair", TOY[:2], spoil=_damage, sound=False),
+    Case("store list", "store list --json", TOY[:2]),
+    Case(
+        "store checkout",
+        "store checkout data/i -o data/i",
+        (NUMBERS, LABEL),
+        sources=_numbers,
+        spoil=_lose,
+        durable=True,
+    ),
+    Case("ingest appends", "ingest numbers more -o data/i", (NUMBERS, LABEL), sources=_more, durable=True),
+    Case("simulate replaces", "simulate toy -o data/i --replace", (NUMBERS, LABEL), sources=_numbers),
     Case("store gc", "store gc --grace-days 0", TOY, spoil=_leave),
     Case("store link", "store link data/s", TOY[:2], spoil=_unlink, outputs=("data/s",)),
     Case("store push", PUSH, TOY[:3], outputs=("remote",), durable=True),

@@ -140,13 +140,15 @@ def test_a_worker_that_dies_is_a_sentence_and_what_was_finished_is_kept(scene: S
     assert told["reused"] >= 4 and told["ran"] + told["reused"] == 40
 
 
-def test_a_mistake_in_a_stage_is_told_with_the_place_in_the_worker(scene: Scene) -> None:
+def test_a_mistake_in_a_stage_shows_the_frames_of_its_own_code_alone(scene: Scene) -> None:
     scene.run("simulate toy --trials 9 --rows 4 -o data/r")
-    running = scene.start("mistaken data/r -o data/s --jobs 2", fresh=True)
-    assert kills.ended(running) == 1
-    said = running.out.read_text()
-    assert "ZeroDivisionError: trial-" in said
-    assert "in a worker process:\n" in said and "stubborn.py" in said and "in stage mistaken" in said
+    for jobs in (1, 2):
+        running = scene.start(f"mistaken data/r -o data/s --jobs {jobs}", fresh=True)
+        assert kills.ended(running) == 1
+        said = running.out.read_text()
+        assert "tacpipe: The code of stage mistaken raised ZeroDivisionError on recording trial-" in said
+        assert "ZeroDivisionError: trial-" in said and "stubborn.py" in said
+        assert said.count('  File "') == 1 and len(said.splitlines()) < 10, said
 
 
 def test_an_interrupt_ends_the_wait_for_a_lock(scene: Scene) -> None:

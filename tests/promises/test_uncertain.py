@@ -133,10 +133,10 @@ def test_a_file_that_changes_while_it_is_ingested_is_not_taken_and_a_rerun_is_ri
     file.write_text("1 2 3 4")
     with monkeypatch.context() as patch:
         meanwhile(patch, lambda: damages.overwrite(file, b"5 6 7 8"))
-        failed = one.lab.call(CHAIN[0])
+        failed = one.lab.call(f"{CHAIN[0]} --replace")
     assert failed.code == FAILED and "src/b.txt changed while it was read" in failed.err, failed
     assert one.shown() == dict(one.sound)
-    one.lab.run(CHAIN[0])
+    one.lab.run(f"{CHAIN[0]} --replace")
     assert specimen.held(one.folder / "data/recordings")["b/left.parquet"][0][-1] == [5, 6, 7, 8]
 
 
@@ -147,7 +147,7 @@ def test_a_file_that_vanishes_while_it_is_ingested_is_a_sentence(
     file.write_text("1 2 3 4")
     with monkeypatch.context() as patch:
         meanwhile(patch, file.unlink)
-        failed = one.lab.call(CHAIN[0])
+        failed = one.lab.call(f"{CHAIN[0]} --replace")
     assert failed.code == FAILED and "src/b.txt" in failed.err and "Traceback" not in failed.err, failed
     assert one.shown() == dict(one.sound)
 

@@ -1,0 +1,257 @@
+"""Results that other code computed are named on a hit, recomputed by --rerun, and code that breaks is shown itself."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Lab, tacpipe
+
+STAGES = '''
+"""Stages of a lab."""
+
+from __future__ import annotations
+from dataclasses import dataclass
+from tacpipe.stage import Recording, stage
+
+
+@dataclass(frozen=True)
+class Params:
+    trials: int = 3
+    factor: int = 2
+
+
+@stage(version=1)
+def made(params: Params, trial: Trial) -> Recording:
+    """Return three numbers."""
+    import pyarrow as pa
+
+    return Recording({"left": pa.table({"x": [trial, 2, 3]})})
+
+
+@stage(version=1)
+def times(params: Params, recording: Shard) -> Recording:
+    """Return the numbers, multiplied."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    table = recording.table("left")
+    return Recording(pa.table({"x": pc.multiply(table["x"], params.factor)}), notes=NOTES)
+
+
+@stage(version=1)
+def sums(params: Params, recordings: Dataset) -> dict:
+    """Return the sum of all numbers."""
+    total = sum(sum(shard.table()["x"].to_pylist()) for shard in recordings.shards.values())
+    return {"sum.txt": str(total).encode()}
+
+
+NOTES = ()
+'''
+POINTS = "[tacpipe.stages]\nsimulate.numbers = lab_stages:made\ntimes = lab_stages:times\nsums = lab_stages:sums\n"
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A project with a plug-in of its own, whose recordings are made and multiplied."""
+    (tmp_path / ".tacpipe").mkdir()
+    package = tmp_path / "package"
+    (package / "lab.egg-info").mkdir(parents=True)
+    (package / "lab.egg-info/entry_points.txt").write_text(POINTS)
+    (package / "lab_stages.py").write_text(STAGES)
+    ran(tmp_path, "simulate numbers -o data/r")
+    ran(tmp_path, "times data/r -o data/t")
+    ran(tmp_path, "sums data/t -o data/s")
+    return tmp_path
+
+
+def call(folder: Path, command: str) -> tuple[int, str, str]:
+    path = os.pathsep.join([str(folder / "package"), os.environ.get("PYTHONPATH", "")])
+    done = tacpipe(folder, command, PYTHONPATH=path, PYTHONDONTWRITEBYTECODE="1")
+    return done.returncode, done.stdout, done.stderr
+
+
+def ran(folder: Path, command: str) -> str:
+    code, out, err = call(folder, f"{command} --json")
+    assert code == 0, out + err
+    return out
+
+
+def edit(folder: Path, before: str, after: str) -> None:
+    path = folder / "package/lab_stages.py"
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+
+
+def test_a_hit_on_results_of_edited_code_says_so_and_rerun_computes_them_again(own: Path) -> None:
+    assert json.loads(ran(own, "times data/r -o data/t"))["notes"] == []
+    edit(own, "params.factor)", "params.factor + 1)")
+    first = json.loads(ran(own, "times data/r -o data/t"))
+    assert (first["ran"], first["reused"]) == (0, 3)
+    (note,) = first["notes"]
+    assert note.startswith("3 of these results were computed by other code of times than there is now in lab_stages")
+    assert "version 1" in note and "--rerun" in note
+    (note,) = json.loads(ran(own, "sums data/t -o data/s"))["notes"]
+    assert note.startswith("1 of these results were computed by other code of sums")
+    again = json.loads(ran(own, "times data/r -o data/t --rerun"))
+    assert (again["ran"], again["reused"], again["notes"]) == (3, 0, [])
+    assert json.loads(ran(own, "times data/r -o data/t"))["notes"] == []
+    ran(own, "sums data/t -o data/s --rerun")
+    assert (own / "data/s/sum.txt").read_text() == str(3 * ((0 + 2 + 3) + (1 + 2 + 3) + (2 + 2 + 3)))
+
+
+def test_new_recordings_do_not_hide_that_others_are_of_older_code(own: Path) -> None:
+    edit(own, "params.factor)", "params.factor + 1)")
+    ran(own, "simulate numbers -o data/r --trials 5 --rerun")
+    for _ in range(2):  # as it runs, and as a hit
+        found = json.loads(ran(own, "times data/r -o data/t"))
+        (note,) = found["notes"]
+        assert note.startswith("3 of these results were computed by other code of times")
+    assert found["reused"] == 5
+
+
+def test_a_change_of_a_built_in_stage_is_not_named_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tacpipe import provenance, registry
+
+    stage = registry.load("split")
+    assert provenance.code(stage) is not None  # of a checkout
+    installed = "/usr/lib/python3/dist-packages/tacpipe_stages/split.py"
+    monkeypatch.setattr(sys.modules[stage.function.__module__], "__file__", installed)
+    assert provenance.code(stage) is None
+
+
+@pytest.mark.parametrize(
+    ("after", "words"),
+    [
+        ("import pyarrow.compute as pc; 1 / 0", "raised ZeroDivisionError on recording trial-000:"),
+        ("import pyarrow.compute as pc; int('x')", "raised ValueError on recording trial-000:"),
+    ],
+)
+def test_code_that_breaks_shows_its_own_frames_alone(own: Path, after: str, words: str) -> None:
+    edit(own, "import pyarrow.compute as pc\n", f"{after}\n")
+    code, out, err = call(own, "times data/r -o data/other --factor 5 --json")
+    lines = err.splitlines()
+    assert code == 1 and lines[0] == f"tacpipe: The code of stage times {words}"
+    assert err.count('  File "') == 1 and f'File "{own}/package/lab_stages.py", line' in err and len(lines) <= 8
+    failed = json.loads(out)
+    assert failed["exit_code"] == 1 and words in failed["error"]
+    path = os.pathsep.join([str(own / "package"), os.environ.get("PYTHONPATH", "")])
+    full = tacpipe(own, "times data/r -o data/other --factor 5", PYTHONPATH=path, TACPIPE_TRACEBACK="1")
+    assert full.returncode == 1 and full.stderr.count('  File "') > 5
+
+
+@pytest.mark.parametrize(
+    ("after", "words"),
+    [("NOTES = (", "SyntaxError: '(' was never closed"), ("NOTES = 1 / 0", "ZeroDivisionError: division by zero")],
+)
+def test_a_module_that_cannot_be_loaded_is_one_sentence_though_its_results_are_stored(
+    own: Path, after: str, words: str
+) -> None:
+    edit(own, "NOTES = ()", after)
+    code, _, err = call(own, "times data/r -o data/t")
+    assert (
+        code == 1
+        and err.count("\n") == 1
+        and err.startswith("tacpipe: The module lab_stages of times cannot be loaded.")
+    )
+    assert words in err and "lab_stages.py, line 4" in err
+
+
+def test_notes_of_a_stage_are_printed_once_for_all_recordings_and_on_a_hit_too(own: Path) -> None:
+    edit(own, "NOTES = ()", 'NOTES = ("no number is above 100.",)')
+    for ran_anew in (True, False):
+        found = json.loads(ran(own, "times data/r -o data/n --factor 3"))
+        assert found["notes"] == ["all 3 recordings: no number is above 100."] and (found["ran"] == 3) == ran_anew
+    ran(own, "simulate numbers -o data/r --trials 5")
+    edit(own, "notes=NOTES", "notes=NOTES if table['x'][0].as_py() < 2 else ()")
+    code, _, err = call(own, "times data/r -o data/m --factor 4")
+    assert code == 0 and "tacpipe: 2 recordings (trial-000, trial-001): no number is above 100.\n" in err
+
+
+def test_a_run_of_which_no_recording_is_left_is_an_error_and_publishes_nothing(lab: Lab) -> None:
+    Path("src").mkdir()
+    Path("src/a.txt").write_text("one")
+    Path("src/b.txt").write_text("two")
+    ran = lab.call("ingest numbers src -o data/r --skip-bad")
+    assert ran.code == 1 and "could not read any of the 2 recordings" in ran.err and not Path("data/r").exists()
+
+
+def test_rerun_does_not_go_with_check(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    for option in ("--check", "--recompute-and-compare"):
+        assert lab.call(f"simulate toy -o data/r --rerun {option}").code == 2
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        ("scale data/none -o data/s --json", 2),
+        ("scale data/r -o data/s --factor x --json", 2),
+        ("scale data/r -o data/s --refuse 0 --json", 1),
+        ("scale data/r -o data/new --check --json", 3),
+        ("label data/r nobody --set a=b --json", 2),
+        ("show data/none --json", 2),
+        ("explain data/none --json", 2),
+        ("store checkout 000000 -o x --json", 2),
+        ("store push s3://bucket/x data/r --json", 2),
+        ("store nothing --json", 2),
+    ],
+)
+def test_json_prints_one_object_on_errors_too(lab: Lab, command: str, code: int) -> None:
+    lab.run("simulate toy -o data/r")
+    failed = lab.call(command)
+    value = json.loads(failed.out)
+    assert failed.code == code == value["exit_code"] and set(value) == {"schema_version", "error", "exit_code"}
+    assert value["error"] in failed.err
+
+
+def test_label_prints_what_it_changed_as_json(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    value = json.loads(lab.run("label data/r trial-00[12] --set material=foam --json").out)
+    assert value == {
+        "schema_version": 1,
+        "output": "data/r",
+        "recordings": ["trial-001", "trial-002"],
+        "labels": {"material": "foam"},
+    }
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "store push s3://bucket/x data/r",
+        "store pull s3://bucket/x data/r",
+        "scale s3://bucket/r -o data/s",
+        "scale data/r -o gs://bucket/s",
+        "ingest numbers https://host/src -o data/i",
+        "label s3://bucket/r trial-000 --set a=b",
+        "show s3://bucket/r",
+        "store checkout data/r -o s3://bucket/r",
+        "acquire rig.toml -o s3://bucket/r",
+        "demo -o s3://bucket/demo",
+    ],
+)
+def test_an_address_is_refused_wherever_a_path_is_wanted_and_no_folder_is_made(lab: Lab, command: str) -> None:
+    lab.run("simulate toy -o data/r")
+    before = sorted(path.name for path in lab.folder.iterdir())
+    failed = lab.call(command)
+    assert failed.code == 2 and "is an address, and " in failed.err and failed.err.count("\n") == 1, failed
+    assert sorted(path.name for path in lab.folder.iterdir()) == before
+
+
+def test_an_address_is_refused_as_the_store_and_from_python(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tacpipe as library
+    from tacpipe import transfer
+    from tacpipe.errors import UsageError
+
+    lab.run("simulate toy -o data/r")
+    with pytest.raises(UsageError, match="s3://bucket/r is an address"):
+        library.open("s3://bucket/r")
+    with pytest.raises(UsageError, match="s3://bucket/x is an address"):
+        transfer.push(Path("s3://bucket/x"), [Path("data/r")])
+    monkeypatch.setenv("TACPIPE_STORE", "s3://bucket/store")
+    assert "s3://bucket/store is an address" in lab.call("store status").err
+    assert not Path("s3:").exists()
