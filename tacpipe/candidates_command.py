@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tacpipe import replacing
 from tacpipe.errors import UsageError
 from tacpipe.excerpt import plain
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from tacpipe.clouds.cloud import Cloud
 
 EXAMPLE = "\n\nExample: tacpipe candidates data/grasps --recording bleach-1561629162 --model models/touch"
+HEADER = "rank,score,off_deg,"  # how the CSV begins
 PICTURES = (".pdf", ".png", ".svg")
 Row = dict[str, float]
 
@@ -171,9 +173,11 @@ def _csv(rows: list[Row]) -> str:
 
 
 def _require_names(output: Path | None, picture: Path | None) -> None:
-    """Raise `UsageError` before anything is computed if a file's ending is none that can be written."""
-    if output is not None and output.suffix.lower() != ".csv":
-        raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
+    """Raise `UsageError` before anything is computed if a file's ending is none that can be written, or it is foreign."""
+    if output is not None:
+        if output.suffix.lower() != ".csv":
+            raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
+        replacing.refuse_foreign(output, HEADER.encode())
     if picture is not None and picture.suffix.lower() not in PICTURES:
         raise UsageError(f"{picture} is no name for a picture; it must end in one of {', '.join(PICTURES)}.")
 

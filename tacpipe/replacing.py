@@ -70,6 +70,18 @@ def _same(output: Path, given: Path) -> bool:
     return output.resolve() == given.resolve()
 
 
+def refuse_foreign(path: Path, mark: bytes) -> None:
+    """Raise `UsageError` if there is a file at ``path`` whose first 64 KiB lack ``mark``: another program wrote it."""
+    if not path.exists():
+        return
+    found = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            found = file.read(2**16)
+    if mark not in found:
+        raise UsageError(f"{path} is there already and this command did not write it. Give -o another place.")
+
+
 def occupant(store: Store, output: Path) -> Manifest | None:
     """Return the manifest of the dataset at ``output``, None if there is none.
 

@@ -1,5 +1,6 @@
 """No command replaces recordings, labels or another stage's dataset unless it is asked to, and then they can be had back."""
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -128,6 +129,26 @@ def test_a_page_does_not_replace_a_file_that_tacpipe_did_not_write(lab: Lab, tmp
         output.refuse(lab.store, Request("report", None, Path("notes.html")), plan)
     output.refuse(lab.store, Request("report", None, Path("notes.html"), replace=True), plan)
     output.refuse(lab.store, Request("report", None, Path("new.html")), plan)
+
+
+def test_an_emulated_rig_file_does_not_replace_another_one(lab: Lab) -> None:
+    text = '[[stream]]\nname = "f"\nsensor = "pulse"\ntransport = "serial:/dev/ttyACM0"\n'
+    Path("rig.toml").write_text(text)
+    ran = lab.call("sensors emulate rig.toml -o . --duration 0.1")
+    assert ran.code == 2 and "rig.toml is there already and this command did not write it" in ran.err
+    assert Path("rig.toml").read_text() == text
+
+
+@pytest.mark.parametrize(("before", "refused"), [("grasp,force\n1,2\n", True), ("rank,score,off_deg,shift_m\n", False)])
+def test_a_file_is_replaced_only_by_the_command_that_writes_such_files(
+    tmp_path: Path, before: str, refused: bool
+) -> None:
+    from tacpipe import candidates_command, replacing
+    from tacpipe.errors import UsageError
+
+    (tmp_path / "grasps.csv").write_text(before)
+    with pytest.raises(UsageError) if refused else contextlib.nullcontext():
+        replacing.refuse_foreign(tmp_path / "grasps.csv", candidates_command.HEADER.encode())
 
 
 # ---- recordings that are ingested one after another

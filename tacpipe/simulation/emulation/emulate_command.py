@@ -14,6 +14,7 @@ EXAMPLE = (
     "tells at the end what was sent and what was harmed.\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o "
     "emulated --faults noise=0.5,drop=0.001"
 )
+MARK = b"\nsimulated = true\n"  # in the rig file of an emulated rig
 SWITCH_S = 0.0005  # that the planning thread may hold up the pacing one; Python's own 5 ms would be seen at 1 kHz
 
 
@@ -34,17 +35,18 @@ def emulate(
     seed: Annotated[int, typer.Option("--seed", help="Of what happens in the world and goes wrong.")] = 0,
 ) -> None:
     """Serve a rig."""
+    from tacpipe import replacing
     from tacpipe.files import readable_errors, write_whole
     from tacpipe.interruption import Ended
     from tacpipe.recording.rig import read
     from tacpipe.simulation.emulation import byte_faults, rig_file
     from tacpipe.simulation.emulation.emulator import Emulator
 
-    asked, wrong = read(rig), byte_faults.parse(faults)
+    asked, wrong, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
+    replacing.refuse_foreign(path, MARK)
     sys.setswitchinterval(SWITCH_S)
     with Ended() as ended, readable_errors(output):
         with Emulator(asked, seed, wrong, output) as emulator:
-            path = output / "rig.toml"
             write_whole(str(path), rig_file.text(emulator.rig).encode(), f"{path}.draft")
             print(path, flush=True)
             for name, stream in emulator.rig.streams.items():
