@@ -63,7 +63,8 @@ class Change(Forward):
     # network; auto: taxelwise for raw channels, gru for latents and for channels that do not lie taxel by taxel
     architecture: Literal["auto", "taxelwise", "gru", "lstm", "tcn"] = "auto"
     dropout: Dropout = 0.2  # fraction of units left out of each training step
-    loss: Literal["absolute", "huber", "squared"] = "absolute"  # error that training minimises
+    # error that training minimises; auto: absolute, and huber for latents of increments, whose median is often 0
+    loss: Literal["auto", "absolute", "huber", "squared"] = "auto"
     PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3}}
 
 

@@ -67,9 +67,19 @@ def check(value: Any, wanted: Any, name: str, where: str = "") -> Any:
     """
     fitted = _fit(value, wanted, f"{where}, {name}" if where else name)
     if fitted is REFUSED:
-        told = f"{where}: {name}" if where else name
-        raise UsageError(f"{told} is {excerpt(value)}; it must be {describe(wanted)}.")
+        subject = f"{where}: {name}" if where else name
+        raise UsageError(f"{subject} is {shown(value)}; it must be {describe(wanted)}.")
     return fitted
+
+
+def shown(value: Any) -> str:
+    """Return a value as a message has it: short, and a whole number as such.
+
+    >>> shown(-5.0), shown("x"), shown(0.5)
+    ('-5', "'x'", '0.5')
+    """
+    whole = isinstance(value, float) and value.is_integer() and abs(value) < 1e15
+    return str(int(value)) if whole else excerpt(value)
 
 
 def fits(value: Any, wanted: Any) -> bool:

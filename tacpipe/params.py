@@ -221,7 +221,7 @@ def _checked(stage: Stage, kind: Kind, given: _Given, before: Mapping[str, Any])
         wanted = known[given.key]
         if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
             told = f"with {name} {current} it must be {fields_of.describe(wanted)}"
-            raise UsageError(f"{subject} is {excerpt(given.value)}; {told}.")
+            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {told}.")
         return fields_of.check(given.value, wanted, given.name, given.place)
     owners = having(stage, given.key)
     raise UsageError(

@@ -80,6 +80,20 @@ def build(params: Mapping[str, Any], features: int, layout: Layout, *, changes: 
     return TaxelwiseForecast(layout, **sizes)
 
 
+def resolved_loss(loss: str, *, changes: bool) -> str:
+    """Return the loss that ``auto`` is; ``changes`` says that features are increments already.
+
+    Where a sensor repeats samples most increments are 0, and so is their median, which is all that the absolute error
+    teaches.
+
+    >>> resolved_loss("auto", changes=True), resolved_loss("auto", changes=False), resolved_loss("squared", changes=True)
+    ('huber', 'absolute', 'squared')
+    """
+    if loss != AUTO:
+        return loss
+    return "huber" if changes else "absolute"
+
+
 def resolved(architecture: str, layout: Layout) -> str:
     """Return the architecture that ``auto`` is for channels that lie like ``layout``, empty for latents; others as they are.
 
@@ -99,4 +113,4 @@ def resolved(architecture: str, layout: Layout) -> str:
     return TAXELWISE
 
 
-__all__ = ["ARCHITECTURES", "AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolved"]
+__all__ = ["ARCHITECTURES", "AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolved", "resolved_loss"]

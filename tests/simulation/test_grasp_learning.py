@@ -107,7 +107,7 @@ def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
         training, tested = (type(made)({name: made.shards[name] for name in part}, {}) for part in _parted(names, fold))
         errors = [
             judged(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
-            for inputs in ("xyzcont", "rgbcont")
+            for inputs in ("xyz", "rgb")
         ]
         for target, gain in gains.items():
             gain.append(errors[0][target] - errors[1][target])

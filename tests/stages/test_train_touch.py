@@ -16,14 +16,14 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tests.asked import asked
 from tests.conftest import Lab
-from tests.tasks.touch.handmade import SMALL, dataset, recordings
+from tests.tasks.touch.handmade import dataset, recordings
 
 STAGE = registry.load("train.touch")
 TREES = "--architecture trees --trees 5 --leaf 2"
 
 
 def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
-    params = asked("train.touch", **SMALL, setting="blocked")
+    params = asked("train.touch", trees=6, leaf=2, setting="blocked")
     files = STAGE(params, recordings(), dataset(), tmp_path).files
     assert set(files) == {"config.json", "model.safetensors", "baselines.safetensors"}
     config = json.loads(files["config.json"])
@@ -85,7 +85,7 @@ def _refuses(lab: Lab) -> None:
         ("--architecture tree", 2, "architecture is 'tree'; it must be one of strong"),
         ("--targets thumb", 2, "targets is 'thumb'"),
         ("--leaf -1", 2, "leaf is -1"),
-        (f"{TREES} --select best --architecture patches", 1, "No recording has the role val"),
+        ("--select best --architecture patches", 1, "No recording has the role val"),
         ("--architecture pointnet --points 100000", 1, "points, and 100000 are to be drawn"),
     ):
         ran = lab.call(f"train touch grasps --split split -o other {words}")

@@ -16,6 +16,7 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.codecs import codec as codecs
+from tacpipe.codecs.stretches import INCREMENTS
 from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
@@ -49,7 +50,7 @@ def train(
     """Return the files of a model trained on ``training`` and stopped by its error on ``validation``.
 
     ``params`` are those of the stage `train.forward`. Scales and baselines are fitted on the training recordings alone,
-    or scales taken over from the model ``init`` with its weights. The files name the architecture that ``auto`` became.
+    or scales taken over from the model ``init`` with its weights. The files name what ``auto`` became.
     Raises `TacpipeError` where recordings lack columns or windows or hold what the architecture cannot read, and where
     ``init`` has another shape or codec.
     """
@@ -57,7 +58,7 @@ def train(
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     codec = tracks.codec_of(next(iter(training.shards.values())).table(), training.files)
     start = Forecaster.load(init) if init else None
-    params = {**params, "architecture": forecasts.resolved(_asked(params, start), layout(codec))}
+    params = _resolved(params, codec, start)
     if init and start:
         _check_start(start, init, params, codec, training.files)
     parts = [
@@ -196,6 +197,14 @@ def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str,
     """Return the digests of all recordings that the model has seen by name, those of the one it began with included."""
     digests = {shard.name: shard.digest for part in parts for shard in part.shards.values()}
     return seen(digests, start.config["trained_on"] if start else {})
+
+
+def _resolved(params: Mapping[str, Any], codec: codecs.Codec, start: Forecaster | None) -> dict[str, Any]:
+    """Return the params with what ``auto`` is for the representation of ``codec``."""
+    found = {**params, "architecture": forecasts.resolved(_asked(params, start), layout(codec))}
+    if "loss" in found:
+        found["loss"] = forecasts.resolved_loss(found["loss"], changes=codec.of == INCREMENTS)
+    return found
 
 
 def _asked(params: Mapping[str, Any], start: Forecaster | None) -> str:
