@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from tacpipe.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed
+from tacpipe.errors import UsageError
 from tacpipe.stage import stage
 
 if TYPE_CHECKING:
@@ -19,32 +21,43 @@ if TYPE_CHECKING:
     from tacpipe.dataset import Dataset, Shard
     from tacpipe.stage import Fitted, Result, Workspace
 
+Representation = Literal["levels", "increments"]
+
 
 @dataclass(frozen=True)
 class Params:
     """How many latents to keep, and of what."""
 
-    components: int = 20  # latents to keep, at most the number of channels; the paper kept 20
-    variance: float = 0.0  # keep as many latents as hold this share of the variance instead; 0 counts components
-    of: str = "levels"  # levels: counts above rest; increments: what each row adds to the one before
+    components: PositiveInt = 20  # latents to keep, at most the number of channels; the paper kept 20
+    # keep as many latents as hold this fraction of the variance instead; 0: as many as components says
+    variance: Annotated[float, Range(0, below=1)] = 0.0
+    of: Representation = "levels"  # levels: counts above rest; increments: what each row adds to the one before
 
 
 @dataclass(frozen=True)
 class AutoencoderParams:
     """What the network reads, how wide it is, and how it is trained."""
 
-    frames: int = 1  # rows in a row that it reads, 1, 2 or 3: the paper's classes C1, C2 and C3
-    components: int = 8  # latents; the paper chose 8
-    hidden: str = ""  # widths of the encoder's hidden layers, as 64,32; empty: those of the class
-    of: str = "levels"  # levels: counts above rest; increments: what each row adds to the one before
-    search: int = 0  # networks to try under the same budget, at most 12, of which the best is kept; 0: none
-    epochs: int = 100  # most passes over the training rows
-    batch: int = 256  # rows a step of the optimiser
-    learning_rate: float = 1e-3  # of Adam, without unit
-    weight_decay: float = 1e-5  # of Adam, without unit
-    patience: int = 10  # epochs without a lower error on held-out training recordings after which training ends
-    seed: int = 0  # of first weights and shuffles
+    frames: Literal[1, 2, 3] = 1  # consecutive rows that it reads: the paper's classes C1, C2 and C3
+    components: PositiveInt = 8  # latents; the paper chose 8
+    # widths of the encoder's hidden layers, as 64,32; empty: those of the class
+    hidden: Annotated[str, CommaList(PositiveInt)] = ""
+    of: Representation = "levels"  # levels: counts above rest; increments: what each row adds to the one before
+    search: Annotated[int, Range(0, 12)] = 0  # networks to try under the same budget, the best is kept; 0: none
+    epochs: PositiveInt = 100  # maximum number of passes over the training rows
+    batch: PositiveInt = 256  # rows per step of the optimiser
+    learning_rate: PositiveFloat = 1e-3  # of Adam
+    weight_decay: NonNegativeFloat = 1e-5  # of Adam
+    patience: PositiveInt = 10  # epochs without a lower error on held-out training recordings after which training ends
+    seed: Seed = 0  # random seed of initial weights and of the order of rows
     PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {"quick": {"epochs": 5}}
+
+    def check(self) -> None:
+        """Refuse hidden layers beside a search, which tries its own."""
+        if self.search and self.hidden:
+            raise UsageError(
+                f"hidden is {self.hidden} and search is {self.search}, which tries its own; give one of them."
+            )
 
 
 @stage(version=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tacpipe.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Recording, stage
 
@@ -23,20 +24,24 @@ class Params:
     Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
     """
 
-    plane_mm: float = 6.0  # millimetres from the table's plane, within which points belong to it; more if it is noisy
-    plane_share: float = 0.2  # of the scene's points, that the table must hold
-    plane_trials: int = 1000  # random samples by which a plane is looked for
-    seed: int = 0  # of these samples
-    cluster_mm: float = 12.0  # millimetres between neighbours in one thing
-    cluster_points: int = 6  # points so near to one another, without which a point is stray
-    object_points: int = 50  # points that a thing must have; fewer are noise of the table
-    near_mm: float = 20.0  # millimetres that the object may be from the line between the fingers, or from its sight
-    outlier_neighbours: int = 20  # points whose mean distance tells a stray one at the object's rim
-    outlier_deviations: float = 5.0  # standard deviations of that distance above its mean, beyond which it is stray
-    rest_s: float = 0.5  # seconds at the start whose median is each finger's pressure without load
-    on_count: float = 20.0  # device counts of pressure above that, from which on a finger surely presses; noise is 0.25
-    settle_s: float = 0.2  # seconds that both must press, and whose median is the reading
-    settled_count: float = 3.0  # device counts by which pressure may vary in that time, and still is settled
+    # millimetres from the table's plane, within which points belong to it; more if it is noisy
+    plane_mm: PositiveFloat = 6.0
+    plane_share: Fraction = 0.2  # of the scene's points, that the table must hold
+    plane_trials: PositiveInt = 1000  # random samples by which a plane is looked for
+    seed: Seed = 0  # random seed of these samples
+    cluster_mm: PositiveFloat = 12.0  # millimetres between neighbours in one thing
+    cluster_points: PositiveInt = 6  # points so near to one another, without which a point is stray
+    object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
+    # millimetres that the object may be from the line between the fingers, or from its sight
+    near_mm: PositiveFloat = 20.0
+    outlier_neighbours: PositiveInt = 20  # points whose mean distance tells a stray one at the object's rim
+    # standard deviations of that distance above its mean, beyond which it is stray
+    outlier_deviations: PositiveFloat = 5.0
+    rest_s: PositiveFloat = 0.5  # seconds at the start whose median is each finger's pressure without load
+    # device counts of pressure above that, from which on a finger surely presses; noise is 0.25
+    on_count: PositiveFloat = 20.0
+    settle_s: PositiveFloat = 0.2  # seconds that both must press, and whose median is the reading
+    settled_count: NonNegativeFloat = 3.0  # device counts by which pressure may vary in that time, and still is settled
 
 
 @stage(version=2)

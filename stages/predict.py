@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from tacpipe.errors import UsageError
+from tacpipe.constraints import CommaList, PositiveInt
 from tacpipe.stage import stage
 
 if TYPE_CHECKING:
@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 
     Model = Dataset
 
+STEPS = CommaList(PositiveInt, least=1)
+
 
 @dataclass(frozen=True)
 class Params:
     """What is told."""
 
-    steps: str = "1,3,5,10"  # steps ahead, with commas between them
+    steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
 
 
 @stage(version=1)
@@ -27,12 +29,7 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     """Write what a model expects of each recording, with the time at which it was known."""
     from tacpipe import model_files
 
-    try:
-        steps = sorted({int(step) for step in params.steps.split(",")})
-    except ValueError:
-        raise UsageError(
-            f"steps is {params.steps!r}; it must be whole numbers with commas between, like 1,5,10."
-        ) from None
+    steps = sorted(set(STEPS.items(params.steps)))
     task = model_files.task(model.files)
     with model_files.believed("the model"):
         result: Result = task.predict(model.files, recordings, steps)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tacpipe.constraints import NonNegativeInt
 from tacpipe.stage import stage
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ class Params:
     """What the page shows."""
 
     title: str = "Touch, predicted"  # heading of the page
-    traces: int = 2  # recordings of each forecast told in full whose predictions are drawn
+    traces: NonNegativeInt = 2  # recordings of each forecast told in full whose predictions are drawn
 
 
 @stage(version=3)

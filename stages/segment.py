@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.errors import TacpipeError
+from tacpipe.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.stage import Attribute, Recording, stage
 
 if TYPE_CHECKING:
@@ -31,14 +32,25 @@ class Params:
     in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts remain for seconds.
     """
 
-    begins: str = "free"  # free: nothing is touched at first; grasped: all of the recording is one contact
-    rest_s: float = 0.2  # seconds at the start whose median is each channel's level without load
-    on_count: float = 120.0  # device counts by which a finger's taxels leave rest on average, where contact starts
-    off_count: float = 80.0  # device counts below which it ends
-    merge_s: float = 0.5  # seconds; contacts that are no further apart are one
-    min_s: float = 0.3  # seconds; shorter contacts are left out
-    pad_s: float = 0.5  # seconds before and after each contact that belong to it
-    tare: str = "median"  # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
+    # free: nothing is touched at first; grasped: all of the recording is one contact
+    begins: Literal["free", "grasped"] = "free"
+    rest_s: NonNegativeFloat = 0.2  # seconds at the start whose median is each channel's level without load
+    # device counts by which a finger's taxels leave rest on average, where contact starts
+    on_count: PositiveFloat = 120.0
+    off_count: NonNegativeFloat = 80.0  # device counts below which it ends
+    merge_s: NonNegativeFloat = 0.5  # seconds; contacts that are no further apart are one
+    min_s: NonNegativeFloat = 0.3  # seconds; shorter contacts are left out
+    pad_s: NonNegativeFloat = 0.5  # seconds before and after each contact that belong to it
+    # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
+    tare: Literal["median", "first", "axis_mean"] = "median"
+
+    def check(self) -> None:
+        """Refuse contacts that end above where they begin."""
+        if self.off_count > self.on_count:
+            raise UsageError(
+                f"off_count is {self.off_count:g}, above on_count, {self.on_count:g}; a contact must end at or below the "
+                f"load at which it begins."
+            )
 
 
 @stage(version=2)
@@ -54,8 +66,6 @@ def contacts(params: Params, recording: Shard) -> pa.Table:
     from tacpipe.signals.contact import contact_intervals, load, rest_level
     from tacpipe.tables import with_metadata
 
-    if params.begins not in ("free", "grasped"):
-        raise TacpipeError(f"begins is {params.begins!r}; it must be free or grasped.")
     table = recording.table()
     t_ns = table.column("t_ns").to_numpy()  # (time,)
     loads: list[Any] = []
@@ -89,17 +99,28 @@ class SlipParams:
     """
 
     channel: str = ""  # column with the readings; empty for the only one whose quantity is proximity
-    cutoff_hz: float = 5.0  # of the low-pass before the rate is taken
-    still_s: float = 0.5  # seconds after the grasp in which nothing slips yet: they give the noise and the level
-    on_sigma: float = 5.0  # times the rate's noise, beyond which slip begins
-    off_sigma: float = 2.0  # times the rate's noise, below which it ends
-    on_frames: int = 3  # rows that it must be beyond
-    off_frames: int = 5  # rows that it must be below
-    noise_floor: float = 3.0  # counts a second; least noise of the rate: a reading's step of one count makes 10 of them
-    level_count: float = 0.75  # counts; readings that have moved no further have not left their level yet
-    patch_mm: float = 25.0  # millimetres; an object that has slipped further is lost
-    count_per_mm: float = 8.0  # of the sensor
-    saturated_count: float = 544.0  # counts; a reading of this or less is no distance any more, the object is lost
+    cutoff_hz: PositiveFloat = 5.0  # of the low-pass before the rate is taken
+    # seconds after the grasp in which nothing slips yet: they give the noise and the level
+    still_s: PositiveFloat = 0.5
+    on_sigma: PositiveFloat = 5.0  # times the rate's noise, beyond which slip begins
+    off_sigma: PositiveFloat = 2.0  # times the rate's noise, below which it ends
+    on_frames: PositiveInt = 3  # rows that it must be beyond
+    off_frames: PositiveInt = 5  # rows that it must be below
+    # counts a second; least noise of the rate: a reading's step of one count makes 10 of them
+    noise_floor: PositiveFloat = 3.0
+    level_count: PositiveFloat = 0.75  # counts; readings that have moved no further have not left their level yet
+    patch_mm: PositiveFloat = 25.0  # millimetres; an object that has slipped further is lost
+    count_per_mm: PositiveFloat = 8.0  # of the sensor
+    # counts; a reading of this or less is no distance any more, the object is lost
+    saturated_count: NonNegativeFloat = 544.0
+
+    def check(self) -> None:
+        """Refuse slips that end above where they begin."""
+        if self.off_sigma > self.on_sigma:
+            raise UsageError(
+                f"off_sigma is {self.off_sigma:g}, above on_sigma, {self.on_sigma:g}; a slip must end at or below the rate "
+                f"at which it begins."
+            )
 
 
 @stage(version=1)
@@ -158,20 +179,38 @@ class SlideParams:
     slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
     """
 
-    pressure_trigger: float = 40.0  # device counts of static pressure whose first crossing starts the slide
-    moving_share: float = 0.5  # of speed_m_s, from which on the arm slides; told only where the arm was recorded
-    steady_frames: int = 5  # rows that the arm must move so fast, or a single wrong reading would count
-    crop: str = "middle"  # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
-    frames: int = 400  # rows that are kept; recordings without static pressure are kept whole
-    offset_frames: int = 101  # rows between trigger and kept frames with crop offset; the authors' files have 101
-    spike_frames: int = 7  # rows around a tactile reading, odd, whose median takes its place if it is a spike; 1: never
-    spike_deviations: float = 5.0  # scaled median absolute deviations of these rows, beyond which it is a spike
-    spike_count: float = 255.0  # device counts that it must stand out by at least; touch changes readings by 0 to 235
-    speed_m_s: float = 0.025  # metres a second; the protocol's speed
-    speed_tolerance: float = 0.05  # share by which the slide's median speed may differ; published ones do by 0.016
-    min_s: float = 5.5  # seconds; a shorter slide is outside the protocol
-    pressure_low: float = 2.0  # device counts; with a mean pressure below this the finger hardly touched
-    pressure_high: float = 150.0  # device counts; with a mean pressure above this it was pressed too hard
+    pressure_trigger: NonNegativeFloat = 40.0  # device counts of static pressure whose first crossing starts the slide
+    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; told only where the arm was recorded
+    steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
+    # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
+    crop: Literal["middle", "offset", "none"] = "middle"
+    frames: PositiveInt = 400  # rows that are kept; recordings without static pressure are kept whole
+    # rows between trigger and kept frames with crop offset; the authors' files have 101
+    offset_frames: NonNegativeInt = 101
+    # rows around a tactile reading, odd, whose median replaces it if it is a spike; 1: never
+    spike_frames: PositiveInt = 7
+    # scaled median absolute deviations of these rows, beyond which it is a spike
+    spike_deviations: NonNegativeFloat = 5.0
+    # device counts that it must stand out by at least; touch changes readings by 0 to 235
+    spike_count: NonNegativeFloat = 255.0
+    speed_m_s: PositiveFloat = 0.025  # metres a second; the protocol's speed
+    # fraction by which the slide's median speed may differ; published ones do by 0.016
+    speed_tolerance: NonNegativeFloat = 0.05
+    min_s: NonNegativeFloat = 5.5  # seconds; a shorter slide is outside the protocol
+    pressure_low: NonNegativeFloat = 2.0  # device counts; with a mean pressure below this the finger hardly touched
+    pressure_high: NonNegativeFloat = 150.0  # device counts; with a mean pressure above this it was pressed too hard
+
+    def check(self) -> None:
+        """Refuse a median of an even number of rows, and bounds of the pressure that leave nothing between them."""
+        if self.spike_frames % 2 == 0:
+            raise UsageError(
+                f"spike_frames is {self.spike_frames}; it must be odd, for a reading has as many rows on both sides."
+            )
+        if self.pressure_low > self.pressure_high:
+            raise UsageError(
+                f"pressure_low is {self.pressure_low:g}, above pressure_high, {self.pressure_high:g}; it must be the "
+                f"lower one."
+            )
 
 
 @stage(version=1)

@@ -3,33 +3,53 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Annotated, Literal
 
+from tacpipe.constraints import (
+    CommaList,
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Seed,
+)
+from tacpipe.errors import UsageError
 from tacpipe.stage import Recording, Trial, stage
+
+Families = Annotated[str, CommaList(Literal["all", "box", "cylinder", "sphere", "ellipsoid", "cone", "bow"], least=1)]
 
 
 @dataclass(frozen=True)
 class Params:
     """What the simulated pick-and-move rig does, and how badly its streams are logged."""
 
-    trials: int = 24  # recordings
-    seed: int = 0  # of all that is random
-    duration_s: float = 12.0  # seconds a recording: approach, grasp, lift and move, then further moves
-    protocol: str = "mixed"  # how the arm moves: controlled (trapezoids), kinaesthetic (by hand), or mixed
-    effort: float = 0.0  # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
-    friction_scale: float = 1.0  # times the friction that was drawn; with 4 nothing ever slips
-    grip_loss_probability: float = 0.0  # share of trials in which the grip gives way, unannounced
-    grip_loss: float = 0.2  # share of the grip force that is lost then
-    lever_m: float = 0.0  # metres from the grasp to the centre of mass, sideways; twists the object
+    trials: PositiveInt = 24  # recordings
+    seed: Seed = 0  # random seed
+    # seconds a recording: approach, grasp, lift and move, then further moves
+    duration_s: Annotated[float, Range(4)] = 12.0
+    # how the arm moves: controlled (trapezoids), kinaesthetic (by hand), or mixed
+    protocol: Literal["mixed", "controlled", "kinaesthetic"] = "mixed"
+    # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
+    effort: NonNegativeFloat = 0.0
+    friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
+    grip_loss_probability: Fraction = 0.0  # share of trials in which the grip gives way, unannounced
+    grip_loss: Fraction = 0.2  # share of the grip force that is lost then
+    lever_m: NonNegativeFloat = 0.0  # metres from the grasp to the centre of mass, sideways; twists the object
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep
-    tactile_rate_hz: float = 50.0  # frames a second of each tactile sensor
-    robot_rate_hz: float = 1000.0  # states a second of the arm
-    hold_probability: float = 0.07  # share of tactile frames that repeat the one before; 0.75 is like the 2021 rig
-    drop_probability: float = 0.002  # share of samples that are lost
-    noise_scale: float = 1.0  # times the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
-    tactile_jitter_ms: float = 2.0  # milliseconds, mean and standard deviation of a tactile frame's way to the host
-    robot_jitter_ms: float = 0.5  # milliseconds, the same of an arm state or a proximity reading
-    clock_offset_ms: float = 80.0  # milliseconds, largest offset of the sensors' own clocks (t_device_ns)
-    clock_skew_ppm: float = 50.0  # parts per million, largest skew of a device's own clock
+    tactile_rate_hz: PositiveFloat = 50.0  # frames a second of each tactile sensor
+    robot_rate_hz: PositiveFloat = 1000.0  # states a second of the arm
+    # fraction of tactile frames that repeat the one before; 0.75 is like the 2021 rig
+    hold_probability: Fraction = 0.07
+    drop_probability: Fraction = 0.002  # fraction of samples that are lost
+    # times the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
+    noise_scale: NonNegativeFloat = 1.0
+    # milliseconds, mean and standard deviation of a tactile frame's way to the host
+    tactile_jitter_ms: NonNegativeFloat = 2.0
+    robot_jitter_ms: NonNegativeFloat = 0.5  # milliseconds, the same of an arm state or a proximity reading
+    clock_offset_ms: NonNegativeFloat = 80.0  # milliseconds, largest offset of the sensors' own clocks (t_device_ns)
+    clock_skew_ppm: NonNegativeFloat = 50.0  # parts per million, largest skew of a device's own clock
 
 
 @stage(version=2)
@@ -47,20 +67,26 @@ def forward(params: Params, trial: Trial) -> Recording:
 class MaterialParams:
     """What the simulated rig of two unlike sensors slides over, and how well the sensors tell."""
 
-    trials: int = 200  # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
-    seed: int = 0  # of all that is random
-    materials: int = 20  # materials
-    sessions: int = 1  # sessions a material, over which its trials are shared out by turns
+    # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
+    trials: PositiveInt = 200
+    seed: Seed = 0  # random seed
+    materials: PositiveInt = 20  # materials
+    sessions: PositiveInt = 1  # sessions a material, over which its trials are shared out by turns
     identical_materials: bool = False  # all classes are one and the same material; only their sessions differ
-    spectra: str = "shared"  # shared: both sensors feel the same materials; independent: each has its own twenty
-    session_scale: float = 1.0  # times the offsets, gains and drift that the trials of a session have in common
-    noise_scale: float = 1.0  # times what differs from reading to reading: noise, drift, each trial's own offsets
-    force_n: float = 1.0  # newton, mean force of a slide; it varies by 5 % from trial to trial
-    speed_m_s: float = 0.025  # metres a second, of the arm that draws the BioTac
-    roboskin_speed_m_s: float = 0.05  # metres a second, mean speed of what slides over RoboSkin; it wanders by 30 %
+    # shared: both sensors measure the same materials; independent: each has its own twenty
+    spectra: Literal["shared", "independent"] = "shared"
+    # times the offsets, gains and drift that the trials of a session have in common
+    session_scale: NonNegativeFloat = 1.0
+    # times what differs from reading to reading: noise, drift, each trial's own offsets
+    noise_scale: NonNegativeFloat = 1.0
+    force_n: PositiveFloat = 1.0  # newton, mean force of a slide; it varies by 5 % from trial to trial
+    speed_m_s: PositiveFloat = 0.025  # metres a second, of the arm that draws the BioTac
+    # metres a second, mean speed of what slides over RoboSkin; it wanders by 30 %
+    roboskin_speed_m_s: PositiveFloat = 0.05
     pac: bool = True  # whether the BioTac's vibration channels are simulated; they are zero otherwise
-    arm_every: int = 20  # every how many-th slide of a BioTac on a material has the arm's streams; 0: none
-    jitter_ms: float = 0.1  # milliseconds, mean and standard deviation of a reading's way to the host
+    # every how many-th slide of a BioTac on a material has the arm's streams; 0: none
+    arm_every: NonNegativeInt = 20
+    jitter_ms: NonNegativeFloat = 0.1  # milliseconds, mean and standard deviation of a reading's way to the host
 
 
 @stage(version=1)
@@ -78,18 +104,26 @@ def material(params: MaterialParams, trial: Trial) -> Recording:
 class TouchParams:
     """What lies on the simulated table, how it is grasped, and how well camera and fingertips tell."""
 
-    trials: int = 360  # recordings, each a grasp; the objects take turns
-    seed: int = 0  # of all that is random
-    families: str = "all"  # of objects: box, cylinder, sphere, ellipsoid, cone, bow, separated by commas; or all
-    objects: int = 5  # named objects of each family
-    stiffness: str = "mixed"  # of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
+    trials: PositiveInt = 360  # recordings, each a grasp; the objects take turns
+    seed: Seed = 0  # random seed
+    families: Families = "all"  # families of objects, or all
+    objects: PositiveInt = 5  # named objects of each family
+    # of the objects: rigid, elastic (50 kPa), foam (15 kPa), or mixed, each object its own
+    stiffness: Literal["mixed", "rigid", "elastic", "foam"] = "mixed"
     spheres: bool = False  # spheres that differ in size alone, seen from as much nearer, grasped through the centre
     one_pose: bool = False  # each object always lies the same way, and is only shifted and turned about the vertical
-    shift: float = 0.5  # largest share of half the cloud's length by which grasps lie off its middle
-    effort_spread: float = 0.15  # standard deviation of the logarithm of the closing effort, which nobody sees
-    noise_scale: float = 1.0  # times the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
-    drift_count_day: float = 30.0  # counts a day by which the sensors drift, root mean square
+    shift: Fraction = 0.5  # largest fraction of half the cloud's length by which grasps lie off its middle
+    # standard deviation of the logarithm of the closing effort, which no stream shows
+    effort_spread: NonNegativeFloat = 0.15
+    # times the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
+    noise_scale: NonNegativeFloat = 1.0
+    drift_count_day: NonNegativeFloat = 30.0  # counts a day by which the sensors drift, root mean square
     raw: bool = False  # the camera's whole view and the sensors over time, as before `segment grasps`
+
+    def check(self) -> None:
+        """Refuse whole views of spheres of all sizes, which have no table."""
+        if self.raw and self.spheres:
+            raise UsageError("raw and spheres are both set; spheres of all sizes have no table. Leave one of them out.")
 
 
 @stage(version=2)

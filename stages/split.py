@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from tacpipe.constraints import Names, NonNegativeInt, PositiveInt, Range, Seed
+from tacpipe.errors import UsageError
 from tacpipe.stage import Recording, Result, stage
 
 if TYPE_CHECKING:
@@ -13,22 +15,90 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Params:
-    """How recordings are dealt out."""
+class Split:
+    """What all schemes have."""
 
-    scheme: str = "random"  # random, kfold, blocked (in the order of names), leave-one-out or authors
-    val: float = 0.15  # share of the recordings to watch; where the scheme picks the test ones, of the others
-    test: float = 0.15  # share of the recordings to test; of no effect with kfold, leave-one-out and authors
-    seed: int = 0  # of every draw
-    folds: int = 5  # how many parts kfold makes
-    by: str = "object"  # attribute whose values leave-one-out leaves out one by one
-    stratify: str = ""  # attributes, commas between, whose values are spread evenly over the roles; empty for none
-    apart: str = ""  # of kfold: attribute whose values are dealt out too, each unknown in one fold; empty for none
-    repeats: int = 1  # of random: folds, each another draw
-    reverse: bool = False  # of blocked: test the first in the order of names and train on the last
-    few: int = 0  # at most so many recordings train, and those left over are unused; 0 for all
+    scheme: str
+    # fraction of the recordings to validate on; where the scheme picks the test ones, of the others
+    val: Annotated[float, Range(0, below=1)] = 0.15
+    seed: Seed = 0  # random seed of every draw
+    stratify: Names = ""  # attributes whose values are spread evenly over the roles; empty for none
+    few: NonNegativeInt = 0  # maximum number of recordings to train on, those left over are unused; 0 for all
     few_by: str = ""  # attribute of whose every value that many train, as sensor; empty for that many altogether
     few_of: str = ""  # attribute=value of the recordings that few is about, as sensor=roboskin; empty for all
+
+    def check(self) -> None:
+        """Refuse what says nothing without few, and an attribute without a value."""
+        if not self.few and (self.few_by or self.few_of):
+            named = "few_by" if self.few_by else "few_of"
+            raise UsageError(
+                f"{named} is {self.few_by or self.few_of} and few is 0; it must be 1 or more with {named}."
+            )
+        if self.few_of and not all(self.few_of.partition("=")):
+            raise UsageError(f"few_of is {self.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
+
+
+@dataclass(frozen=True)
+class Tested(Split):
+    """Schemes that are given how many recordings to test on."""
+
+    test: Annotated[float, Range(0, below=1)] = 0.15  # fraction of the recordings to test on
+
+    def check(self) -> None:
+        """Refuse fractions that leave nothing to train on."""
+        super().check()
+        if self.val + self.test >= 1:
+            raise UsageError(
+                f"val is {self.val:g} and test is {self.test:g}, which leave nothing to train on; their sum must be below 1."
+            )
+
+
+@dataclass(frozen=True)
+class Random(Tested):
+    """Roles drawn at random."""
+
+    # random: roles drawn at random
+    scheme: Literal["random"] = "random"
+    repeats: PositiveInt = 1  # folds, each another draw
+
+
+@dataclass(frozen=True)
+class Kfold(Split):
+    """Each recording is tested in one of several folds."""
+
+    # kfold: each recording is tested in one of several folds
+    scheme: Literal["kfold"] = "kfold"
+    folds: Annotated[int, Range(2)] = 5  # number of parts
+    apart: str = ""  # attribute whose values are dealt out too, each unknown in one fold; empty for none
+
+
+@dataclass(frozen=True)
+class Blocked(Tested):
+    """Recordings in the order of names, which is that of time for most sets: train, then val, then test."""
+
+    # blocked: in the order of names
+    scheme: Literal["blocked"] = "blocked"
+    reverse: bool = False  # test the first in the order of names and train on the last
+
+
+@dataclass(frozen=True)
+class LeaveOneOut(Split):
+    """The recordings of one value of an attribute are tested in each fold."""
+
+    # leave-one-out: all recordings of a value
+    scheme: Literal["leave-one-out"] = "leave-one-out"
+    by: str = "object"  # attribute whose values are left out one by one
+
+
+@dataclass(frozen=True)
+class Authors(Split):
+    """The roles that the authors of a published set gave."""
+
+    # authors: as the authors of a published set did
+    scheme: Literal["authors"] = "authors"
+
+
+Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 
 
 @stage(version=1)
@@ -41,21 +111,8 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
 
     from tacpipe.splits import Scheme, assign
 
-    scheme = Scheme(
-        name=params.scheme,
-        val=params.val,
-        test=params.test,
-        seed=params.seed,
-        folds=params.folds,
-        by=params.by,
-        stratify=params.stratify,
-        apart=params.apart,
-        repeats=params.repeats,
-        reverse=params.reverse,
-        few=params.few,
-        few_by=params.few_by,
-        few_of=params.few_of,
-    )
+    values = asdict(params)
+    scheme = Scheme(name=values.pop("scheme"), **values)
     roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme, extend or {})
     table = pa.table(
         {

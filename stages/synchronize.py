@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from tacpipe.constraints import PositiveFloat
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Attribute, Recording, stage
 
@@ -20,7 +21,6 @@ EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device says of a sample; they stay as they are
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
-GRIDS, CLOCKS = ("uniform", "logged", "fresh"), ("auto", "device", "arrival")
 MEDIAN_NS = (
     10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
 )
@@ -30,11 +30,13 @@ MEDIAN_NS = (
 class Params:
     """The grid, the clock that places samples on it, and what counts as a gap."""
 
-    rate_hz: float = 50.0  # points a second of the uniform grid
-    grid: str = "uniform"  # uniform; logged: at the master's own stamps; fresh: at those whose rows are not held
+    rate_hz: PositiveFloat = 50.0  # points a second of the uniform grid
+    # uniform; logged: at the master's own stamps; fresh: at those whose rows are not repeated samples
+    grid: Literal["uniform", "logged", "fresh"] = "uniform"
     master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
-    gap_ms: float = 50.0  # milliseconds; a point between samples further apart than this is marked as in a gap
-    clock: str = "auto"  # device: when the device says a sample was taken; arrival: when it came; auto: as can be had
+    gap_ms: PositiveFloat = 50.0  # milliseconds; a point between samples further apart than this is marked as in a gap
+    # time of a sample: device: its own stamp; arrival: when it came; auto: the device's where there is one
+    clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are
 
 
@@ -65,7 +67,6 @@ def synchronize(params: Params, recording: Shard) -> Recording:
 
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
 
-    _require_known(params)
     tables = {name: recording.table(name) for name in sorted(recording.streams) if name != EVENTS}
     streams = {name: _stream(recording.name, name, table, params.clock) for name, table in tables.items()}
     wanted = params.master or str(recording.attributes.get("master", ""))
@@ -87,12 +88,6 @@ def synchronize(params: Params, recording: Shard) -> Recording:
             attributes |= stream.attributes
     arrays = [pa.array(values, kind.type) for kind, values in columns]
     return Recording(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
-
-
-def _require_known(params: Params) -> None:
-    for value, what, known in ((params.grid, "grid", GRIDS), (params.clock, "clock", CLOCKS)):
-        if value not in known:
-            raise TacpipeError(f"There is no {what} {value!r}; it must be {', '.join(known[:-1])} or {known[-1]}.")
 
 
 def _stream(recording: str, name: str, table: pa.Table, clock: str) -> _Stream:

@@ -1,23 +1,48 @@
-"""From defaults, ``params.yaml``, presets and options to a stage's params."""
+"""From defaults, ``params.yaml``, presets and options to a stage's params, checked before any data is read.
+
+A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
+same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
+one by default; a field that the chosen class does not have is refused, and is no part of a key. A method ``check`` may
+refuse values that do not go together; stored params are read back without it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import re
-import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
+from tacpipe import fields as fields_of
 from tacpipe import regular, yaml_text
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.excerpt import excerpt, listed, plain
+from tacpipe.excerpt import excerpt, listed
+from tacpipe.fields import filled as filled
 from tacpipe.stage import Stage
 
-PRESETS = ("paper", "quick")
+Kind = type[Any]  # a dataclass of params
+
+
+class _Given(NamedTuple):
+    """A value that was given, and where."""
+
+    where: str
+    key: str
+    value: Any
+    option: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.where if self.option else self.key
+
+    @property
+    def place(self) -> str:
+        return "" if self.option else self.where
 
 
 def build(
@@ -32,68 +57,76 @@ def build(
 ) -> Any:
     """Return the params of stage ``name``: defaults, then file, preset, ``--set``, options, each over the one before.
 
-    Raises `UsageError` for an unknown name or a value of the wrong type, with where it stands.
+    Raises `UsageError` for an unknown name, a value that is not allowed, an option of another kind of params than the
+    chosen one, and values that do not go together.
     """
+    early = [] if file is None else _from_file(file, block or name, required=block is not None)
+    late = [_from_set(name, text) for text in sets]
+    late += [_Given(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
+    for given in (*early, *late):
+        if given.key not in fields(stage):
+            raise fields_of.unknown(given.key, fields(stage), given.where, "param")
+    kind = _chosen(stage, early, late, preset)
+    if tag(stage) and kind is not _named(stage, early):  # the preset or an option chose, over what the file names
+        early = [given for given in early if given.key != tag(stage)]
+    presets = [] if preset is None else _from_preset(name, stage, kind, preset)
     values: dict[str, Any] = {}
-    if file is not None:
-        values.update(_from_file(file, block or name, required=block is not None))
-        where = f"{file}, block {block or name}"
-        values = {key: check(stage, key, value, where) for key, value in values.items()}
-    if preset is not None:
-        values.update(_from_preset(name, stage, preset))
-    for text in sets:
-        key, _, value = text.partition("=")
-        field = key.removeprefix(f"{name}.")
-        values[field] = check(stage, field, _parse(value), f"--set {text}")
-    for key, value in (options or {}).items():
-        values[key] = check(stage, key, value, f"--{key.replace('_', '-')}")
+    for given in (*early, *presets, *late):
+        values[given.key] = _checked(stage, kind, given, values)
     try:
-        return stage.params(**values)
+        made = kind(**values)
     except TypeError as error:
         raise UsageError(f"The params of {name} are not complete: {error}.") from error
+    if hasattr(made, "check"):
+        made.check()
+    return made
+
+
+def kinds(stage: Stage) -> tuple[Kind, ...]:
+    """Return the dataclasses that a stage's params may be, the default one first."""
+    found = stage.params
+    return get_args(found) if get_origin(found) in (typing.Union, types.UnionType) else (found,)
+
+
+def tag(stage: Stage) -> str | None:
+    """Return the name of the field that chooses among several kinds of params; None where there is one kind."""
+    several = kinds(stage)
+    if len(several) == 1:
+        return None
+    name = dataclasses.fields(several[0])[0].name
+    choices = [get_args(fields_of.hints(kind).get(name)) for kind in several]
+    if not all(choices) or len({choice for some in choices for choice in some}) < sum(map(len, choices)):
+        raise TacpipeError(
+            f"The params of {stage.function.__name__} are of {len(several)} kinds, and their first field, {name}, does "
+            f"not tell them apart: it must be a Literal in each, with choices that no other has."
+        )
+    return name
 
 
 def fields(stage: Stage) -> dict[str, Any]:
-    """Return the type of each param of a stage."""
-    hints = typing.get_type_hints(stage.params)
-    return {field.name: hints[field.name] for field in dataclasses.fields(stage.params)}
+    """Return the annotation of each param of a stage, of whatever kind; choices of several kinds are joined."""
+    return dict(_fields(kinds(stage)))
 
 
-def check(stage: Stage, key: str, value: Any, where: str) -> Any:
-    """Return ``value`` if the param ``key`` can hold it, an int as a float where one is wanted.
-
-    Raises `UsageError` otherwise.
-    """
-    return _checked(fields(stage), key, value, where, "param")
-
-
-def _checked(known: Mapping[str, Any], key: str, value: Any, where: str, noun: str) -> Any:
-    if key not in known:
-        told = plain(key) if isinstance(key, str) else excerpt(key)
-        raise UsageError(f"{where}: there is no {noun} {told}; there are {', '.join(known) or 'none'}.")
-    wanted = known[key]
-    fitted = _fit(value, wanted, f"{where}, {key}")
-    if fitted is _NO:
-        raise UsageError(f"{where}: {key} is {excerpt(value)}, which is no {_name(wanted)}.")
-    return fitted
+def having(stage: Stage, field: str) -> list[str]:
+    """Return the choices of the tag for which a param counts, empty if it always does."""
+    name, several = tag(stage), kinds(stage)
+    owners = [kind for kind in several if field in fields_of.hints(kind)]
+    if name is None or len(owners) == len(several):
+        return []
+    return [str(choice) for kind in owners for choice in get_args(fields_of.hints(kind)[name])]
 
 
-def filled(kind: type[Any], values: Mapping[str, Any], where: str, noun: str = "param") -> Any:
-    """Return the dataclass ``kind`` with ``values`` over its defaults, an int as a float where one is wanted.
+def defaults(stage: Stage, field: str) -> list[Any]:
+    """Return the defaults that a param has, one in each kind that has another; of the tag that of the default kind."""
+    several = kinds(stage)[:1] if field == tag(stage) else kinds(stage)
+    found = [kind.__dataclass_fields__[field] for kind in several if field in kind.__dataclass_fields__]
+    return list({repr(one.default): one.default for one in found if one.default is not dataclasses.MISSING}.values())
 
-    Raises `UsageError` for an unknown name, a value of the wrong type, and one without a default that is missing.
-    """
-    hints = typing.get_type_hints(kind)
-    known = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-    fitting = {key: _checked(known, key, value, where, noun) for key, value in values.items()}
-    missing = [
-        field.name
-        for field in dataclasses.fields(kind)
-        if field.default is field.default_factory is dataclasses.MISSING and field.name not in fitting
-    ]
-    if missing:
-        raise UsageError(f"{where}: {noun} {' and '.join(missing)} must be given.")
-    return kind(**fitting)
+
+def presets(stage: Stage) -> list[str]:
+    """Return the names of a stage's presets."""
+    return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
 
 
 def to_json(params: Any) -> dict[str, Any]:
@@ -104,74 +137,143 @@ def to_json(params: Any) -> dict[str, Any]:
 
 
 def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
-    """Return the params that `to_json` gave."""
-    known = fields(stage)
-    return stage.params(**{k: tuple(v) if get_origin(known.get(k)) is tuple else v for k, v in values.items()})
+    """Return the params that `to_json` gave, now or in an older version; values are taken as they are.
+
+    A field that only other kinds have is left out, and so is any that is gone where the stage reads whole datasets.
+    Raises `TacpipeError` where a stage that works recording by recording has no such field: its result would be
+    stored under a name that is not its own.
+    """
+    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), kinds(stage)[0])
+    known = fields_of.hints(kind)
+    gone = sorted(set(values) - set(fields(stage)))
+    if gone and stage.mapped:
+        raise TacpipeError(
+            f"What is stored was made by another version of {stage.function.__name__}, with the param {gone[0]}, which "
+            f"this version does not have. Run the stage again, or use that version."
+        )
+    return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in values.items() if k in known})
 
 
 def comments(stage: Stage) -> dict[str, str]:
-    """Return the comment behind each field of a stage's params, which is its help."""
+    """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
+    found: dict[str, list[str]] = {}
+    for kind in kinds(stage):
+        own: dict[str, str] = {}
+        for owner in reversed(kind.__mro__):
+            own |= _comments(owner) if dataclasses.is_dataclass(owner) else {}
+        for name, text in own.items():
+            if text not in found.setdefault(name, []):
+                found[name].append(text)
+    return {name: "; ".join(texts) for name, texts in found.items()}
+
+
+def _comments(kind: Kind) -> dict[str, str]:
     try:
-        lines = inspect.getsource(stage.params).splitlines()
+        lines = inspect.getsource(kind).splitlines()
     except (OSError, TypeError):
         return {}
-    found = (re.match(r"\s+(\w+)\s*:[^#]*#\s*(.*)", line) for line in lines)
-    return {match[1]: match[2] for match in found if match}
+    found: dict[str, str] = {}
+    above: list[str] = []
+    for line in lines:
+        if match := re.match(r"\s+#\s*(.*)", line):
+            above.append(match[1])
+        elif match := re.match(r"\s+(\w+)\s*:[^#]*(?:#\s*(.*))?$", line):
+            found[match[1]] = match[2] or " ".join(above)
+            above = []
+        else:
+            above = []
+    return found
 
 
-_NO = object()
-_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # YAML 1.1 takes 1e-3 for text, and nobody else does
+# ---- kinds of params
 
 
-def _fit(value: Any, wanted: Any, where: str) -> Any:
-    """Return ``value`` as what is wanted, or `_NO`; a mapping fills a dataclass, which raises as `filled` does."""
-    origin = get_origin(wanted)
-    if origin in (typing.Union, types.UnionType):
-        return next((fit for kind in get_args(wanted) if (fit := _fit(value, kind, where)) is not _NO), _NO)
-    if origin is typing.Literal:  # 1, 1.0 and True are equal, and three values in a key
-        return next((one for one in get_args(wanted) if one == value and type(one) is type(value)), _NO)
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            return _NO
-        fits = [_fit(item, get_args(wanted)[0], f"{where} {row}") for row, item in enumerate(value, start=1)]
-        return _NO if any(fit is _NO for fit in fits) else tuple(fits)
-    if dataclasses.is_dataclass(wanted):
-        if isinstance(value, Mapping):
-            return filled(typing.cast(type, wanted), value, where, "key")
-        return value if isinstance(value, typing.cast(type, wanted)) else _NO
-    if wanted is float and isinstance(value, str) and _EXPONENT.fullmatch(value):
-        value = float(value)
-    if wanted is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value) + 0.0 if abs(value) <= sys.float_info.max else _NO  # NaN is none; -0.0 becomes 0.0
-    if wanted is str and isinstance(value, str) and not _encodes(value):
-        return _NO
-    if wanted is type(None):
-        return value if value is None else _NO
-    right = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
-    return value if right else _NO
+def _chosen(stage: Stage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
+    """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
+    if any(given.key == tag(stage) for given in late):
+        return _named(stage, late)
+    kind = _named(stage, early)
+    if preset is None or preset in _presets(kind):
+        return kind
+    return next((other for other in kinds(stage) if preset in _presets(other)), kind)
 
 
-def _encodes(text: str) -> bool:
-    """Return whether text is Unicode: of other bytes on the command line halves of characters are made."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+def _named(stage: Stage, given: Sequence[_Given]) -> Kind:
+    """Return the kind that the last tag among ``given`` names, or the default one. Raises `UsageError` for none."""
+    name, found = tag(stage), kinds(stage)[0]
+    for one in given:
+        if one.key == name:
+            value = fields_of.check(one.value, fields(stage)[name], one.name, one.place)
+            found = next(kind for kind in kinds(stage) if value in get_args(fields_of.hints(kind)[name]))
+    return found
 
 
-def _name(wanted: Any) -> str:
-    if get_origin(wanted) is typing.Literal:
-        return "one of " + ", ".join(map(str, get_args(wanted)))
-    kinds = [kind for kind in get_args(wanted) if kind is not type(None)]
-    if get_origin(wanted) in (typing.Union, types.UnionType) and len(kinds) == 1:
-        return _name(kinds[0])
-    if get_origin(wanted) is tuple:
-        return f"list, each {_name(kinds[0])}"
-    if dataclasses.is_dataclass(wanted):
-        return f"table of {', '.join(field.name for field in dataclasses.fields(wanted))}"
-    names = {float: "number", int: "whole number", str: "text", bool: "true or false"}
-    return names.get(wanted, str(wanted))
+def _holds(kind: Kind, name: str | None, values: Mapping[str, Any]) -> bool:
+    return name is None or values.get(name) in get_args(fields_of.hints(kind)[name])
+
+
+def _checked(stage: Stage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
+    """Return a value as the field of ``kind`` has it."""
+    known, name = fields_of.hints(kind), tag(stage)
+    subject = given.name if given.option else f"{given.place}: {given.key}"
+    current = before.get(name, kind.__dataclass_fields__[name].default) if name else None
+    if given.key in known:
+        wanted = known[given.key]
+        if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
+            told = f"with {name} {current} it must be {fields_of.describe(wanted)}"
+            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {told}.")
+        return fields_of.check(given.value, wanted, given.name, given.place)
+    owners = having(stage, given.key)
+    raise UsageError(
+        f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "
+        f"Leave it out, or set {name} to {_or(owners)}."
+    )
+
+
+def _or(names: Sequence[str]) -> str:
+    return "".join(names) if len(names) < 2 else f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+@functools.cache
+def _fields(several: tuple[Kind, ...]) -> Mapping[str, Any]:
+    found: dict[str, list[Any]] = {}
+    for kind in several:
+        for name, wanted in fields_of.hints(kind).items():
+            if wanted not in found.setdefault(name, []):
+                found[name].append(wanted)
+    return {name: _joined(wanted) for name, wanted in found.items()}
+
+
+def _joined(several: Sequence[Any]) -> Any:
+    """Return one annotation that allows what any of several does."""
+    if all(get_origin(one) is Literal for one in several):
+        return Literal[tuple(dict.fromkeys(choice for one in several for choice in get_args(one)))]
+    return several[0] if len(several) == 1 else typing.Union[tuple(several)]  # noqa: UP007
+
+
+def _presets(kind: Kind) -> Mapping[str, Mapping[str, Any]]:
+    found: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
+    return found
+
+
+# ---- where values come from
+
+
+def _from_preset(name: str, stage: Stage, kind: Kind, preset: str) -> list[_Given]:
+    there = _presets(kind)
+    if preset not in presets(stage):
+        have = f"it has {', '.join(presets(stage))}" if presets(stage) else "it has none"
+        raise UsageError(f"There is no preset {preset} for {name}; {have}.")
+    if preset not in there:
+        choices = _or(list(map(str, get_args(fields_of.hints(kind).get(tag(stage) or "")))))
+        have = f"it has {', '.join(there)}" if there else "it has none"
+        raise UsageError(f"There is no preset {preset} for the {tag(stage)} {choices} of {name}; {have}.")
+    return [_Given(f"preset {preset} of {name}", key, value) for key, value in there[preset].items()]
+
+
+def _from_set(name: str, text: str) -> _Given:
+    key, _, value = text.partition("=")
+    return _Given(f"--set {text}", key.removeprefix(f"{name}."), _parse(value))
 
 
 def _parse(text: str) -> Any:
@@ -181,7 +283,12 @@ def _parse(text: str) -> Any:
         return text
 
 
-def _from_file(path: Path, block: str, *, required: bool) -> dict[str, Any]:
+def _from_file(path: Path, block: str, *, required: bool) -> list[_Given]:
+    where = f"{path}, block {block}"
+    return [_Given(where, key, value) for key, value in _block(path, block, required=required).items()]
+
+
+def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
     try:
         found = yaml_text.load(regular.content(path)) or {}
     except FileNotFoundError:
@@ -203,13 +310,3 @@ def _from_file(path: Path, block: str, *, required: bool) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise UsageError(f"{path}: block {block} is {excerpt(found)}; it should be a mapping of params.")
     return found
-
-
-def _from_preset(name: str, stage: Stage, preset: str) -> dict[str, Any]:
-    presets = getattr(stage.params, "PRESETS", {})
-    known = dict.fromkeys([*PRESETS, *presets])
-    if preset not in known:
-        raise UsageError(f"There is no preset {preset}; there are {', '.join(known)}.")
-    return {
-        key: check(stage, key, value, f"preset {preset} of {name}") for key, value in presets.get(preset, {}).items()
-    }

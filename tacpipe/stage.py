@@ -1,6 +1,7 @@
 """What a stage is: a typed function whose signature is its declaration.
 
-The first parameter is ``params``, a frozen dataclass. Each further one says by its annotation what the stage reads:
+The first parameter is ``params``, a frozen dataclass or a union of several (`tacpipe.params`). Each further one says by
+its annotation what the stage reads:
 
 ==============  ==========================================================================================
 ``Shard``       one recording at a time; the stage is run, keyed and stored for each recording alone
@@ -107,12 +108,10 @@ class Stage:
         return str(inspect.signature(self.function).parameters[name].annotation).strip("'\"").endswith(" | None")
 
     @property
-    def params(self) -> type[Any]:
-        """The dataclass of the first argument."""
+    def params(self) -> Any:
+        """The dataclass of the first argument, or a union of dataclasses; `tacpipe.params.kinds` gives each of them."""
         name = next(iter(inspect.signature(self.function).parameters.values())).annotation
-        found = self.function.__globals__[name] if isinstance(name, str) else name
-        assert isinstance(found, type)
-        return found
+        return self.function.__globals__[name] if isinstance(name, str) else name
 
     @property
     def reads_model(self) -> bool:

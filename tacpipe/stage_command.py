@@ -7,12 +7,14 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import typer
 
+from tacpipe import fields as fields_of
 from tacpipe import params as params_of
 from tacpipe import pipeline, progress, registry
+from tacpipe.constraints import NonNegativeInt
 from tacpipe.errors import FAILED
 from tacpipe.request import Request
 from tacpipe.stage import Stage
@@ -42,6 +44,7 @@ _BEFORE = {
     "train": "latents",
     "evaluate": "latents",
 }
+_CHECKED = {"jobs": NonNegativeInt, "fold": NonNegativeInt | None, "role": Literal["train", "val", "test"] | None}
 
 
 def add(program: typer.Typer, name: str, command: str) -> None:
@@ -60,6 +63,8 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 
 def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) -> None:
     progress.set_quiet(given["quiet"])
+    for flag, kind in _CHECKED.items():
+        fields_of.check(given.get(flag), kind, f"--{flag}")
     params = params_of.build(
         name,
         stage,
@@ -67,7 +72,7 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         block=given["block"],
         preset=given["preset"],
         sets=given["set_"] or (),
-        options={field: given[field] for field in named},
+        options={field: _parsed(given[field], params_of.fields(stage)[field]) for field in named},
     )
     if given["print_params"]:
         print(json.dumps(params_of.to_json(params), indent=1))
@@ -161,19 +166,21 @@ def _shared(stage: Stage) -> list[inspect.Parameter]:
 def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
     found = []
-    for name, kind in fields.items():
+    for name, wanted in fields.items():
+        kind = fields_of.bare(wanted)
         many = get_origin(kind) is tuple
         flag = f"--{name.replace('_', '-')}"
         flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
-        annotation = list[kind.__args__[0]] | None if many else kind | None  # type: ignore[name-defined]
-        default = _default(stage, name)
-        text = f"{helps.get(name, '')} [{default}]".strip()
-        found.append(_parameter(name, annotation, typer.Option(None, *flags, help=text, show_default=False)))
+        annotation = bool | None if kind is bool else list[str] | None if many else str | None  # parsed as --set is
+        text = _about(stage, name, helps.get(name, ""))
+        metavar = None if kind is bool else _metavar(wanted)
+        option = typer.Option(None, *flags, help=text, show_default=False, metavar=metavar)
+        found.append(_parameter(name, annotation, option))
     more: list[tuple[str, Any, Any]] = [
         (
             "preset",
             str | None,
-            typer.Option(None, "--preset", help="paper, quick, or a stage's own; without one, the best we know."),
+            typer.Option(None, "--preset", help=f"Preset of params: {', '.join(params_of.presets(stage)) or 'none'}."),
         ),
         (
             "params_file",
@@ -207,9 +214,32 @@ def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
     return [*found, *(_parameter(*item) for item in more)]
 
 
-def _default(stage: Stage, name: str) -> str:
-    field = stage.params.__dataclass_fields__[name]
-    return str(field.default)
+def _parsed(given: Any, wanted: Any) -> Any:
+    """Return what was given for an option, as its annotation has it where that is possible."""
+    if isinstance(given, list):
+        return [fields_of.parsed(text, get_args(fields_of.bare(wanted))[0]) for text in given]
+    return fields_of.parsed(given, wanted) if isinstance(given, str) else given
+
+
+def _about(stage: Stage, name: str, comment: str) -> str:
+    """Return the help of an option: its comment, what it may be, which choices have it, and its default."""
+    wanted = params_of.fields(stage)[name]
+    told = [comment] if comment else []
+    if fields_of.constraints(wanted):
+        told.append(fields_of.describe(wanted))
+    if owners := params_of.having(stage, name):
+        told.append(f"only with {params_of.tag(stage)} {', '.join(owners)}")
+    return f"{'; '.join(told)} [{' or '.join(map(str, params_of.defaults(stage, name)))}]".strip()
+
+
+def _metavar(wanted: Any) -> str:
+    """Return what stands for an option's value in its help: the choices, or the type."""
+    kind = fields_of.bare(wanted)
+    if get_origin(kind) is tuple:
+        return f"{_metavar(get_args(kind)[0])}..."
+    if get_origin(kind) is Literal:
+        return f"[{'|'.join(map(str, get_args(kind)))}]"
+    return {int: "INTEGER", float: "NUMBER"}.get(kind, "TEXT")
 
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:

@@ -239,14 +239,14 @@ def test_minus_zero_is_zero() -> None:
 
 @pytest.mark.parametrize("value", [True, 1.0])
 def test_a_choice_among_whole_numbers_is_that_number_and_nothing_that_equals_it(value: object) -> None:
-    with pytest.raises(UsageError, match=r"order is .*, which is no one of 1, 2"):
+    with pytest.raises(UsageError, match=r"order is .*; it must be one of 1, 2"):
         built(order=value)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), pytest.param(1 << 20_000, id="huge")])
 @pytest.mark.parametrize("name", ["rate_hz", "cutoff_hz", "gains"])
 def test_a_number_that_is_none_is_refused_with_the_name_of_its_param(name: str, value: float) -> None:
-    with pytest.raises(UsageError, match=name) as caught:
+    with pytest.raises(UsageError, match=name.replace("_", "-")) as caught:
         built(**{name: [1.0, value] if name == "gains" else value})
     assert caught.value.exit_code == 2 and len(str(caught.value)) < 500
 

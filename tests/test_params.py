@@ -58,8 +58,8 @@ def test_a_whole_number_is_a_number_and_keys_do_not_tell_them_apart(file: Path) 
     ("text", "sentence"),
     [
         ("cut: {rate: 100}", "no param rate; there are rate_hz, frames"),
-        ("cut: {frames: 1.5}", "frames is 1.5, which is no whole number"),
-        ("cut: {frames: true}", "frames is True, which is no whole number"),
+        ("cut: {frames: 1.5}", "frames is 1.5; it must be a whole number"),
+        ("cut: {frames: true}", "frames is True; it must be a whole number"),
         ("cut: {frames: many}", "frames is 'many'"),
         ("cut: {grid: hexagonal}", "one of uniform, logged"),
         ("cut: {sensors: 1}", "sensors is 1"),
@@ -122,11 +122,11 @@ def test_tables_fill_the_dataclasses_that_stand_for_them() -> None:
     ("values", "sentence"),
     [
         ({"parts": [{"name": "a"}, {"nam": "b"}]}, r"box, parts 2: there is no key nam; there are name, size\."),
-        ({"parts": [{"name": 1}]}, r"box, parts 1: name is 1, which is no text\."),
+        ({"parts": [{"name": 1}]}, r"box, parts 1: name is 1; it must be text\."),
         ({"parts": [{"size": 1}]}, r"box, parts 1: key name must be given\."),
-        ({"parts": ["a"]}, r"box: parts is \['a'\], which is no list, each table of name, size\."),
-        ({"parts": [], "lid": {"size": "big"}}, r"box, lid: size is 'big', which is no number\."),
-        ({"parts": [], "lid": 3}, r"box: lid is 3, which is no table of name, size\."),
+        ({"parts": ["a"]}, r"box: parts is \['a'\]; it must be a list, each item a table of name, size\."),
+        ({"parts": [], "lid": {"size": "big"}}, r"box, lid: size is 'big'; it must be a number\."),
+        ({"parts": [], "lid": 3}, r"box: lid is 3; it must be a table of name, size\."),
     ],
 )
 def test_what_is_wrong_in_a_table_is_told_with_the_table(values: dict[str, object], sentence: str) -> None:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Files
@@ -18,7 +19,8 @@ PREFIX = "data_sample_"
 class Params:
     """How trials are read."""
 
-    authors_role: str = ""  # part of the authors' split that this folder is: train, val or test; empty if none
+    # part of the authors' split that this folder is; empty: none
+    authors_role: Literal["", "train", "val", "test"] = ""
 
 
 def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:

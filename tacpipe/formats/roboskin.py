@@ -14,9 +14,10 @@ import re
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe import regular
+from tacpipe.constraints import PositiveFloat
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import excerpt, plain
 from tacpipe.formats.folders import walk
@@ -30,7 +31,6 @@ BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
 PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
 LARGEST = 255.0  # readings stem from eight bits, compensated for temperature
 ALONG_TIME = 0.85  # correlation of neighbours: of published slides 0.92 or more along time, 0.82 or less otherwise
-LAYOUTS = ("time", "authors")
 UNREADABLE = (
     *(OSError, ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, MemoryError, OverflowError),
     tokenize.TokenError,
@@ -45,8 +45,9 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
 class Params:
     """How slides are read."""
 
-    rate_hz: float = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
-    layout: str = "time"  # time: frames as they were felt; authors: mixed as they were published, to compare with
+    rate_hz: PositiveFloat = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
+    # time: frames in order of time; authors: in the order in which they were published, to compare with
+    layout: Literal["time", "authors"] = "time"
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
@@ -88,14 +89,12 @@ def roboskin(params: Params, files: Files) -> Recording:
     from tacpipe.signals.resampling import uniform_grid
     from tacpipe.signals.scrambling import scramble
 
-    if params.layout not in LAYOUTS:
-        raise TacpipeError(f"layout is {params.layout!r}; it must be {' or '.join(LAYOUTS)}.")
     (block, place), (labels, _) = sorted((path, _place(name)) for name, path in files.items())
     slide = _felt(block, place)  # (triangle, taxel, time)
     if params.layout == "authors":
         slide = scramble(slide)
     frames = slide.shape[-1]
-    t_ns = uniform_grid(0, round((frames - 1) * 1e9 / params.rate_hz) if params.rate_hz > 0 else 0, params.rate_hz)
+    t_ns = uniform_grid(0, round((frames - 1) * 1e9 / params.rate_hz), params.rate_hz)
     columns = np.reshape(slide, (-1, frames))
     material = _label(block, labels, place) + 1
     return Recording(

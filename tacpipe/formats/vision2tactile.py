@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe import regular
+from tacpipe.constraints import NonNegativeFloat
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import plain
 from tacpipe.formats.folders import require, valid, walk
@@ -38,7 +39,7 @@ POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the 
 class Params:
     """What counts as a grasp of the cloud."""
 
-    beside_mm: float = 20.0  # millimetres that a grasp point may lie from the nearest point of the cloud
+    beside_mm: NonNegativeFloat = 20.0  # millimetres that a grasp point may lie from the nearest point of the cloud
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:

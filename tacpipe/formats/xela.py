@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import excerpt
 from tacpipe.formats import channels
-from tacpipe.stage import ROLES, Attribute
+from tacpipe.stage import Attribute
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -140,7 +140,5 @@ def tactile_streams(
 
 
 def authors_role(role: str) -> dict[str, Attribute]:
-    """Return the attribute of the authors' part that a folder is, or none. Raises `TacpipeError` for another word."""
-    if role and role not in ROLES:
-        raise TacpipeError(f"authors_role is {role!r}; it must be {', '.join(ROLES)}, or empty where there is none.")
+    """Return the attribute of the authors' part that a folder is, or none where ``role`` is empty."""
     return {"authors_role": role} if role else {}

@@ -11,11 +11,12 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast
 from tacpipe.models.recurrent_forward import RecurrentForward
-from tacpipe.models.taxelwise import TaxelwiseForecast
+from tacpipe.models.taxelwise import TaxelwiseForecast, grid
 from tacpipe.models.windows import POSE, Windows
 
-ARCHITECTURES = ("taxelwise", *CELLS, "recurrent")
-LOSSES = ("absolute", "huber", "squared")
+AUTO, TAXELWISE, RECURRENT = "auto", "taxelwise", "recurrent"
+ELSE = "gru"  # what auto is where the taxelwise model cannot read what there is
+ARCHITECTURES = (TAXELWISE, *CELLS, RECURRENT)
 Layout = Sequence[Mapping[str, str]]
 
 
@@ -64,18 +65,14 @@ class RecurrentForecast(nn.Module):
 def build(params: Mapping[str, Any], features: int, layout: Layout, *, changes: bool) -> nn.Module:
     """Return a forecaster of random weights for ``features`` latents or channels.
 
-    ``params`` has architecture, hidden, dropout, loss, context and horizon; ``layout`` says where each channel sits;
-    ``changes`` that features are increments already. Raises `TacpipeError` for a name that is unknown or a
-    representation that an architecture cannot read.
+    ``params`` has architecture, hidden, context and horizon, and but for the recurrent model dropout and loss;
+    ``layout`` says where each channel sits; ``changes`` that features are increments already. Raises `TacpipeError` for
+    an architecture that is unknown and for a representation that it cannot read.
     """
-    architecture, loss = params["architecture"], params["loss"]
+    architecture = params["architecture"]
     if architecture not in ARCHITECTURES:
         raise TacpipeError(f"There is no architecture {architecture!r}; there are {', '.join(ARCHITECTURES)}.")
-    if loss not in LOSSES:
-        raise TacpipeError(f"There is no loss {loss!r}; there are {', '.join(LOSSES)}.")
-    if architecture == "recurrent":
-        if loss != "squared":
-            raise TacpipeError(f"The recurrent model minimises the squared error, not {loss}. Give --loss squared.")
+    if architecture == RECURRENT:
         return RecurrentForecast(features, params["hidden"])
     sizes = {name: params[name] for name in ("hidden", "dropout", "loss", "context", "horizon")}
     if architecture in CELLS:
@@ -83,4 +80,37 @@ def build(params: Mapping[str, Any], features: int, layout: Layout, *, changes: 
     return TaxelwiseForecast(layout, **sizes)
 
 
-__all__ = ["ARCHITECTURES", "LOSSES", "ChangeForecast", "RecurrentForecast", "build"]
+def resolved_loss(loss: str, *, changes: bool) -> str:
+    """Return the loss that ``auto`` is; ``changes`` says that features are increments already.
+
+    Where a sensor repeats samples most increments are 0, and so is their median, which is all that the absolute error
+    teaches.
+
+    >>> resolved_loss("auto", changes=True), resolved_loss("auto", changes=False), resolved_loss("squared", changes=True)
+    ('huber', 'absolute', 'squared')
+    """
+    if loss != AUTO:
+        return loss
+    return "huber" if changes else "absolute"
+
+
+def resolved(architecture: str, layout: Layout) -> str:
+    """Return the architecture that ``auto`` is for channels that lie like ``layout``, empty for latents; others as they are.
+
+    Raises `TacpipeError` for one that cannot read them.
+
+    >>> resolved("auto", ()), resolved("tcn", ())
+    ('gru', 'tcn')
+    """
+    if architecture not in (AUTO, TAXELWISE):
+        return architecture
+    try:
+        grid(layout)
+    except TacpipeError:
+        if architecture == AUTO:
+            return ELSE
+        raise
+    return TAXELWISE
+
+
+__all__ = ["ARCHITECTURES", "AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolved", "resolved_loss"]

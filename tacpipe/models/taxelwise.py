@@ -126,8 +126,9 @@ def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
     names = list(dict.fromkeys(taxel for _, taxel, _ in places))
     wanted = [(stream, taxel, axis) for stream in streams for taxel in names for axis in axes]
     if None in names or places != wanted or taxels < 2:
+        held = f"these {len(layout)} do not" if layout else "the recordings hold latents"
         raise TacpipeError(
-            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel; these {len(layout)} "
-            f"do not. Train it on segments without a codec, or choose --architecture gru."
+            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel; {held}. "
+            f"Train it on segments without a codec, or choose --architecture gru, lstm, tcn or recurrent."
         )
     return len(streams), taxels, len(axes)

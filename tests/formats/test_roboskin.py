@@ -176,14 +176,6 @@ def test_blocks_are_found_at_any_depth_and_copies_below_them_are_passed_over(tmp
     }
 
 
-def test_unknown_layouts_and_rates_are_refused(tmp_path: Path) -> None:
-    write_roboskin(tmp_path, felt(1))
-    with pytest.raises(TacpipeError, match="layout is 'mixed'; it must be time or authors"):
-        read(tmp_path, Params(layout="mixed"))
-    with pytest.raises(TacpipeError, match="A rate of 0"):
-        read(tmp_path, Params(rate_hz=0.0))
-
-
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "roboskin_slide_20_50").is_dir(), reason="the published recordings are not here")
 def test_each_published_slide_is_unscrambled_as_the_formula_says() -> None:

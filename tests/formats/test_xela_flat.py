@@ -167,11 +167,6 @@ def test_more_robot_rows_than_tactile_ones_are_refused(flat_trial: Trial) -> Non
         read(folder)
 
 
-def test_an_unknown_part_of_the_authors_split_is_refused(flat_trial: Trial) -> None:
-    with pytest.raises(TacpipeError, match="authors_role is 'unseen'"):
-        read(flat_trial(), Params(authors_role="unseen"))
-
-
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
 def test_the_published_trials_are_read_as_they_were_counted() -> None:

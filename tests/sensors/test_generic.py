@@ -240,13 +240,13 @@ N = {"name": "n", "type": "u8"}
         ({"numbers": [V], "marker": ""}, "nothing tells where a frame begins; give marker or tail"),
         ({"numbers": []}, "no number is a channel; list in numbers what the board measures"),
         ({"numbers": [N], "sequence": {"number": "n"}}, "no number is a channel"),
-        ({"numbers": [{"name": "v", "type": "u12"}]}, "rig, numbers 1: type is 'u12', which is no one of u8, i8"),
+        ({"numbers": [{"name": "v", "type": "u12"}]}, "rig, numbers 1: type is 'u12'; it must be one of u8, i8"),
         ({"numbers": [V, {"type": "u8"}]}, "rig, numbers 2: key name must be given"),
         (
             {"numbers": [V, {"name": "x", "kind": "u8"}]},
             "rig, numbers 2: there is no key kind; there are name, type, count",
         ),
-        ({"numbers": {"name": "v"}}, "rig: numbers is .*, which is no list, each table of name, type"),
+        ({"numbers": {"name": "v"}}, "rig: numbers is .*; it must be a list, each item a table of name, type"),
         ({"numbers": [V, V]}, "two numbers are named v; names must be unique"),
         (
             {"numbers": [{**V, "count": 2}, {"name": "v01", "type": "u8"}]},
@@ -280,7 +280,7 @@ N = {"name": "n", "type": "u8"}
         ({"numbers": [V, N], "clock": {"number": "n"}}, "rig, clock: key unit must be given"),
         (
             {"numbers": [V, N], "clock": {"number": "n", "unit": "min"}},
-            "rig, clock: unit is 'min', which is no one of ns, us",
+            "rig, clock: unit is 'min'; it must be one of ns, us",
         ),
         (
             {"numbers": [V, N], "clock": {"number": "n", "unit": "s"}, "sequence": {"number": "n"}},
@@ -288,7 +288,7 @@ N = {"name": "n", "type": "u8"}
         ),
         (
             {"numbers": [V, N], "sum": {"kind": "md5", "number": "n"}},
-            "rig, sum: kind is 'md5', which is no one of sum8, lrc",
+            "rig, sum: kind is 'md5'; it must be one of sum8, lrc",
         ),
         (
             {"numbers": [V, N], "sum": {"kind": "sum16", "number": "n"}},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tacpipe import biotac_sp, registry
+from tacpipe import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation.grasp_scene import Rig
 from tacpipe.tasks import touch
+from tests.asked import fitting
 from tests.simulation.grasp_datasets import grasps, readings
 
 POINTNET = {
@@ -33,7 +33,7 @@ Metrics = dict[str, Any]
 
 
 def trained(training: Any, workspace: Path, **changed: Any) -> dict[str, bytes]:
-    params = {**asdict(registry.load("train.touch").params()), "trees": 60, **changed}
+    params = fitting("train.touch", {"trees": 60}, **changed)
     return touch.train(params, training, None, workspace)
 
 
@@ -107,7 +107,7 @@ def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
         training, tested = (type(made)({name: made.shards[name] for name in part}, {}) for part in _parted(names, fold))
         errors = [
             judged(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
-            for inputs in ("xyzcont", "rgbcont")
+            for inputs in ("xyz", "rgb")
         ]
         for target, gain in gains.items():
             gain.append(errors[0][target] - errors[1][target])

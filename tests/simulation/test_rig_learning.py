@@ -23,6 +23,7 @@ from tacpipe.tasks import forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, told
+from tests.asked import fitting
 from tests.stages.conftest import FakeShard as Shard
 from tests.stages.learning_fakes import FakeShard, dataset
 
@@ -65,8 +66,8 @@ def trials(indices: range, **rig: Any) -> list[FakeShard]:
 
 
 def trained(folder: Path, training: list[FakeShard], watched: list[FakeShard], **params: Any) -> Forecaster:
-    asked = dataclasses.asdict(load("train.forward").params(**{**SMALL, **params}))
-    return Forecaster.load(forward.train(asked, dataset(*training), dataset(*watched), folder))
+    given = fitting("train.forward", SMALL, **params)
+    return Forecaster.load(forward.train(given, dataset(*training), dataset(*watched), folder))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ Slides of one material are alike in what is wrong with them, so certainty is cou
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from functools import cache
 from itertools import product
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from tacpipe.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
 from tacpipe.tasks import material
+from tests.asked import fitting
 from tests.stages.conftest import FakeShard
 from tests.tasks.material.textures import Slide, dataset
 
@@ -53,8 +53,8 @@ def named(spectra: str) -> dict[str, NDArray[np.float64]]:
     found: dict[str, list[float]] = {"every": [], "among": []}
     for seed, held in product(SEEDS, HELD):
         hold_out = "roboskin=" + ",".join(map(str, held))
-        asked = load("train.material").params(architecture="spectra", hold_out=hold_out, baselines=False)
-        files = material.train(dataclasses.asdict(asked), dataset(*slides(seed, KNOWN, spectra)), None, Path())
+        params = fitting("train.material", {}, architecture="spectra", hold_out=hold_out, baselines=False)
+        files = material.train(params, dataset(*slides(seed, KNOWN, spectra)), None, Path())
         for number in held:
             new = [one for one in slides(seed, NEW, spectra) if one.attributes["material"] == number]
             zero: dict[str, Any] = json.loads(material.evaluate(files, dataset(*new)).files["metrics.json"])[
@@ -86,8 +86,8 @@ def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> Non
 
 @pytest.mark.parametrize("spectra", SPECTRA)
 def test_each_sensor_names_what_it_was_told_whatever_the_other_feels(spectra: str) -> None:
-    asked = load("train.material").params(architecture="spectra", baselines=False)
-    files = material.train(dataclasses.asdict(asked), dataset(*slides(0, KNOWN, spectra)), None, Path())
+    params = fitting("train.material", {}, architecture="spectra", baselines=False)
+    files = material.train(params, dataset(*slides(0, KNOWN, spectra)), None, Path())
     metrics = json.loads(material.evaluate(files, dataset(*slides(0, NEW, spectra))).files["metrics.json"])
     assert metrics["model"]["accuracy"]["biotac"] >= 0.95
     assert metrics["model"]["accuracy"]["roboskin"] >= 0.8

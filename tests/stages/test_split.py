@@ -11,6 +11,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.registry import load
+from tests.asked import asked
 
 split = load("split")
 Shard = Callable[..., Any]
@@ -26,7 +27,7 @@ def dataset(shard: Shard, count: int) -> FakeDataset:
 
 
 def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Shard) -> None:
-    result = split(split.params(scheme="leave-one-out"), dataset(shard, 12))
+    result = split(asked("split", scheme="leave-one-out"), dataset(shard, 12))
     assert set(result.recordings) == {"split"}
     table = result.recordings["split"].tables
     assert table.schema == pa.schema([("recording", pa.string()), ("fold", pa.int32()), ("role", pa.string())])
@@ -35,12 +36,12 @@ def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Shard) ->
 
 
 def test_the_same_params_give_the_same_table(shard: Shard) -> None:
-    tables = [split(split.params(seed=3), dataset(shard, 20)).recordings["split"].tables for _ in range(2)]
+    tables = [split(asked("split", seed=3), dataset(shard, 20)).recordings["split"].tables for _ in range(2)]
     assert tables[0].equals(tables[1])
 
 
 def test_every_param_reaches_the_scheme(shard: Shard) -> None:
-    params = split.params(scheme="kfold", folds=2, val=0.25, seed=5, stratify="object", apart="object")
+    params = asked("split", scheme="kfold", folds=2, val=0.25, seed=5, stratify="object", apart="object")
     rows = split(params, dataset(shard, 16)).recordings["split"].tables.to_pylist()
     objects = {f"t{i:02d}": i % 4 for i in range(16)}
     for fold in (0, 1):
@@ -50,12 +51,12 @@ def test_every_param_reaches_the_scheme(shard: Shard) -> None:
 
 def test_a_missing_attribute_is_an_error_sentence(shard: Shard) -> None:
     with pytest.raises(TacpipeError, match="has no attribute authors_role"):
-        split(split.params(scheme="authors"), dataset(shard, 3))
+        split(asked("split", scheme="authors"), dataset(shard, 3))
 
 
 def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -> None:
     given = dataset(shard, 16)
-    few = split.params(test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
+    few = asked("split", test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
     rows = split(few, given).recordings["split"].tables.to_pylist()
     assert {row["fold"] for row in rows} == {0, 1}
     for fold in (0, 1):
@@ -63,6 +64,6 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -
         assert of_two.count("train") == 1
         assert "unused" in of_two
         assert not any(row["role"] == "unused" for row in rows if int(row["recording"][1:]) % 4 != 2)
-    blocked = split.params(scheme="blocked", test=0.25, val=0.0, reverse=True)
+    blocked = asked("split", scheme="blocked", test=0.25, val=0.0, reverse=True)
     rows = split(blocked, given).recordings["split"].tables.to_pylist()
     assert [row["recording"] for row in rows if row["role"] == "test"] == ["t00", "t01", "t02", "t03"]

@@ -286,8 +286,6 @@ def test_time_that_runs_backwards_is_named_with_stream_and_row(shard: Shard) -> 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"grid": "even"}, "no grid 'even'; it must be uniform, logged or fresh"),
-        ({"clock": "sun"}, "no clock 'sun'; it must be auto, device or arrival"),
         ({"clock": "device"}, "stream 'robot' has no column t_device_ns"),
         ({"master": "camera"}, "no stream 'camera' to be master; it has robot, xela1"),
         ({"rate_hz": 0.0}, "gives no grid"),

@@ -9,6 +9,7 @@ import pytest
 
 from tacpipe import registry
 from tacpipe.dataset import Dataset
+from tests.asked import asked
 from tests.stages.learning_fakes import dataset, motion
 from tests.tasks.forward.trials import SMALL, compressed
 
@@ -17,7 +18,7 @@ STAGE = registry.load("train.forward")
 
 def test_a_model_holds_all_that_it_needs_to_be_used(tmp_path: Path) -> None:
     training = compressed(*(motion(seed) for seed in range(3)))
-    params = STAGE.params(**SMALL)
+    params = asked("train.forward", **SMALL)
     files = STAGE(params, training, compressed(motion(9), files=training.files), tmp_path).files
     assert set(files) == {
         *("model.safetensors", "baselines.safetensors", "config.json", "history.jsonl"),
@@ -32,7 +33,7 @@ def test_a_model_holds_all_that_it_needs_to_be_used(tmp_path: Path) -> None:
 
 def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
     training, watched = dataset(*(motion(seed) for seed in range(2))), dataset(motion(9))
-    params = STAGE.params(**{**SMALL, "epochs": 1})
+    params = asked("train.forward", **{**SMALL, "epochs": 1})
     init: Dataset = dataset(files=STAGE(params, training, watched, tmp_path / "a").files)
     tuned = STAGE(params, training, watched, tmp_path / "b", init).files
     first, second = (json.loads(one["history.jsonl"])["val_loss"] for one in (init.files, tuned))
@@ -41,8 +42,7 @@ def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("preset", ["paper", "quick"])
 def test_presets_name_params_that_exist_and_train(preset: str, tmp_path: Path) -> None:
-    changed = STAGE.params.PRESETS[preset]
-    params = STAGE.params(**{**changed, "hidden": 8, "epochs": 1})
+    params = asked("train.forward", preset, hidden=8, epochs=1)
     files = STAGE(params, dataset(motion(0)), dataset(motion(9)), tmp_path).files
     config = json.loads(files["config.json"])
     assert config["architecture"] == {"paper": "recurrent", "quick": "taxelwise"}[preset]

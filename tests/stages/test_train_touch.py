@@ -14,15 +14,16 @@ from tacpipe import registry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
+from tests.asked import asked
 from tests.conftest import Lab
-from tests.tasks.touch.handmade import SMALL, dataset, recordings
+from tests.tasks.touch.handmade import dataset, recordings
 
 STAGE = registry.load("train.touch")
 TREES = "--architecture trees --trees 5 --leaf 2"
 
 
 def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
-    params = STAGE.params(**SMALL, setting="blocked")
+    params = asked("train.touch", trees=6, leaf=2, setting="blocked")
     files = STAGE(params, recordings(), dataset(), tmp_path).files
     assert set(files) == {"config.json", "model.safetensors", "baselines.safetensors"}
     config = json.loads(files["config.json"])
@@ -32,8 +33,8 @@ def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("preset", "architecture"), [("paper", "pointnet"), ("quick", "strong")])
 def test_presets_name_params_that_exist_and_train(preset: str, architecture: str, tmp_path: Path) -> None:
-    small = {"epochs": 1, "points": 20, "trees": 5, "leaf": 2, "hidden": 8, "targets": "pdc_th,e_mf", "head": "fc1"}
-    params = STAGE.params(**{**STAGE.params.PRESETS[preset], **small})
+    small = {"paper": {"epochs": 1, "points": 20, "head": "fc1"}, "quick": {"trees": 5, "leaf": 2}}[preset]
+    params = asked("train.touch", preset, targets="pdc_th,e_mf", **small)
     files = STAGE(params, recordings(), recordings(6, 1), tmp_path).files
     config = json.loads(files["config.json"])
     assert config["architecture"] == architecture
@@ -49,7 +50,7 @@ def test_presets_name_params_that_exist_and_train(preset: str, architecture: str
 
 
 def test_the_papers_preset_is_what_the_letter_says() -> None:
-    params = STAGE.params(**STAGE.params.PRESETS["paper"])
+    params = asked("train.touch", "paper")
     assert (params.points, params.batch, params.epochs, params.learning_rate) == (750, 10, 250, 0.01)
     assert (params.normalisation, params.head, params.loss, params.together) == ("minmax", "fc3", "rmse", False)
     assert (params.cycle, params.weight_decay, params.patience, params.select) == (False, 0, 0, "last")
@@ -84,7 +85,7 @@ def _refuses(lab: Lab) -> None:
         ("--architecture tree", 2, "architecture is 'tree'; it must be one of strong"),
         ("--targets thumb", 2, "targets is 'thumb'"),
         ("--leaf -1", 2, "leaf is -1"),
-        (f"{TREES} --select best --architecture patches", 1, "No recording has the role val"),
+        ("--select best --architecture patches", 1, "No recording has the role val"),
         ("--architecture pointnet --points 100000", 1, "points, and 100000 are to be drawn"),
     ):
         ran = lab.call(f"train touch grasps --split split -o other {words}")

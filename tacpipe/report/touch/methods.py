@@ -185,7 +185,7 @@ def _settings(run: Run) -> dict[str, Any]:
         params["colour"] = str(params.pop("inputs", "")).startswith("rgb")
     if not str(params.get("inputs", "")).endswith("pose") and params.get("normalisation") != "wrist":
         params.pop("wrist", None)  # nothing reads it
-    if not params.get("together"):
+    if not params.get("together", True):  # trees are one model of all targets
         params.pop("targets", None)  # one network a target: others beside it change nothing
     return {**params, "architecture": run.architecture, "split": run.split, "simulated": run.simulated}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -224,9 +224,12 @@ class Forecaster:
 
 def network(params: Mapping[str, Any], codec: codecs.Codec) -> nn.Module:
     """Return the network that ``params`` ask for, of random weights, for the codec's features."""
-    return forecasts.build(
-        params, len(codec.latents), codec.layout if codec.kind == "raw" else (), changes=codec.of == INCREMENTS
-    )
+    return forecasts.build(params, len(codec.latents), layout(codec), changes=codec.of == INCREMENTS)
+
+
+def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:
+    """Return where each raw channel lies; nothing of latents."""
+    return codec.layout if codec.kind == "raw" else ()
 
 
 def _begins(touch: Floats) -> NDArray[np.bool_]:

@@ -16,12 +16,14 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.codecs import codec as codecs
+from tacpipe.codecs.stretches import INCREMENTS
 from tacpipe.errors import TacpipeError
+from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.alarms import Loads
-from tacpipe.tasks.forward.forecaster import BASELINES, CONFIG, TASK, WEIGHTS, Config, Forecaster, network
+from tacpipe.tasks.forward.forecaster import BASELINES, CONFIG, TASK, WEIGHTS, Config, Forecaster, layout, network
 from tacpipe.tasks.forward.predictors import told
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
@@ -48,18 +50,22 @@ def train(
     """Return the files of a model trained on ``training`` and stopped by its error on ``validation``.
 
     ``params`` are those of the stage `train.forward`. Scales and baselines are fitted on the training recordings alone,
-    or scales taken over from the model ``init`` with its weights. Raises `TacpipeError` where recordings lack columns
-    or windows, and where ``init`` has another shape or codec.
+    or scales taken over from the model ``init`` with its weights. The files name what ``auto`` became.
+    Raises `TacpipeError` where recordings lack columns or windows or hold what the architecture cannot read, and where
+    ``init`` has another shape or codec.
     """
     if not training.shards:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     codec = tracks.codec_of(next(iter(training.shards.values())).table(), training.files)
+    start = Forecaster.load(init) if init else None
+    params = _resolved(params, codec, start)
+    if init and start:
+        _check_start(start, init, params, codec, training.files)
     parts = [
         [tracks.track(shard, codec) for _, shard in sorted(dataset.shards.items())]
         for dataset in (training, validation)
     ]
     rate_hz = tracks.rate_hz([one for part in parts for one in part])
-    start = _start(init, params, codec, training.files) if init else None
     reference = start.orientation if start else _reference([one.arm[one.usable, 3:7] for one in parts[0]])
     parts = [[dataclasses.replace(one, arm=tracks.aligned(one.arm, reference)) for one in part] for part in parts]
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -139,10 +145,8 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
 
 def _windows(part: Sequence[Track], params: Mapping[str, Any], stride: int, device: str) -> Rows:
     """Return the rows of a part and its windows, all or those in contact."""
-    context, horizon, chosen = params["context"], params["horizon"], params["windows"]
-    if chosen not in ("all", "contact"):
-        raise TacpipeError(f"There are no windows {chosen!r}; there are all and contact.")
-    starts = [getattr(one, "starts" if chosen == "all" else "contact_starts")(context, horizon, stride) for one in part]
+    context, horizon, where = params["context"], params["horizon"], params["windows"]
+    starts = [getattr(one, "starts" if where == "all" else "contact_starts")(context, horizon, stride) for one in part]
     return rows(part, starts, context, horizon, actions=params["actions"], device=device)
 
 
@@ -195,11 +199,28 @@ def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str,
     return seen(digests, start.config["trained_on"] if start else {})
 
 
-def _start(
-    init: Mapping[str, bytes], params: Mapping[str, Any], codec: codecs.Codec, recordings: Mapping[str, bytes]
-) -> Forecaster:
-    """Return the model to begin with. Raises `TacpipeError` where it does not fit what is to be trained."""
-    start = Forecaster.load(init)
+def _resolved(params: Mapping[str, Any], codec: codecs.Codec, start: Forecaster | None) -> dict[str, Any]:
+    """Return the params with what ``auto`` is for the representation of ``codec``."""
+    found = {**params, "architecture": forecasts.resolved(_asked(params, start), layout(codec))}
+    if "loss" in found:
+        found["loss"] = forecasts.resolved_loss(found["loss"], changes=codec.of == INCREMENTS)
+    return found
+
+
+def _asked(params: Mapping[str, Any], start: Forecaster | None) -> str:
+    """Return the architecture that is asked for; ``auto`` is that of the model to begin with, if it is one of change."""
+    asked = str(params["architecture"])
+    return str(start.config["architecture"]) if start and start.tells_change and asked == forecasts.AUTO else asked
+
+
+def _check_start(
+    start: Forecaster,
+    init: Mapping[str, bytes],
+    params: Mapping[str, Any],
+    codec: codecs.Codec,
+    recordings: Mapping[str, bytes],
+) -> None:
+    """Raise `TacpipeError` where the model to begin with does not fit what is to be trained."""
     for name in ("architecture", "hidden", "context", "horizon"):
         found = start.config["params"][name]
         if found != params[name]:
@@ -215,4 +236,3 @@ def _start(
         )
     check_codec(init, recordings)
     codecs.check_channels(start.codec.channels, codec.channels)
-    return start

@@ -104,7 +104,7 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
     predicted = {MODEL: classifier.named(told.scores)}
     if sensor in classifier.last:
         predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].tell(slides.frames).scores)
-    mapped = bool(classifier.config["params"]["known"])  # all have the known sensor's classifier already
+    mapped = bool(classifier.config["params"].get("known"))  # all have the known sensor's classifier already
     if classifier.config.get("joint") and told.latents is not None and not mapped:
         predicted[SWAPPED] = _exchanged(classifier, sensor, told.latents)
     for name, by_sensor in classifier.baselines.items():
@@ -115,7 +115,7 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
     counted = np.ones(len(slides), bool)
-    if classifier.config["params"]["drop_last"]:
+    if classifier.config["params"].get("drop_last"):
         batch = classifier.config["params"]["batch"]
         counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
     found = Judged(

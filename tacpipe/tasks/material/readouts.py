@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
 
+from tacpipe.constraints import Assignments
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
 from tacpipe.models.level import Level
@@ -25,16 +25,8 @@ Arrays = dict[str, np.ndarray]
 
 
 def rockets(config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
-    """Return the files of a model of patterns and a readout, of each sensor alone.
-
-    Raises `UsageError` where labels are to be held out.
-    """
+    """Return the files of a model of patterns and a readout, of each sensor alone."""
     params = config["params"]
-    if params["hold_out"]:
-        raise UsageError(
-            "hold_out is for networks that are learned jointly, and for spectra; patterns alone cannot name what they "
-            "never saw."
-        )
     tensors: Arrays = {}
     baselines: Arrays = {}
     for place, (name, some) in enumerate(known.items()):
@@ -95,7 +87,7 @@ def _felt(speeds: str, known: BySensor) -> dict[str, Felt]:
 
     ``speeds``, like ``biotac=0.025,roboskin=0.05``, is of sensors none of whose slides tells it.
     """
-    given = _speeds(speeds)
+    given = Assignments(float).items(speeds)
     found = {}
     for name, some in known.items():
         told = some.speeds_m_s[some.speeds_m_s > 0]
@@ -110,24 +102,6 @@ def _felt(speeds: str, known: BySensor) -> dict[str, Felt]:
             )
         speed_m_s = float(np.median(told)) if len(told) else given[name]
         found[name] = Felt(some.layout.frames, some.layout.rate_hz, speed_m_s)
-    return found
-
-
-def _speeds(given: str) -> dict[str, float]:
-    """Return metres a second by sensor.
-
-    >>> _speeds("biotac=0.025, roboskin=0.05")
-    {'biotac': 0.025, 'roboskin': 0.05}
-    """
-    found = {}
-    for part in filter(None, (part.strip() for part in given.split(","))):
-        name, _, number = part.partition("=")
-        try:
-            found[name.strip()] = float(number)
-        except ValueError:
-            found[name.strip()] = math.nan
-        if not 0 < found[name.strip()] < math.inf:
-            raise UsageError(f"speeds is {given!r}; it must be like biotac=0.025,roboskin=0.05, in metres a second.")
     return found
 
 

@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import save as save_tensors
 from torch import nn
 
+from tacpipe.constraints import Assignments, CommaList
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import headers, recurrent_autoencoder
 from tacpipe.models.level import Level
@@ -44,8 +45,9 @@ if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
 HISTORY = "history.jsonl"
-ARCHITECTURES = (ROCKET, "raec", "x-lstm", SPECTRA)
+RAEC = "raec"
 QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params do not say
+WEIGHTED = ("reconstruction", "classification", "alignment")  # losses of raec
 MAPPED_RECONSTRUCTION = 0.05  # of a network that learns to meet known latents: that of the published script
 
 Params = Mapping[str, Any]
@@ -104,20 +106,17 @@ def train(
 
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
-    """Refuse params that do not go together."""
-    if params["architecture"] not in ARCHITECTURES:
-        raise UsageError(f"There is no architecture {params['architecture']}; there are {', '.join(ARCHITECTURES)}.")
-    if params["labels"] not in ("true", "permuted"):
-        raise UsageError(f"labels is {params['labels']!r}; it must be true or permuted.")
-    if params["select"] not in ("best", "last"):
-        raise UsageError(f"select is {params['select']!r}; it must be best or last.")
-    if bool(params["known"]) != (init is not None):
+    """Refuse a model to begin with where nothing is learned from it, and a known sensor without one."""
+    if init is not None and params["architecture"] != RAEC:
+        raise UsageError(
+            f"--init goes with the architecture {RAEC} alone, whose networks learn to meet the latents of a known "
+            f"sensor, not with {params['architecture']}. Leave it out, or choose --architecture {RAEC}."
+        )
+    if bool(params.get("known")) != (init is not None):
         raise UsageError(
             "Mapping to a known space needs both --known, the sensor whose latents are known, and --init, the model that "
             "knows them."
         )
-    if params["known"] and params["architecture"] != "raec":
-        raise UsageError(f"Only networks of the architecture raec map to a known space, not {params['architecture']}.")
 
 
 # ---- networks
@@ -135,7 +134,8 @@ def _networks(
         )
     device = "cuda" if torch.cuda.is_available() else "cpu"
     start = Classifier.load(init) if init else None
-    joint = params["joint"] and len(known) > 1 and params["architecture"] == "raec"
+    joint = bool(params.get("joint")) and len(known) > 1
+    mapped_to = str(params.get("known", ""))
     if joint:
         _same_materials(known)
     kinds = headers.chosen(params["headers"], {name: len(some.layout.channels) for name, some in known.items()})
@@ -143,9 +143,9 @@ def _networks(
     scalings = {name: Affine.fit(some.frames, params["scaling"]) for name, some in known.items()}
     held = held_out(params["hold_out"], config["classes"], known)
     if start:
-        _same_space(start, params["known"], config, known)
-        shapes[params["known"]] = Shape(**start.config["shapes"][params["known"]])
-        scalings[params["known"]] = _reader(start, params["known"]).scaling
+        _same_space(start, mapped_to, config, known)
+        shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
+        scalings[mapped_to] = _reader(start, mapped_to).scaling
         config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
     felt = [
         {
@@ -163,13 +163,13 @@ def _networks(
         "held_out": {name: sorted(materials) for name, materials in held.items()},
     }
     partners = None
-    if params["pairing"] == "permuted":
+    if params.get("pairing") == "permuted":
         partners = permuted_classes(range(len(config["classes"])), params["seed"])
         config["partners"] = {
             str(config["classes"][one]): config["classes"][other] for one, other in sorted(partners.items())
         }
     pairs = _pairs(params, felt[0], partners)
-    work = JointWork(felt[0], felt[1], pairs, _weights(params, joint), params["known"], params["drop_last"])
+    work = JointWork(felt[0], felt[1], pairs, _weights(params, joint), mapped_to, params["drop_last"])
     trained = loop.train(lambda: _built(params, shapes, start).to(device), work, _schedule(params), workspace)
     best, last = (trained.weights, trained.last) if params["select"] == "best" else (trained.last, trained.weights)
     config["validation"] = _validation(trained.history, work.joint)
@@ -188,14 +188,9 @@ def _networks(
 def _pairs(params: Params, felt: Mapping[str, Felt], partners: Mapping[int, int] | None) -> Pairs:
     return Pairs(
         {name: some.classes.cpu() for name, some in felt.items()},
-        params["batch"],
-        params["pairing"],
-        params["shuffle"],
-        params["drop_last"],
-        params["reduce"],
-        params["ratio"],
-        partners,
-        params["seed"],
+        reduced=params["reduce"],
+        partners=partners,
+        **_of(Pairs, params),
     )
 
 
@@ -216,12 +211,13 @@ def _shape(params: Params, some: Slides, header: str, classes: int) -> Shape:
         channels=len(some.layout.channels),
         classes=classes,
         header=header,
-        decoder=params["decoder"],
-        hidden=params["hidden"],
-        latents=params["latents"],
-        unpool=params["unpool"],
-        dropout=params["dropout"] if params["dropout_mode"] == "latent" else 0.0,
+        **_of(Shape, params),
     )
+
+
+def _of(kind: type[Any], params: Params) -> dict[str, Any]:
+    """Return the params that fields of a dataclass are named like; an architecture has some of them, or all."""
+    return {field.name: params[field.name] for field in dataclasses.fields(kind) if field.name in params}
 
 
 def _felt(config: Config, some: Slides, scaled: Affine, held: Mapping[str, set[int]], device: str, place: int) -> Felt:
@@ -242,15 +238,12 @@ def held_out(given: str, classes: Sequence[int], sensors: Sequence[str] | BySens
     {'a': set(), 'b': {3, 4}}
     """
     found: dict[str, set[int]] = {name: set() for name in sensors}
-    for part in filter(None, (part.strip() for part in given.split(";"))):
-        name, _, numbers = part.partition("=")
-        try:
-            materials = {int(number) for number in numbers.split(",")}
-        except ValueError:
-            raise UsageError(f"hold_out is {part!r}; it must be like roboskin=17,18,19,20.") from None
+    for name, numbers in Assignments(str, between=";").items(given).items():
+        materials = set(CommaList(int).items(numbers))
         if name not in found or not materials <= set(classes):
             raise UsageError(
-                f"hold_out names {part}; the sensors are {', '.join(found)} and the materials {classes[0]} to {classes[-1]}."
+                f"hold_out names {name}={numbers}; the sensors are {', '.join(found)} and the materials {classes[0]} to "
+                f"{classes[-1]}."
             )
         found[name] |= materials
     return found
@@ -273,9 +266,9 @@ def _same_space(start: Classifier, known: str, config: Config, slides: BySensor)
     """Refuse a model of --init that does not know the sensor or the same materials."""
     if known not in slides:
         raise UsageError(f"known names the sensor {known}; the recordings are of {', '.join(slides)}.")
-    if start.architecture != "raec":
+    if start.architecture != RAEC:
         raise TacpipeError(
-            f"The model of --init is of the architecture {start.architecture}; its space must be of raec."
+            f"The model of --init is of the architecture {start.architecture}; its space must be of {RAEC}."
         )
     start.check(slides[known])
     if list(start.classes) != config["classes"]:
@@ -292,13 +285,12 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
 
 
 def _weights(params: Params, joint: bool) -> Weights:
-    return Weights(
-        MAPPED_RECONSTRUCTION if params["known"] else params["reconstruction_weight"],
-        params["classification_weight"],
-        params["alignment_weight"] if joint else 0.0,
-        params["align_from"],
-        params["agreement"],
-    )
+    found = {name: params[f"{name}_weight"] for name in WEIGHTED if f"{name}_weight" in params}
+    if params.get("known"):
+        found["reconstruction"] = MAPPED_RECONSTRUCTION
+    if not joint:
+        found["alignment"] = 0.0
+    return Weights(**found, **_of(Weights, params))
 
 
 def _built(params: Params, shapes: Mapping[str, Shape], start: Classifier | None) -> nn.ModuleDict:

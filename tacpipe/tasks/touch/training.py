@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,17 +18,14 @@ from torch import Tensor, nn
 
 from tacpipe import biotac_sp
 from tacpipe.clouds import geometry
-from tacpipe.clouds.normalisation import NORMALISATIONS
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.constraints import CommaList
+from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
-from tacpipe.models.patches import BACKBONES
-from tacpipe.models.pointnet import HEADS
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.inputs import MODES, WRISTS
-from tacpipe.tasks.touch.learning import LOSSES, Drawn, Felt, TouchWork
+from tacpipe.tasks.touch.learning import Drawn, Felt, TouchWork
 from tacpipe.tasks.touch.patches import require_colours
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
 from tacpipe.training import loop
@@ -41,25 +38,7 @@ Floats = NDArray[np.float64]
 Params = Mapping[str, Any]
 Config = dict[str, Any]
 
-ARCHITECTURES = ("strong", "trees", "patches", "pointnet")
-WORDS: Mapping[str, Iterable[str]] = {  # that params may be
-    "architecture": ARCHITECTURES,
-    "inputs": MODES,
-    "normalisation": NORMALISATIONS,
-    "wrist": WRISTS,
-    "head": HEADS,
-    "backbone": BACKBONES,
-    "loss": LOSSES,
-    "select": ("best", "last"),
-}
 LEAVES = (2, 4, 8)  # rows of a leaf that are tried
-LIMITS = {  # least and most of params that nothing else checks
-    **dict.fromkeys(("networks", "draws", "trees"), (1, math.inf)),
-    **dict.fromkeys(("leaf", "patience", "weight_decay"), (0, math.inf)),
-    "hidden": (2, math.inf),  # half of them make the layer behind
-    "dropout": (0, 1),
-    "seed": (0, 2**32 - 1),  # of scikit-learn
-}
 
 
 def train(
@@ -74,8 +53,8 @@ def train(
     ``validation`` too where ``use_validation`` says so and nothing is chosen by them. Raises `TacpipeError` where
     grasps lack what is to be read or told.
     """
-    _check(params)
-    targets = _targets(params["targets"])
+    asked = CommaList().items(params["targets"])
+    targets = tuple(target for target in biotac_sp.TARGETS if target in asked)  # in one order whatever was asked for
     known = grasps_of.read(training)
     if not len(known):
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
@@ -113,27 +92,6 @@ def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Gras
         "members": [],
         "parameters": None,
     }
-
-
-def _check(params: Params) -> None:
-    """Refuse params that cannot be, before anything is read."""
-    for name, words in WORDS.items():
-        if params[name] not in words:
-            raise UsageError(f"{name} is {params[name]!r}; it must be one of {', '.join(words)}.")
-    for name, (least, most) in LIMITS.items():
-        if not least <= params[name] <= most:
-            allowed = f"be {least} or more" if most == math.inf else f"lie between {least} and {most}"
-            raise UsageError(f"{name} is {params[name]}; it must {allowed}.")
-
-
-def _targets(asked: str) -> tuple[str, ...]:
-    """Return what is to be foretold, in one order whatever that of the names asked for."""
-    named = [name.strip() for name in asked.split(",") if name.strip()]
-    if not named or set(named) - set(biotac_sp.TARGETS):
-        raise UsageError(
-            f"targets is {asked!r}; it must name some of {', '.join(biotac_sp.TARGETS)}, with commas between."
-        )
-    return tuple(target for target in biotac_sp.TARGETS if target in named)
 
 
 def _chooses(params: Params) -> bool:

@@ -73,7 +73,7 @@ def test_the_config_tells_what_was_trained_on_what(tmp_path: Path) -> None:
         "train": {"recordings": 3, "windows": 3 * 36},
         "val": {"recordings": 2, "windows": 2 * 72},  # validation and test have every window, whatever the stride
     }
-    assert found["params"] == params(stride=2)
+    assert found["params"] == params(stride=2) | {"loss": "absolute"}
     assert set(found["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
     assert set(found["anticipation"]) == {"sd", "theta"}
 
@@ -138,8 +138,6 @@ def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
         for chosen in ("all", "contact")
     }
     assert windows == {"all": 72, "contact": 22}
-    with pytest.raises(TacpipeError, match="no windows 'some'; there are all and contact"):
-        trained(tmp_path / "some", given, given, windows="some")
 
 
 @pytest.mark.parametrize("actions", ["planned", "none", "shuffled"])
@@ -149,11 +147,6 @@ def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_pat
     metrics, _ = judged(files, strolling(20), strolling(21))
     skill = metrics["skill"]["mse_counts"][f"t{HORIZON}"]["mean"]
     assert skill > 0.9 if actions == "planned" else skill < 0.2
-
-
-def test_actions_that_do_not_exist_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TacpipeError, match="There are no actions 'guessed'"):
-        trained(tmp_path, actions="guessed")
 
 
 @pytest.mark.parametrize("architecture", ["recurrent", "taxelwise", "gru"])

@@ -21,6 +21,7 @@ from tacpipe.tasks import forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Told, told
+from tests.asked import fitting
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
 
 Floats = NDArray[np.floating[Any]]
@@ -31,9 +32,7 @@ SMALL = {"architecture": "gru", "hidden": 16, "epochs": 2, "batch": 64, "context
 
 def params(**changed: Any) -> dict[str, Any]:
     """The params of the training stage, small."""
-    if changed.get("architecture") == "recurrent":
-        changed = {"loss": "squared", **changed}
-    return dataclasses.asdict(registry.load("train.forward").params(**{**SMALL, **changed}))
+    return fitting("train.forward", SMALL, **changed)
 
 
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:

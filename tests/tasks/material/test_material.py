@@ -254,15 +254,15 @@ def test_slides_that_cannot_be_learned_from_are_refused(
 @pytest.mark.parametrize(
     "changed, sentence",
     [
-        ({"architecture": "cnn"}, "no architecture cnn; there are minirocket, raec, x-lstm"),
+        ({"architecture": "cnn"}, "architecture is 'cnn'; it must be one of minirocket, raec, x-lstm, spectra"),
         ({"labels": "none"}, "labels is 'none'"),
         ({**RAEC, "select": "first"}, "select is 'first'"),
         ({**RAEC, "known": "biotac"}, "needs both --known"),
         ({**RAEC, "hold_out": "roboskin=9"}, "hold_out names roboskin=9"),
-        ({**RAEC, "hold_out": "roboskin=x"}, "must be like roboskin=17,18"),
-        ({"hold_out": "roboskin=3"}, "hold_out is for networks"),
+        ({**RAEC, "hold_out": "roboskin=x"}, "hold-out is 'roboskin=x'"),
+        ({"hold_out": "roboskin=3"}, "hold-out belongs to the architecture raec, x-lstm or spectra"),
         ({"sensors": "digit"}, "No recording is of the sensor digit"),
-        ({**RAEC, "scaling": "cube"}, "no scaling 'cube'"),
+        ({**RAEC, "scaling": "cube"}, "scaling is 'cube'; it must be one of none, standard, spread, log"),
     ],
 )
 def test_params_that_make_no_sense_are_refused(tmp_path: Path, changed: dict[str, Any], sentence: str) -> None:
@@ -302,7 +302,7 @@ def test_the_published_code_with_its_quirks_is_a_preset() -> None:
     quirks = params_of.build("train.material", stage, preset="authors")
     assert (quirks.pairing, quirks.shuffle, quirks.drop_last, quirks.unpool) == ("fixed", False, True, "last")
     assert (quirks.architecture, quirks.select, quirks.scaling, quirks.epochs) == ("raec", "last", "none", 2000)
-    with pytest.raises(UsageError, match="no preset huge; there are paper, quick, authors"):
+    with pytest.raises(UsageError, match=r"no preset huge for train\.material; it has quick, paper, authors"):
         params_of.build("train.material", stage, preset="huge")
 
 

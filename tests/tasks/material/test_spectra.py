@@ -144,8 +144,8 @@ def test_labels_dealt_out_anew_leave_nothing_to_learn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "changed, sentence",
     [
-        ({"speeds": "biotac"}, "speeds is 'biotac'; it must be like"),
-        ({"speeds": "biotac=-1"}, "it must be like biotac=0.025"),
+        ({"speeds": "biotac"}, "speeds is 'biotac'; it must be a comma-separated list of NAME=VALUE"),
+        ({"speeds": "biotac=-1"}, "each value a number above 0"),
         ({"speeds": "biotac=0.02"}, "Nothing tells how fast roboskin slides"),
         ({"hold_out": "roboskin=3;biotac=3"}, "no sensor that is told of material 3"),
         ({"hold_out": "roboskin=3", "sensors": "roboskin"}, "no sensor that is told of material 3"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe import registry
 from tacpipe.hashing import digest
 from tacpipe.stage import Result
 from tacpipe.tasks import material
+from tests.asked import fitting
 from tests.stages.conftest import FakeShard
 from tests.stages.learning_fakes import FakeDataset
 
@@ -67,7 +66,7 @@ def slides(first: int, count: int, sensors: tuple[str, ...] = ("biotac", "robosk
 
 
 def params(**changed: Any) -> dict[str, Any]:
-    return dataclasses.asdict(registry.load("train.material").params(**{**SMALL, **changed}))
+    return fitting("train.material", SMALL, **changed)
 
 
 def trained(

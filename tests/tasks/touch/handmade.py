@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe import biotac_sp, registry
+from tacpipe import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import axes
 from tacpipe.clouds.grasp import Grasp
@@ -21,6 +20,7 @@ from tacpipe.stage import Result
 from tacpipe.tasks import touch
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch.grasps import Grasps
+from tests.asked import fitting
 from tests.stages.conftest import FakeShard
 from tests.stages.learning_fakes import FakeDataset
 
@@ -97,7 +97,7 @@ def grasps(first: int = 0, count: int = 6, **given: Any) -> Grasps:
 
 
 def params(**changed: Any) -> dict[str, Any]:
-    return dataclasses.asdict(registry.load("train.touch").params(**{**SMALL, **changed}))
+    return fitting("train.touch", SMALL, **changed)
 
 
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:

@@ -1,0 +1,23 @@
+"""A stage's params as a command would build them, for tests that call stages and tasks without one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tacpipe import params as params_of
+from tacpipe import registry
+
+
+def asked(name: str, preset: str | None = None, **options: Any) -> Any:
+    """Return the params of stage ``name`` with these options."""
+    return params_of.build(name, registry.load(name), preset=preset, options=options)
+
+
+def fitting(name: str, usual: Mapping[str, Any], **changed: Any) -> dict[str, Any]:
+    """Return the params as a task reads them; of the ``usual`` ones those that the chosen architecture has."""
+    stage = registry.load(name)
+    tag = params_of.tag(stage) or ""
+    chosen = changed.get(tag, usual.get(tag, (params_of.defaults(stage, tag) or [""])[0]))
+    counting = {key: value for key, value in usual.items() if chosen in (params_of.having(stage, key) or [chosen])}
+    return params_of.to_json(asked(name, **{**counting, **changed}))

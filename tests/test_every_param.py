@@ -1,0 +1,394 @@
+"""Every param of every stage says what it may be, and what it may not be is refused before anything is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import pytest
+
+from tacpipe import fields, registry
+from tacpipe import params as params_of
+from tacpipe.clouds.normalisation import NORMALISATIONS
+from tacpipe.codecs.autoencoder_fit import FRAMES, MOST
+from tacpipe.constraints import CommaList, Range
+from tacpipe.errors import UsageError
+from tacpipe.models.forecasts import ARCHITECTURES
+from tacpipe.models.patches import BACKBONES
+from tacpipe.models.pointnet import HEADS
+from tacpipe.models.recurrent_autoencoder import DECODERS
+from tacpipe.simulation.household import FAMILIES, MODULI_PA
+from tacpipe.simulation.slide import SPECTRA
+from tacpipe.simulation.trajectory import PROTOCOLS
+from tacpipe.splits import SCHEMES
+from tacpipe.tasks.forward.rows import ACTIONS
+from tacpipe.tasks.material.pairs import EVERY, PAIRINGS
+from tacpipe.tasks.touch.inputs import MODES, WRISTS
+from tacpipe.tasks.touch.learning import LOSSES
+from tacpipe.training.scaling import KINDS
+from tests.conftest import Ran
+
+Call = Callable[[str], Ran]
+STAGES = [name for name in registry.stages() if registry.load(name).function.__module__.startswith("tacpipe")]
+FREE = {  # params that are any text, and why
+    "synchronize.master": "the name of a stream",
+    "segment.slips.channel": "the name of a column",
+    "split.stratify": "attributes of recordings, which are the lab's own",
+    "split.few_by": "an attribute of recordings",
+    "split.few_of": "an attribute and its value; `check` looks at the form",
+    "split.apart": "an attribute of recordings",
+    "split.by": "an attribute of recordings",
+    "train.material.sensors": "sensors of recordings, which plug-ins may add",
+    "train.material.quantities": "quantities of columns, which plug-ins may add",
+    "train.material.reduce": "a sensor of recordings",
+    "train.material.known": "a sensor of recordings",
+    "train.material.setting": "words for a report",
+    "train.touch.setting": "words for a report",
+    "report.title": "words for a report",
+}
+
+
+def each() -> Iterator[tuple[str, Any, str, Any]]:
+    """Yield stage, kind of params, name and annotation of every field."""
+    for name in STAGES:
+        for kind in params_of.kinds(registry.load(name)):
+            for field, wanted in fields.hints(kind).items():
+                yield name, kind, field, wanted
+
+
+def tagged(name: str, kind: Any) -> dict[str, Any]:
+    """Return the option that chooses a kind of params, if there are several."""
+    tag = params_of.tag(registry.load(name))
+    return {tag: get_args(fields.hints(kind)[tag])[0]} if tag else {}
+
+
+def outside(wanted: Any) -> Iterator[Any]:
+    """Yield values just outside of each end of a range."""
+    whole = fields.bare(wanted) is int
+    for one in fields.constraints(wanted):
+        if isinstance(one, Range):
+            yield from () if one.least is None else (one.least - (1 if whole else 0.001),)
+            yield from () if one.most is None else (one.most + (1 if whole else 0.001),)
+            yield from () if one.above is None else (one.above,)
+            yield from () if one.below is None else (one.below,)
+            yield from () if whole else (math.nan, math.inf)
+
+
+def command(name: str, options: dict[str, Any]) -> str:
+    """Return a command line whose inputs do not exist, which would be found out next."""
+    words = [f"--{key.replace('_', '-')}={value}" for key, value in options.items()]
+    split = "--split nowhere" if registry.load(name).needs_split else ""
+    inputs = {"simulate": "", "evaluate": "nowhere nowhere", "predict": "nowhere nowhere"}
+    return f"{name.replace('.', ' ')} {inputs.get(name.partition('.')[0], 'nowhere')} {split} -o out {' '.join(words)}"
+
+
+RANGED = {(name, kind, field): wanted for name, kind, field, wanted in each() if any(True for _ in outside(wanted))}
+CHOICES = {
+    (name, kind, field): wanted for name, kind, field, wanted in each() if get_origin(fields.bare(wanted)) is Literal
+}
+
+
+def test_every_param_is_a_choice_a_range_a_list_a_truth_or_free_for_a_reason() -> None:
+    free = {
+        f"{name}.{field}"
+        for name, _, field, wanted in each()
+        if fields.bare(wanted) is not bool
+        and get_origin(fields.bare(wanted)) is not Literal
+        and not any(not (isinstance(one, CommaList) and one.of is str) for one in fields.constraints(wanted))
+    }
+    assert free == set(FREE)
+    assert len(RANGED) > 100 and len(CHOICES) > 40
+
+
+@pytest.mark.parametrize("key", RANGED, ids=lambda key: f"{key[0]}.{key[1].__name__}.{key[2]}")
+def test_a_number_out_of_its_range_ends_with_code_2_before_anything_is_read(
+    key: tuple[str, Any, str], tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, kind, field = key
+    monkeypatch.chdir(tmp_path)
+    stage = registry.load(name)
+    for value in outside(RANGED[key]):
+        ran = call(command(name, {**tagged(name, kind), field: value}))
+        assert (ran.code, ran.out) == (2, ""), ran
+        flag = f"--{field.replace('_', '-')}"
+        assert ran.err == f"tacpipe: {flag} is {fields.shown(value)}; it must be {fields.describe(RANGED[key])}.\n"
+        with pytest.raises(UsageError, match=f"{field} is "):
+            params_of.build(
+                name, stage, sets=[*(f"{k}={v}" for k, v in tagged(name, kind).items()), f"{field}={value}"]
+            )
+        with pytest.raises(UsageError, match=f"preset odd of {name}: {field} is "), monkeypatch.context() as patched:
+            patched.setattr(kind, "PRESETS", {"odd": {field: value}}, raising=False)
+            params_of.build(name, stage, preset="odd", options=tagged(name, kind))
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("key", RANGED, ids=lambda key: f"{key[0]}.{key[1].__name__}.{key[2]}")
+def test_the_ends_of_a_range_belong_to_it_or_not_as_it_says(key: tuple[str, Any, str]) -> None:
+    for one in fields.constraints(RANGED[key]):
+        if isinstance(one, Range):
+            assert all(fields.fits(end, RANGED[key]) for end in (one.least, one.most) if end is not None)
+            assert not any(fields.fits(end, RANGED[key]) for end in (one.above, one.below) if end is not None)
+            default = key[1].__dataclass_fields__[key[2]].default
+            assert fields.fits(default, RANGED[key])
+
+
+@pytest.mark.parametrize("key", CHOICES, ids=lambda key: f"{key[0]}.{key[1].__name__}.{key[2]}")
+def test_a_word_that_is_no_choice_ends_with_code_2_before_anything_is_read(
+    key: tuple[str, Any, str], tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, kind, field = key
+    monkeypatch.chdir(tmp_path)
+    ran = call(command(name, {**tagged(name, kind), field: "zzz"}))
+    assert (ran.code, ran.out, ran.err.count("\n")) == (2, "", 1), ran
+    assert ran.err.startswith(f"tacpipe: --{field.replace('_', '-')} is 'zzz'; it must be one of ")
+
+
+@pytest.mark.parametrize("name", [name for name in STAGES if params_of.tag(registry.load(name))])
+def test_an_option_of_another_kind_of_params_is_refused_and_is_in_no_key(
+    name: str, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = registry.load(name)
+    monkeypatch.chdir(tmp_path)
+    for kind in params_of.kinds(stage):
+        own = params_of.build(name, stage, options=tagged(name, kind))
+        assert set(params_of.to_json(own)) == set(fields.hints(kind))
+        for other in params_of.kinds(stage):
+            for field in set(fields.hints(other)) - set(fields.hints(kind)):
+                default = other.__dataclass_fields__[field].default
+                with pytest.raises(UsageError, match=f"--{field.replace('_', '-')} belongs to the "):
+                    params_of.build(name, stage, options={**tagged(name, kind), field: default})
+                (tmp_path / "params.yaml").write_text(json.dumps({"own": {**tagged(name, kind), field: default}}))
+                ran = call(f"{command(name, {})} --block own")
+                assert ran.code == 2
+                assert f"params.yaml, block own: {field} belongs to the {params_of.tag(stage)} " in ran.err
+                assert get_args(fields.hints(other)[params_of.tag(stage) or ""])[0] in ran.err
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_preset_that_a_stage_does_not_have_is_refused_and_those_it_has_can_be_built(name: str, call: Call) -> None:
+    stage = registry.load(name)
+    there = params_of.presets(stage)
+    ran = call(f"{command(name, {})} --preset glossy")
+    assert ran.code == 2
+    assert ran.err == f"tacpipe: There is no preset glossy for {name}; it has {', '.join(there) or 'none'}.\n"
+    for preset in there:
+        assert params_of.build(name, stage, preset=preset)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_help_shows_choices_ranges_and_whose_an_option_is(name: str, call: Call) -> None:
+    stage = registry.load(name)
+    printed = " ".join(call(f"{name.replace('.', ' ')} --help").out.split())
+    for field, wanted in params_of.fields(stage).items():
+        assert f"--{field.replace('_', '-')}" in printed
+        if get_origin(fields.bare(wanted)) is Literal:
+            assert f"[{'|'.join(map(str, get_args(fields.bare(wanted))))}]" in printed
+        assert not params_of.having(stage, field) or f"only with {params_of.tag(stage)}" in printed
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_every_param_has_a_help_text(name: str) -> None:
+    stage = registry.load(name)
+    told = params_of.comments(stage)
+    assert [field for field in params_of.fields(stage) if not told.get(field)] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "known"),
+    [
+        ("train.forward", "architecture", {"auto", *ARCHITECTURES}),
+        ("train.forward", "actions", ACTIONS),
+        ("train.material", "decoder", DECODERS),
+        ("train.material", "pairing", PAIRINGS),
+        ("train.material", "ratio", (100, 90, *EVERY)),
+        ("train.material", "scaling", KINDS),
+        ("train.touch", "inputs", MODES),
+        ("train.touch", "normalisation", NORMALISATIONS),
+        ("train.touch", "wrist", WRISTS),
+        ("train.touch", "head", HEADS),
+        ("train.touch", "backbone", BACKBONES),
+        ("train.touch", "loss", LOSSES),
+        ("split", "scheme", SCHEMES),
+        ("compress.autoencoder", "frames", FRAMES),
+        ("simulate.forward", "protocol", {"mixed", *PROTOCOLS}),
+        ("simulate.material", "spectra", SPECTRA),
+        ("simulate.touch", "stiffness", {"mixed", *MODULI_PA}),
+    ],
+)
+def test_choices_are_those_that_the_code_behind_them_knows(name: str, field: str, known: Any) -> None:
+    assert set(get_args(params_of.fields(registry.load(name))[field])) == set(known)
+
+
+def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
+    families = fields.constraints(params_of.fields(registry.load("simulate.touch"))["families"])[0]
+    assert isinstance(families, CommaList) and set(get_args(families.of)) == {"all", *FAMILIES}
+    search = fields.constraints(params_of.fields(registry.load("compress.autoencoder"))["search"])[0]
+    assert isinstance(search, Range) and search.most == MOST
+
+
+# ---- what a lab typed
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("train material nowhere --split s --decoder nonsense", "--decoder belongs to the architecture raec, and the"),
+        ("train material nowhere --split s --unpool rubbish", "--unpool belongs to the architecture raec"),
+        ("train material nowhere --split s --hidden 77", "--hidden belongs to the architecture raec or x-lstm"),
+        (
+            "train material nowhere --split s --architecture raec --agreement zzz",
+            "--agreement is 'zzz'; it must be one",
+        ),
+        ("train material nowhere --split s --architecture raec --ratio 30", "--ratio is '30'; it must be one of 100"),
+        ("train material nowhere --split s --architecture raec --ratio 25", "ratio is 25 and no sensor is reduced"),
+        ("train material nowhere --split s --architecture raec --reduce biotac", "give --no-shuffle with --reduce"),
+        ("train material nowhere --split s --preset paper --no-joint --pairing permuted", "pairing is permuted and"),
+        ("train material nowhere --split s --architecture spectra --speeds biotac", "list of NAME=VALUE, each value a"),
+        (
+            "train material nowhere --split s --architecture raec --headers biotac=rnn",
+            "each value one of none, mlp, cnn",
+        ),
+        ("train forward nowhere --split s --loss zzz", "--loss is 'zzz'; it must be one of auto, absolute, huber"),
+        ("train forward nowhere --split s --epochs 0", "--epochs is 0; it must be a whole number of 1 or more."),
+        ("train forward nowhere --split s --epochs abc", "--epochs is 'abc'; it must be a whole number of 1 or more."),
+        ("train forward nowhere --split s --preset paper --loss huber", "--loss belongs to the architecture auto, tax"),
+        ("train touch nowhere --split s --targets thumb", "each item one of pdc_th, pdc_mf, e_th, e_mf"),
+        ("train touch nowhere --split s --preset paper --architecture strong", "no preset paper for the architecture"),
+        ("report nowhere --preset paper", "There is no preset paper for report; it has none."),
+        ("report nowhere --traces -1", "--traces is -1; it must be a whole number of 0 or more."),
+        ("synchronize nowhere --grid bogus --skip-bad", "--grid is 'bogus'; it must be one of uniform, logged, fresh."),
+        ("synchronize nowhere --rate-hz -5", "--rate-hz is -5; it must be a number above 0."),
+        ("synchronize nowhere --rate-hz nan", "--rate-hz is nan; it must be a number above 0."),
+        ("synchronize nowhere --set rate_hz=-5", "--set rate_hz=-5: rate_hz is -5; it must be a number above 0."),
+        ("synchronize nowhere --jobs -3", "--jobs is -3; it must be a whole number of 0 or more."),
+        ("split nowhere --fold 1", "No such option"),
+        ("split nowhere --scheme foo", "--scheme is 'foo'; it must be one of random, kfold, blocked, leave-one-out"),
+        (
+            "split nowhere --scheme kfold --test 0.2",
+            "--test belongs to the scheme random or blocked, and the scheme is",
+        ),
+        ("split nowhere --folds 3", "--folds belongs to the scheme kfold, and the scheme is random. Leave it out, or"),
+        ("split nowhere --val 0.6 --test 0.5", "val is 0.6 and test is 0.5, which leave nothing to train on"),
+        ("split nowhere --few-by sensor", "few_by is sensor and few is 0; it must be 1 or more with few_by."),
+        ("split nowhere --few 3 --few-of sensor", "few_of is 'sensor'; it must be an attribute and a value"),
+        ("segment contacts nowhere --on-count 5", "off_count is 80, above on_count, 5"),
+        ("segment slides nowhere --spike-frames 4", "spike_frames is 4; it must be odd"),
+        ("compress autoencoder nowhere --split s --hidden 64,x", "each item a whole number of 1 or more"),
+        ("compress autoencoder nowhere --split s --hidden 8 --search 3", "search is 3, which tries its own"),
+        ("evaluate nowhere nowhere --split s --role best", "--role is 'best'; it must be one of train, val, test."),
+        ("evaluate nowhere nowhere --split s --fold -1", "--fold is -1; it must be a whole number of 0 or more."),
+        ("predict nowhere nowhere --steps 1,0", "--steps is '1,0'; it must be a comma-separated list, each item a"),
+        ("simulate touch --families box,pyramid", "--families is 'box,pyramid'; it must be a comma-separated list"),
+        ("simulate touch --raw --spheres", "raw and spheres are both set"),
+    ],
+)
+def test_what_means_nothing_is_refused_with_one_sentence_and_code_2(
+    words: str, sentence: str, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ran = call(f"{words} -o out")
+    assert (ran.code, ran.out) == (2, ""), ran
+    assert sentence in ran.err
+    assert "No such option" in ran.err or (ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1), ran.err
+    assert not any(tmp_path.iterdir())
+
+
+# ---- a plug-in's own stage
+
+PLUGIN = '''
+"""Bend."""
+
+from __future__ import annotations
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+from tacpipe.constraints import PositiveInt, Range
+from tacpipe.stage import stage
+
+
+@dataclass(frozen=True)
+class Gentle:
+    way: Literal["gentle"] = "gentle"  # how it is bent
+    trials: PositiveInt = 1
+    angle_deg: Annotated[float, Range(0, 90)] = 10.0  # degrees
+
+
+@dataclass(frozen=True)
+class Hard:
+    way: Literal["hard"] = "hard"
+    trials: PositiveInt = 1
+    # newton; what it takes
+    force_n: Annotated[float, Range(above=0, most=5)] = 1.0
+    PRESETS: ClassVar[dict[str, dict[str, object]]] = {"strong": {"force_n": 5.0}}
+
+
+Params = Gentle | Hard
+
+
+@stage(version=1)
+def bend(params: Params, trial: Trial) -> Table:
+    """Bend."""
+    import pyarrow as pa
+
+    return pa.table({"x": [len(params.way)]})
+'''
+
+
+@pytest.fixture
+def bending(tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
+    folder = tmp_path / "plugin"
+    (folder / "bend.egg-info").mkdir(parents=True)
+    (folder / "bend_stages.py").write_text(PLUGIN)
+    (folder / "bend.egg-info" / "entry_points.txt").write_text("[tacpipe.stages]\nbend = bend_stages:bend\n")
+    monkeypatch.syspath_prepend(folder)
+    (tmp_path / "lab").mkdir()
+    monkeypatch.chdir(tmp_path / "lab")
+    monkeypatch.delenv("TACPIPE_STORE", raising=False)
+    for cached in (registry.entry_points, registry.stages):
+        cached.cache_clear()
+    yield call
+    for cached in (registry.entry_points, registry.stages):
+        cached.cache_clear()
+
+
+def test_a_plug_ins_stage_has_choices_ranges_and_kinds_like_a_built_in_one(bending: Call) -> None:
+    for words, sentence in (
+        ("--way rough", "--way is 'rough'; it must be one of gentle, hard."),
+        ("--angle-deg 91", "--angle-deg is 91; it must be a number from 0 to 90."),
+        ("--force-n 2", "--force-n belongs to the way hard, and the way is gentle. Leave it out, or set way to hard."),
+        ("--way hard --force-n 6", "--force-n is 6; it must be a number above 0 and of 5 or less."),
+        ("--preset paper", "There is no preset paper for bend; it has strong."),
+    ):
+        ran = bending(f"bend -o out {words}")
+        assert (ran.code, ran.err) == (2, f"tacpipe: {sentence}\n")
+    printed = bending("bend --help").out
+    assert "[gentle|hard]" in printed and "only with way hard" in " ".join(printed.split())
+    assert json.loads(bending("bend --preset strong --print-params").out) == {
+        "way": "hard",
+        "trials": 1,
+        "force_n": 5.0,
+    }
+    assert bending("bend -o out").code == 0
+    assert json.loads(Path("out/manifest.json").read_text())["params"] == {
+        **{"way": "gentle", "trials": 1, "angle_deg": 10.0},
+    }
+
+
+def test_kinds_that_no_field_tells_apart_are_a_mistake_of_the_stage() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class One:
+        size: Annotated[int, Range(1)] = 1
+
+    @dataclasses.dataclass(frozen=True)
+    class Other:
+        size: Annotated[int, Range(1)] = 2
+
+    class Fake:
+        params = One | Other
+        function = test_kinds_that_no_field_tells_apart_are_a_mistake_of_the_stage
+
+    with pytest.raises(Exception, match="not tell them apart"):
+        params_of.tag(Fake())  # type: ignore[arg-type]
