@@ -75,8 +75,8 @@ def _of_kind(dataset: Path, kind: str, rounds: int) -> list[timing.Line]:
         "pyarrow.parquet.read_table": lambda: [len(pq.read_table(path)) for path in files],
     }
     arrays: Ways = {
-        "verified": lambda: tacpipe.open(dataset).to_numpy(columns=columns),
-        "unverified": lambda: plain.to_numpy(columns=columns),
+        "verified": lambda: _matrices(tacpipe.open(dataset), columns),
+        "unverified": lambda: _matrices(plain, columns),
         "pyarrow.parquet.read_table": lambda: [_stacked(path, columns) for path in files],
     }
     what = f"{size / 1e9:.1f} GB in {len(files)} recordings, {kind}"
@@ -89,6 +89,10 @@ def _of_kind(dataset: Path, kind: str, rounds: int) -> list[timing.Line]:
             size,
         ),
     ]
+
+
+def _matrices(dataset: Dataset, columns: list[str]) -> list[np.ndarray]:
+    return [arrays.values for arrays in dataset.to_numpy(columns=columns).values()]
 
 
 def _stacked(path: Path, columns: list[str]) -> np.ndarray:

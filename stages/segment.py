@@ -6,12 +6,15 @@ remain that are alike in all recordings.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.params import added
 from tacpipe.stage import Attribute, Recording, stage
 
 if TYPE_CHECKING:
@@ -20,7 +23,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tacpipe.dataset import Shard
+    from tacpipe.signals.contact import Thresholds
 
+COUNT = "count"
 EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
 
 
@@ -28,8 +33,9 @@ EVEN = 0.01  # of a step between rows, by which it may differ from the others fo
 class Params:
     """What counts as contact, and as the level without load.
 
-    The thresholds stem from 52 published pick-and-move trials of a XELA uSkin: at rest the load stays below 6 counts,
-    in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts remain for seconds.
+    Thresholds in counts are for streams in counts, and stem from 52 published pick-and-move trials of a XELA uSkin: at
+    rest the load stays below 6 counts, in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts
+    remain for seconds. Those of streams in any other unit follow from the noise at rest, unless they are given.
     """
 
     # free: nothing is touched at first; grasped: all of the recording is one contact
@@ -41,6 +47,10 @@ class Params:
     merge_s: NonNegativeFloat = 0.5  # seconds; contacts that are no further apart are one
     min_s: NonNegativeFloat = 0.3  # seconds; shorter contacts are left out
     pad_s: NonNegativeFloat = 0.5  # seconds before and after each contact that belong to it
+    # as on_count, of streams in other units, in theirs; None: from noise at rest
+    on_level: PositiveFloat | None = added(None)
+    # level below which it ends there; None: two thirds of where it starts
+    off_level: NonNegativeFloat | None = added(None)
     # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
     tare: Literal["median", "first", "axis_mean"] = "median"
 
@@ -54,40 +64,53 @@ class Params:
 
 
 @stage(version=2)
-def contacts(params: Params, recording: Shard) -> pa.Table:
+def contacts(params: Params, recording: Shard) -> Recording:
     """Mark the rows in which either finger touches something, numbered from 0 in ``contact``; -1 in all others.
 
     Each tactile channel's level without load is written into its field metadata ``rest``. Contact is told from the
-    median of the first seconds, whatever ``tare`` is.
+    median of the first seconds, whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and
+    ``off_count``. One in any other unit has those of ``on_level`` and ``off_level`` or of its noise at rest (see
+    `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off`` and
+    ``<stream>_contact_unit`` say which these were. A recording without a contact has a note.
     """
     import numpy as np
     import pyarrow as pa
 
-    from tacpipe.signals.contact import contact_intervals, load, rest_level
+    from tacpipe.signals.contact import Thresholds, contact_intervals, load, noise_thresholds, rest_level
     from tacpipe.tables import with_metadata
 
     table = recording.table()
     t_ns = table.column("t_ns").to_numpy()  # (time,)
-    loads: list[Any] = []
+    loads: list[NDArray[np.float64]] = []
+    limits: list[Thresholds] = []
     rest: dict[str, dict[str, str]] = {}
-    for names in _sensors(recording.name, table).values():
+    sensors = _sensors(recording.name, table)
+    units = {stream: _unit(table, names) for stream, names in sensors.items()}
+    _check_levels(params, recording.name, units)
+    for stream, names in sensors.items():
         values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
         axes = len({(table.field(name).metadata or {}).get(b"axis") for name in names})
         level = rest_level(values, t_ns, params.rest_s)
         loads.append(load(values, level, axes))
+        if units[stream] == COUNT:
+            limits.append(Thresholds(params.on_count, params.off_count))
+        else:
+            limits.append(_given(params, noise_thresholds(values, loads[-1], t_ns, params.rest_s)))
         written = _tared(params.tare, values, level, axes)
         rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, written, strict=True)}
     if params.begins == "grasped":
         intervals = np.array([[0, len(t_ns)]])
     else:
-        intervals = contact_intervals(
-            np.max(loads, axis=0), t_ns, params.on_count, params.off_count, params.min_s, params.merge_s, params.pad_s
-        )
+        on, off = np.array(limits).T
+        intervals = contact_intervals(np.array(loads), t_ns, on, off, params.min_s, params.merge_s, params.pad_s)
     numbers = np.full(len(t_ns), -1, dtype=np.int32)
     for number, (start, stop) in enumerate(intervals):
         numbers[start:stop] = number
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
-    return with_metadata(table.append_column(field, pa.array(numbers)), rest)
+    largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
+    notes = [] if len(intervals) else [_no_contact(params, units, limits, largest)]
+    marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
+    return Recording(marked, _thresholds_told(units, limits), notes)
 
 
 @dataclass(frozen=True)
@@ -277,13 +300,77 @@ def _tared(tare: str, values: NDArray[Any], level: NDArray[np.float64], axes: in
     raise TacpipeError(f"tare is {tare!r}; it must be median, first or axis_mean.")
 
 
-def _sensors(name: str, table: pa.Table) -> dict[Any, list[str]]:
+def _unit(table: pa.Table, names: Sequence[str]) -> str:
+    """Return the unit of a stream's channels; the empty text where they have none, or not all the same."""
+    units = {(table.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
+    return next(iter(units)) if len(units) == 1 else ""
+
+
+def _check_levels(params: Params, name: str, units: Mapping[str, str]) -> None:
+    """Refuse thresholds in a unit that no stream has: they would do nothing."""
+    if params.on_level is not None and params.on_level <= 0:
+        raise UsageError(f"on_level is {params.on_level:g}; it must be above 0, or every row would be in contact.")
+    told = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
+    if set(units.values()) == {COUNT} and (params.on_level, params.off_level) != (None, None):
+        raise UsageError(
+            f"on_level and off_level are of streams in other units than counts, and recording {name} has {told}; give "
+            f"on_count and off_count."
+        )
+    if COUNT not in units.values() and (params.on_count, params.off_count) != (Params.on_count, Params.off_count):
+        raise UsageError(
+            f"on_count and off_count are of streams in counts, and recording {name} has {told}; give on_level and "
+            f"off_level in that unit, or none: then they follow from the noise at rest."
+        )
+
+
+def _given(params: Params, found: Thresholds) -> Thresholds:
+    """Return the thresholds of a stream in another unit than counts: those given, else those ``found``."""
+    from tacpipe.signals.contact import ENDS
+
+    on = found.on if params.on_level is None else params.on_level
+    return found._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
+
+
+def _thresholds_told(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
+    """Return the attributes that say by which thresholds a stream in another unit than counts was segmented."""
+    told: dict[str, Attribute] = {}
+    for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
+        if unit != COUNT and math.isfinite(on):
+            begins = f"{stream}_contact" if stream else "contact"
+            told |= {f"{begins}_on": on, f"{begins}_off": off, f"{begins}_unit": unit}
+    return told
+
+
+def _no_contact(
+    params: Params, units: Mapping[str, str], limits: Sequence[Thresholds], largest: Sequence[float]
+) -> str:
+    """Return the note on a recording without a contact: thresholds, largest load, and what to do."""
+    found = [
+        f"{stream or 'the sensor'} starts contact at a load of {_number(on)} {unit}".rstrip()
+        + f" and reaches {_number(most)} {unit}".rstrip()
+        if math.isfinite(on)
+        else f"{stream or 'the sensor'} never leaves its level at rest"
+        for (stream, unit), (on, _), most in zip(units.items(), limits, largest, strict=True)
+    ]
+    names = ["--on-count"] * (COUNT in units.values()) + ["--on-level"] * bool(set(units.values()) - {COUNT})
+    return (
+        f"no contact of {params.min_s:g} s or more was found in this recording: {'; '.join(found)}. If something was "
+        f"touched, lower {' and '.join(names)}."
+    )
+
+
+def _number(value: float) -> str:
+    """Return a number with three digits that count, without an exponent where it can be."""
+    return f"{float(f'{value:.3g}'):g}"
+
+
+def _sensors(name: str, table: pa.Table) -> dict[str, list[str]]:
     """Return the tactile columns of each stream, taxel by taxel."""
-    found: dict[Any, list[str]] = {}
+    found: dict[str, list[str]] = {}
     for field in table.schema:
         metadata = field.metadata or {}
         if metadata.get(b"quantity") == b"tactile":
-            found.setdefault(metadata.get(b"stream"), []).append(field.name)
+            found.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
     if not found:
         raise TacpipeError(
             f"Recording {name} has no tactile channel: no column's quantity is tactile. Give a synchronized dataset "

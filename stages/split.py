@@ -10,8 +10,12 @@ from tacpipe.errors import UsageError
 from tacpipe.stage import Recording, Result, stage
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tacpipe.dataset import Dataset
     from tacpipe.stage import Roles
+
+SHOWN = 5  # folds that a note lists before it counts the rest
 
 
 @dataclass(frozen=True)
@@ -105,15 +109,19 @@ Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
     """Return one table, ``split``, with a row a recording and fold: recording, fold, role.
 
-    Recordings that have a role in the older split ``extend`` keep it.
+    Recordings that have a role in the older split ``extend`` keep it. A note names folds without validation recordings,
+    unless ``val`` is 0.
     """
     import pyarrow as pa
 
-    from tacpipe.splits import Scheme, assign
+    from tacpipe.splits import Scheme, assign, sufficient_val, without_val
 
     values = asdict(params)
     scheme = Scheme(name=values.pop("scheme"), **values)
-    roles = assign({name: shard.attributes for name, shard in recordings.shards.items()}, scheme, extend or {})
+    attributes = {name: shard.attributes for name, shard in recordings.shards.items()}
+    roles = assign(attributes, scheme, extend or {})
+    bare = without_val(roles) if params.val else []
+    enough = sufficient_val(attributes, scheme, extend or {}) if bare else None
     table = pa.table(
         {
             "recording": pa.array([name for name, _ in roles], pa.string()),
@@ -121,4 +129,16 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
             "role": pa.array(list(roles.values()), pa.string()),
         }
     )
-    return Result(recordings={"split": Recording(table)})
+    notes = [_note(bare, len({fold for _, fold in roles}), len(attributes), params.val, enough)] if bare else []
+    return Result(recordings={"split": Recording(table)}, notes=notes)
+
+
+def _note(bare: Sequence[int], folds: int, recordings: int, val: float, enough: float | None) -> str:
+    """Return the sentence on folds without validation recordings; ``enough`` is a share that would leave none so."""
+    named = ", ".join(map(str, bare[:SHOWN])) + (f" and {len(bare) - SHOWN} more" if len(bare) > SHOWN else "")
+    subject = f"Folds {named} of {folds} have" if len(bare) > 1 else f"Fold {named} of {folds} has"
+    advice = f"Give --val {enough:g}" if enough else "Add recordings"
+    return (
+        f"{subject} no validation recording: val {val:g} of {recordings} recordings gives none. {advice}, or --val 0 if "
+        f"none is needed; networks are stopped or chosen by validation recordings."
+    )

@@ -13,10 +13,10 @@ from tacpipe.manifest import Manifest, shard_path
 from tacpipe.stage import Attribute
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
     import pyarrow as pa
-    import torch
+
+    from tacpipe.arrays import Arrays, Tensors
 
 Reader = Callable[[str, str], bytes]  # digest, path within the dataset directory -> verified content
 
@@ -116,26 +116,46 @@ class Dataset:
         return pa.concat_tables(plain, promote_options="default").unify_dictionaries()
 
     def to_pandas(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """Return all recordings in one frame, after a categorical column ``recording``."""
-        frame: pd.DataFrame = self.table(stream, columns).to_pandas()
+        """Return all recordings in one frame, after a categorical column ``recording``.
+
+        Integers with nulls, as where only some recordings have the column, are pandas' nullable integers: a column of
+        floats would round those beyond 2^53.
+        """
+        import pandas as pd
+        import pyarrow as pa
+
+        table = self.table(stream, columns)
+        frame: pd.DataFrame = table.to_pandas()
+        for field, column in zip(table.schema, table.columns, strict=True):
+            if pa.types.is_integer(field.type) and column.null_count:
+                nullable = pd.api.types.pandas_dtype(str(field.type).replace("u", "U").replace("i", "I"))
+                frame[field.name] = column.to_pandas(types_mapper={field.type: nullable}.get)
         return frame
 
-    def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Return one array of shape (time, channel) a recording, in the order of ``columns``."""
-        import numpy as np
+    def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Arrays]:
+        """Return the arrays of each recording by its name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
+
+        ``columns`` chooses what is read and in which order. Clocks, counters, masks and labels are never mixed with the
+        channels: ``arrays["contact"]`` is any column (time,) in its own type. See `tacpipe.arrays.Arrays`.
+        """
+        from tacpipe import arrays
 
         name = self._only_stream() if stream is None else stream
-        tables = {shard.name: shard.table(name, columns) for shard in self.shards.values()}
+        order = columns and [*dict.fromkeys(columns)]
         return {
-            recording: np.column_stack([table[column].to_numpy() for column in columns or table.column_names])
-            for recording, table in tables.items()
+            shard.name: arrays.of_table(table if order is None else table.select(order))
+            for shard in self.shards.values()
+            for table in [shard.table(name, order)]
         }
 
-    def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
-        """Return one tensor of shape (time, channel) a recording, in the order of ``columns``."""
-        import torch
+    def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Tensors]:
+        """Return the tensors of each recording by its name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
 
-        return {name: torch.from_numpy(values) for name, values in self.to_numpy(stream, columns).items()}
+        As `to_numpy`, with the same types; torch computes little in uint16, so ``values.float()`` comes first there.
+        """
+        from tacpipe import arrays
+
+        return {name: arrays.to_tensors(found) for name, found in self.to_numpy(stream, columns).items()}
 
     def _only_stream(self) -> str:
         streams = {stream for shard in self.shards.values() for stream in shard.streams}

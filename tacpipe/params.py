@@ -129,11 +129,23 @@ def presets(stage: Stage) -> list[str]:
     return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
 
 
+def added(default: Any) -> Any:
+    """Return a field that was added to params later: in keys only where it is not its default.
+
+    So what was computed before keeps its key, where the default gives the same result.
+    """
+    return dataclasses.field(default=default, metadata={"added": True})
+
+
 def to_json(params: Any) -> dict[str, Any]:
-    """Return the params as they stand in keys and manifests."""
-    return {
-        name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(params).items()
+    """Return the params as they stand in keys and manifests; those `added` only where they are not the default."""
+    silent = {
+        field.name
+        for field in dataclasses.fields(params)
+        if field.metadata.get("added") and getattr(params, field.name) == field.default
     }
+    values = {name: value for name, value in dataclasses.asdict(params).items() if name not in silent}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:

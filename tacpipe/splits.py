@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.stage import ROLES, Attribute
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
+SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # of validation recordings, that are advised where there are too few
 UNUSED = "unused"  # role of those that a few-shot split takes out of training
 Attributes = Mapping[str, Attribute]
 Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
@@ -92,6 +93,31 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
                 f"Lower val and test, or add recordings."
             )
     return dict(sorted(roles.items(), key=lambda item: (item[0][1], item[0][0])))
+
+
+def without_val(roles: Mapping[tuple[str, int], str]) -> list[int]:
+    """Return the folds in which no recording has the role val, sorted.
+
+    >>> without_val({("a", 0): "train", ("b", 0): "val", ("a", 1): "test", ("b", 1): "train"})
+    [1]
+    """
+    return sorted({fold for _, fold in roles} - {fold for (_, fold), role in roles.items() if role == "val"})
+
+
+def sufficient_val(
+    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}
+) -> float | None:
+    """Return the smallest of some larger shares ``val`` that leaves no fold without validation recordings, or None.
+
+    Arguments are those of `assign`.
+    """
+    for val in SHARES:
+        try:
+            if val > scheme.val and not without_val(assign(attributes, replace(scheme, val=val), keep)):
+                return val
+        except TacpipeError:  # so large a share leaves nothing to train on
+            continue
+    return None
 
 
 def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:

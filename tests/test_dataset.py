@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 import tacpipe
 from tacpipe import directory
+from tacpipe.errors import UsageError
 from tacpipe.hashing import bytes_digest
 from tacpipe.manifest import Manifest
 from tacpipe.store import Store
@@ -115,9 +116,92 @@ def test_arrays_and_tensors_hold_the_columns_that_were_asked_for_in_their_order(
     with published({"trial-000": {"": table}}) as path:
         dataset = tacpipe.open(path)
         wanted = values[:, [int(name[1:]) for name in order]]
-        assert dataset.to_numpy(columns=order)["trial-000"].tobytes() == wanted.tobytes()
-        assert dataset.to_torch(columns=order)["trial-000"].numpy().tobytes() == wanted.tobytes()
-        assert dataset.to_numpy()["trial-000"].shape == (rows, columns)
+        arrays, tensors = dataset.to_numpy(columns=order)["trial-000"], dataset.to_torch(columns=order)["trial-000"]
+        assert arrays.columns == tensors.columns == tuple(order)
+        assert arrays.values.tobytes() == tensors.values.numpy().tobytes() == wanted.tobytes()
+        assert arrays.t_ns is None and tensors.t_ns is None
+        assert dataset.to_numpy()["trial-000"].values.shape == (rows, columns)
+
+
+def exactly(array: Any) -> list[Any]:
+    """Return the values of an array (time,) or of a frame's column as Python has them, None where one is masked."""
+    values = array.tolist()
+    if np.ma.isMaskedArray(array):
+        values = [None if hidden else value for value, hidden in zip(values, np.ma.getmaskarray(array), strict=True)]
+    return [None if value is pd.NA or (isinstance(value, float) and math.isnan(value)) else value for value in values]
+
+
+def as_stored(column: pa.ChunkedArray) -> list[Any]:
+    """Return the values of a column, where neither null nor NaN is a number."""
+    return [None if isinstance(value, float) and math.isnan(value) else value for value in column.to_pylist()]
+
+
+@given(tables(columns=5))
+@drawn
+def test_no_value_that_is_read_differs_from_that_of_the_file(table: pa.Table) -> None:
+    with published({"trial-000": {"": table}}) as path:
+        dataset, wanted = tacpipe.open(path), {name: as_stored(table[name]) for name in table.column_names}
+        frame, arrays = dataset.to_pandas(), dataset.to_numpy()["trial-000"]
+        assert {name: exactly(frame[name]) for name in wanted} == wanted
+        assert {name: exactly(array) for name, array in arrays.by_column.items()} == wanted
+        for name, array in arrays.by_column.items():
+            assert (
+                pa.types.is_string(table.schema.field(name).type)
+                or array.dtype == table.schema.field(name).type.to_pandas_dtype()
+            ), name
+        assert not {"t_ns", "t_device_ns", "seq"} & set(arrays.columns)
+        try:
+            values = arrays.values
+        except UsageError:
+            wide = [value for name in arrays.columns if arrays[name].dtype.kind in "iu" for value in wanted[name]]
+            assert any(abs(value) > 2**53 for value in wide if value is not None)
+            return
+        assert {name: exactly(values[:, at]) for at, name in enumerate(arrays.columns)} == {
+            name: wanted[name] for name in arrays.columns
+        }
+
+
+def test_times_stay_whole_nanoseconds_beside_channels_of_floats() -> None:
+    t_ns = 1_763_782_179_000_000_000 + 20_000_001 * np.arange(5)  # (time,)
+    table = pa.table(
+        {"t_ns": t_ns, "x": pa.array(np.linspace(0, 1, 5), pa.float32()), "y": np.arange(5, dtype=np.uint16)}
+    )
+    assert (t_ns.astype(np.float64).astype(np.int64) != t_ns).any()  # what a matrix with the times in it would hold
+    with published({"trial-000": {"": table}}) as path:
+        arrays, tensors = (read()["trial-000"] for read in (tacpipe.open(path).to_numpy, tacpipe.open(path).to_torch))
+        assert arrays.t_ns is not None and tensors.t_ns is not None
+        assert arrays.t_ns.dtype == np.int64 and arrays.t_ns.tolist() == tensors.t_ns.tolist() == t_ns.tolist()
+        assert arrays.columns == ("x", "y") and arrays.values.dtype == np.float32
+        assert arrays["y"].dtype == np.uint16
+
+
+def test_masks_labels_and_counters_are_read_by_name_and_are_no_channels() -> None:
+    label = pa.field("contact", pa.int32(), metadata={"quantity": "label"})
+    others = [pa.field("x_gap", pa.bool_()), pa.field("seq", pa.int64()), pa.field("gt_force_n", pa.float64())]
+    fields = pa.schema([pa.field("x", pa.int16()), label, *others])
+    table = pa.table([[1, 2], [-1, 0], [True, False], [2**62, 2**62 + 1], [0.5, 1.5]], schema=fields)
+    with published({"trial-000": {"": table}}) as path:
+        arrays = tacpipe.open(path).to_numpy()["trial-000"]
+        assert arrays.columns == ("x",) and arrays.values.tolist() == [[1], [2]] and arrays.values.dtype == np.int16
+        assert arrays["contact"].tolist() == [-1, 0] and arrays["x_gap"].tolist() == [True, False]
+        assert arrays["seq"].tolist() == [2**62, 2**62 + 1]
+
+
+def test_an_integer_channel_that_a_matrix_of_floats_would_round_is_refused_there_and_read_alone() -> None:
+    table = pa.table({"wide": [2**53 + 1, 0], "x": [0.5, 1.0]})
+    with published({"trial-000": {"": table}}) as path:
+        arrays = tacpipe.open(path).to_numpy()["trial-000"]
+        with pytest.raises(UsageError, match=r"wide \(int64\) holds integers beyond 2\^53.*arrays\['wide'\]"):
+            _ = arrays.values
+        assert arrays["wide"].tolist() == [2**53 + 1, 0]
+        assert tacpipe.open(path).to_numpy(columns=["wide"])["trial-000"].values.tolist() == [[2**53 + 1], [0]]
+
+
+def test_integers_that_some_recordings_lack_stay_integers_in_one_frame() -> None:
+    one = pa.table({"t_ns": [1], "t_device_ns": [2**60 + 1]})
+    with published({"trial-000": {"": one}, "trial-001": {"": one.select(["t_ns"])}}) as path:
+        frame = tacpipe.open(path).to_pandas()
+        assert frame["t_device_ns"].tolist() == [2**60 + 1, pd.NA]
 
 
 @pytest.mark.parametrize("rows", [(1 << 20) - 1, 1 << 20, (1 << 20) + 1])

@@ -248,7 +248,7 @@ def test_what_git_brought_back_to_a_path_is_live_though_the_root_names_another(l
     Path("data/s/manifest.json").write_bytes(old)
     age(lab)
     collected(lab)
-    assert tacpipe.open("data/s").to_numpy()["trial-001"][1].tolist() == [4]
+    assert tacpipe.open("data/s").to_numpy()["trial-001"].values[1].tolist() == [4]
     assert upkeep.verify(lab.store).clean
 
 

@@ -36,7 +36,7 @@ def test_a_chain_gives_what_the_functions_give(lab: Lab) -> None:
     lab.run("simulate toy --trials 3 --rows 5 -o data/r")
     lab.run("scale data/r -o data/s --factor 10")
     lab.run("total data/s -o data/t")
-    values = tacpipe.open("data/s").to_numpy()["trial-002"]
+    values = tacpipe.open("data/s").to_numpy()["trial-002"].values
     assert values[:, 0].tolist() == [0, 30, 60, 90, 120]
     assert json.loads(Path("data/t/metrics.json").read_text()) == {
         "trial-000": 100,
@@ -139,7 +139,7 @@ def test_a_fitted_codec_can_be_applied_to_other_recordings(lab: Lab) -> None:
     lab.run("simulate toy -o data/r2 --trials 1 --rows 3 --offset 5")
     lab.run("scale data/r2 -o data/s2 --factor 1")
     lab.run("centre data/s2 --codec data/c -o data/c2")
-    assert tacpipe.open("data/c2").to_numpy()["trial-000"][:, 0].tolist() == [3.5, 4.5, 5.5]
+    assert tacpipe.open("data/c2").to_numpy()["trial-000"].values[:, 0].tolist() == [3.5, 4.5, 5.5]
 
 
 def test_several_datasets_are_read_as_one_if_names_are_unique(lab: Lab) -> None:
@@ -193,7 +193,7 @@ def test_damage_to_a_recording_that_cannot_be_made_again_is_said_so_unless_its_c
     path = Path(lab.store.object_path(stored))
     path.chmod(0o644)
     path.write_bytes(b"X" + path.read_bytes()[1:])
-    assert tacpipe.open("data/r").to_numpy("left")["a"].tolist() == [[1], [2], [3]]  # adopted from data/r
+    assert tacpipe.open("data/r").to_numpy("left")["a"].values.tolist() == [[1], [2], [3]]  # adopted from data/r
     for copy in (path, Path("data/r/a/left.parquet")):
         copy.chmod(0o644)
         copy.write_bytes(b"X" + copy.read_bytes()[1:])
@@ -216,7 +216,7 @@ def test_files_beside_the_manifest_are_never_trusted(lab: Lab) -> None:
     stale = Path("data/s/trial-000.parquet")
     stale.unlink()
     stale.write_bytes(to_parquet(pa.table({"x": [99]})))
-    assert tacpipe.open("data/s").to_numpy()["trial-000"].tolist() == [[0], [1]]
+    assert tacpipe.open("data/s").to_numpy()["trial-000"].values.tolist() == [[0], [1]]
     lab.run("store link data/s")
     assert file_digest(stale) == lab.manifest("data/s").recordings["trial-000"]["shards"][""]["digest"]
 
@@ -267,7 +267,7 @@ def test_a_project_that_was_moved_and_lost_a_manifest_is_still_known(lab: Lab) -
     Path("data").rename("moved")
     Path("moved/s/manifest.json").unlink()
     lab.run("scale moved/r -o moved/s --factor 3")
-    assert tacpipe.open("moved/s").to_numpy()["trial-001"][1].tolist() == [6]
+    assert tacpipe.open("moved/s").to_numpy()["trial-001"].values[1].tolist() == [6]
 
 
 def test_check_says_whether_something_would_change_and_changes_nothing(lab: Lab) -> None:

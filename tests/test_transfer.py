@@ -59,7 +59,7 @@ def test_a_pull_brings_back_what_was_damaged_here(lab: Lab, clone: Path) -> None
     for path in Path("data/s").glob("*.parquet"):
         path.unlink()
     lab.run(f"store pull {remote_of(lab)} data/s")
-    assert tacpipe.open("data/s").to_numpy()["trial-001"][:, 0].tolist() == [0, 2, 4]
+    assert tacpipe.open("data/s").to_numpy()["trial-001"].values[:, 0].tolist() == [0, 2, 4]
 
 
 def test_what_is_damaged_there_is_not_brought_here(lab: Lab, clone: Path) -> None:

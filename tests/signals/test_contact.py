@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tacpipe.errors import TacpipeError
-from tacpipe.signals.contact import axis_mean_level, contact_intervals, load, rest_level
+from tacpipe.signals.contact import axis_mean_level, contact_intervals, load, noise_thresholds, rest_level
 
 MS = 1_000_000
 loads = hnp.arrays(np.float64, st.integers(1, 80), elements=st.floats(0, 10))
@@ -87,3 +87,66 @@ def test_intervals_are_sorted_disjoint_and_hold_every_row_at_or_above_on(
     for start, stop in found:
         inside[start:stop] = True
     assert inside[values >= 5.0].all()
+
+
+def felt(rows: int, peak: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values (time, channel) of three taxels at 100 Hz, pressed in the second half, and the rows' times."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(0, noise, (rows, 9)) + 3.0
+    values[rows // 2 :, 2::3] += peak
+    return values, np.arange(rows) * 10_000_000
+
+
+def thresholds(values: np.ndarray, t_ns: np.ndarray) -> tuple[float, float]:
+    return noise_thresholds(values, load(values, rest_level(values, t_ns, 0.2)), t_ns, 0.2)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.004, 1.0, 5000.0])
+def test_thresholds_of_the_noise_follow_the_unit(scale: float) -> None:
+    values, t_ns = felt(400, 500.0, 1.0)
+    one, scaled = thresholds(values, t_ns), thresholds(scale * values, t_ns)
+    assert np.allclose(scaled, np.array(one) * scale, rtol=1e-9)
+    assert 40 < one[0] < 125 and one[1] == pytest.approx(one[0] * 2 / 3)
+
+
+@pytest.mark.parametrize(
+    ("peak", "noise", "least", "most"),
+    [
+        (20.0, 1.0, 10.0, 20.0),  # little more than noise: found all the same, above ten times the noise
+        (500.0, 0.0, 24.0, 26.0),  # without noise a twentieth of the largest load
+        (0.0, 1.0, 10.0, 25.0),  # noise alone does not reach it
+    ],
+)
+def test_thresholds_of_the_noise_lie_between_noise_and_load(
+    peak: float, noise: float, least: float, most: float
+) -> None:
+    values, t_ns = felt(400, peak, noise)
+    on, _ = thresholds(values, t_ns)
+    assert least < on < most
+    distance = load(values, rest_level(values, t_ns, 0.2))
+    assert (distance[:200] < on).all() and (distance[200:] >= on).all() == (peak > 0)
+
+
+def test_repeated_samples_and_one_wrong_frame_at_rest_leave_the_thresholds_of_the_noise() -> None:
+    values, t_ns = felt(400, 500.0, 1.0)
+    usual, _ = thresholds(values, t_ns)
+    repeated = np.repeat(values[::4], 4, axis=0)
+    assert 0.4 * usual < thresholds(repeated, t_ns)[0] < 2.5 * usual
+    values[7, 4] += 5000
+    assert thresholds(values, t_ns)[0] == pytest.approx(usual, rel=0.2)
+
+
+def test_without_any_load_no_threshold_is_reached() -> None:
+    values, t_ns = felt(100, 0.0, 0.0)
+    assert thresholds(values, t_ns) == (np.inf, np.inf)
+    assert thresholds(np.full_like(values, np.nan), t_ns) == (np.inf, np.inf)
+
+
+def test_sensors_of_unlike_units_have_thresholds_of_their_own() -> None:
+    t_ns = np.arange(10) * 10_000_000
+    loads = np.zeros((2, 10))
+    loads[0, 2:4], loads[1, 7:9] = 150.0, 0.3
+    found = contact_intervals(loads, t_ns, np.array([120.0, 0.2]), np.array([80.0, 0.1]), 0.0, 0.0, 0.0)
+    assert found.tolist() == [[2, 4], [7, 9]]
+    loads[1, 2] = np.nan
+    assert contact_intervals(loads, t_ns, 120.0, 80.0, 0.0, 0.0, 0.0).tolist() == [[3, 4]]

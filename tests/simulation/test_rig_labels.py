@@ -33,7 +33,7 @@ def synced(recording: Recording, **params: Any) -> Recording:
 @cache
 def labelled(trial: int, **rig: Any) -> pa.Table:
     table = synced(recorded(trial, **rig)).streams[""]
-    return slips(slips.params(), FakeShard({"": contacts(contacts.params(), FakeShard({"": table}))}))
+    return slips(slips.params(), FakeShard(contacts(contacts.params(), FakeShard({"": table})).streams))
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:

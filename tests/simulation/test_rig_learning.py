@@ -57,7 +57,7 @@ def recorded(index: int, grid: str = "uniform", **rig: Any) -> FakeShard:
     """A segmented trial of the rig."""
     recording = simulate(simulate.params(**rig), index)
     synced = synchronize(synchronize.params(grid=grid), Shard(recording.streams))
-    table = contacts(contacts.params(), Shard({"": synced.streams[""]}))
+    table = contacts(contacts.params(), Shard({"": synced.streams[""]})).streams[""]
     return FakeShard(f"trial-{index}", table, dict(recording.attributes) | {"grid": grid})
 
 

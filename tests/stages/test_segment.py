@@ -11,14 +11,20 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.params import from_json, to_json
 from tacpipe.registry import load
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
-contacts = load("segment.contacts")
+segment = load("segment.contacts")
 slips = load("segment.slips")
 synchronize = load("synchronize")
 Shard = Callable[..., Any]
+
+
+def contacts(params: Any, recording: Any) -> pa.Table:
+    """The table of a segmented recording."""
+    return segment(params, recording).streams[""]
 
 
 def table(loads: list[float], sensor: str = "xela1", rest: float = 1000.0) -> pa.Table:
@@ -36,21 +42,21 @@ def table(loads: list[float], sensor: str = "xela1", rest: float = 1000.0) -> pa
 
 def test_contacts_with_their_padding_are_numbered_and_all_rows_stay(shard: Shard) -> None:
     given = table([0.0] * 50 + [500.0] * 50 + [0.0] * 100 + [500.0] * 50 + [0.0] * 50)
-    found = contacts(contacts.params(pad_s=0.1), shard({"": given}))
+    found = contacts(segment.params(pad_s=0.1), shard({"": given}))
     assert found.column("contact").to_pylist() == [-1] * 45 + [0] * 60 + [-1] * 90 + [1] * 60 + [-1] * 45
     assert found.schema.field("contact").type == pa.int32()
     assert found.drop_columns(["contact"]).equals(given)
 
 
 def test_the_level_at_rest_is_written_beside_each_channel(shard: Shard) -> None:
-    found = contacts(contacts.params(), shard({"": table([0.0] * 50 + [500.0] * 50)}))
+    found = contacts(segment.params(), shard({"": table([0.0] * 50 + [500.0] * 50)}))
     assert float(found.schema.field("xela1_taxel02_z").metadata[b"rest"]) == 1002.0
     assert found.schema.field("xela1_taxel02_z").metadata[b"unit"] == b"count"
 
 
 def test_the_tare_chooses_the_level_that_is_written_and_never_the_contacts(shard: Shard) -> None:
     given = shard({"": table([7.0, *[0.0] * 49, *[500.0] * 50])})  # the first frame is a bad one
-    found = {tare: contacts(contacts.params(tare=tare), given) for tare in ("median", "first", "axis_mean")}
+    found = {tare: contacts(segment.params(tare=tare), given) for tare in ("median", "first", "axis_mean")}
     levels = {
         tare: [
             float(one.schema.field(f"xela1_taxel{taxel:02d}_{axis}").metadata[b"rest"])
@@ -72,23 +78,124 @@ def test_either_finger_counts(shard: Shard) -> None:
     for field in pressed.schema:
         if field.name != "t_ns":
             both = both.append_column(field, pressed.column(field.name))
-    assert contacts(contacts.params(pad_s=0.0), shard({"": both})).column("contact").to_pylist() == [-1] * 50 + [0] * 50
+    assert contacts(segment.params(pad_s=0.0), shard({"": both})).column("contact").to_pylist() == [-1] * 50 + [0] * 50
 
 
 def test_a_recording_without_contact_has_none_in_any_row(shard: Shard) -> None:
-    found = contacts(contacts.params(), shard({"": table([0.0, 50.0] * 50)}))
+    found = contacts(segment.params(), shard({"": table([0.0, 50.0] * 50)}))
     assert found.column("contact").to_pylist() == [-1] * 100
     assert found.column_names == [*table([0.0]).column_names, "contact"]
 
 
 def test_a_recording_that_begins_in_the_grasp_is_one_contact(shard: Shard) -> None:
-    found = contacts(contacts.params(begins="grasped"), shard({"": table([0.0] * 30)}))
+    found = contacts(segment.params(begins="grasped"), shard({"": table([0.0] * 30)}))
     assert found.column("contact").to_pylist() == [0] * 30
 
 
 def test_what_cannot_be_is_refused(shard: Shard) -> None:
     with pytest.raises(TacpipeError, match="has no tactile channel"):
-        contacts(contacts.params(), shard({"": pa.table({"t_ns": [1]})}))
+        contacts(segment.params(), shard({"": pa.table({"t_ns": [1]})}))
+
+
+UNITS = [("N", 0.004), ("mT", 0.0003), ("kPa", 0.05), ("1", 1 / 65535), ("V", 1e-4)]
+
+
+def in_unit(synced: pa.Table, unit: str, factor: float) -> pa.Table:
+    """Return a recording whose tactile channels are in another unit of so much a count."""
+    for index, field in enumerate(synced.schema):
+        if (field.metadata or {}).get(b"quantity") == b"tactile":
+            values = pa.array(synced.column(field.name).to_numpy().astype(np.float64) * factor)
+            other = pa.field(field.name, pa.float64(), metadata={**field.metadata, b"unit": unit.encode()})
+            synced = synced.set_column(index, other, values)
+    return synced
+
+
+def overlap(one: pa.Table, other: pa.Table) -> float:
+    """Return intersection over union of the rows in contact."""
+    first, second = (found.column("contact").to_numpy() >= 0 for found in (one, other))
+    return float((first & second).sum() / max((first | second).sum(), 1))
+
+
+@pytest.mark.parametrize(("unit", "factor"), UNITS)
+def test_contacts_of_simulated_trials_in_any_unit_are_those_in_counts_and_of_the_ground_truth(
+    unit: str, factor: float, shard: Shard
+) -> None:
+    simulate = load("simulate.forward")
+    for trial in range(4):
+        recording = simulate(simulate.params(duration_s=6.0), trial)
+        synced = synchronize(synchronize.params(), shard(recording.streams)).streams[""]
+        params = segment.params(pad_s=0.0)
+        counted, other = (contacts(params, shard({"": one})) for one in (synced, in_unit(synced, unit, factor)))
+        assert other.column("contact").unique().to_pylist() == counted.column("contact").unique().to_pylist()
+        assert overlap(counted, other) > 0.98
+        pressed = pa.table({"contact": np.where(synced.column("gt_finger1_normal_n").to_numpy() > 0, 0, -1)})
+        assert overlap(pressed, other) > 0.95
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="published recordings are not here")
+def test_contacts_of_published_trials_in_newtons_are_those_in_counts(shard: Shard) -> None:
+    ingest, overlaps = load("ingest.xela-flat"), []
+    assert ingest.discover is not None
+    found = ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move")
+    for files in list(found.values())[::4]:
+        synced = synchronize(synchronize.params(), shard(ingest(ingest.params(), files).streams)).streams[""]
+        one, other = (contacts(segment.params(), shard({"": each})) for each in (synced, in_unit(synced, "N", 0.004)))
+        overlaps.append(overlap(one, other))
+    assert len(overlaps) == 13 and min(overlaps) > 0.9 and np.median(overlaps) > 0.99
+
+
+def test_thresholds_in_another_unit_stand_in_the_attributes_and_those_in_counts_do_not(shard: Shard) -> None:
+    loads = [*np.random.default_rng(0).normal(0, 1, 50), *[500.0] * 50]
+    counted, other = table(loads), in_unit(table(loads, "skin"), "N", 0.01)
+    both = pa.table(
+        {**{name: counted[name] for name in counted.column_names}, **{name: other[name] for name in other.column_names}}
+    ).cast(pa.schema([*counted.schema, *list(other.schema)[1:]]))
+    found = segment(segment.params(pad_s=0.0), shard({"": both}))
+    assert set(found.attributes) == {"skin_contact_on", "skin_contact_off", "skin_contact_unit"}
+    assert found.attributes["skin_contact_unit"] == "N" and 0.1 < found.attributes["skin_contact_on"] < 2.5
+    assert found.streams[""].column("contact").to_pylist() == [-1] * 50 + [0] * 50
+    assert segment(segment.params(), shard({"": counted})).attributes == {} and found.notes == []
+
+
+def test_thresholds_can_be_given_in_the_unit_of_the_stream(shard: Shard) -> None:
+    given = shard({"": in_unit(table([0.0] * 50 + [50.0] * 50 + [500.0] * 50), "N", 0.01)})
+    found = segment(segment.params(on_level=1.0, pad_s=0.0), given)
+    assert found.streams[""].column("contact").to_pylist() == [-1] * 100 + [0] * 50
+    assert found.attributes["xela1_contact_on"] == 1.0
+    assert found.attributes["xela1_contact_off"] == pytest.approx(2 / 3)
+    both = segment(segment.params(on_level=0.2, off_level=0.1, pad_s=0.0), given)
+    assert both.streams[""].column("contact").to_pylist() == [-1] * 50 + [0] * 100
+    assert both.attributes["xela1_contact_off"] == 0.1
+
+
+def test_thresholds_in_a_unit_that_no_stream_has_are_refused(shard: Shard) -> None:
+    counted, other = shard({"": table([0.0])}), shard({"": in_unit(table([0.0]), "N", 0.01)})
+    with pytest.raises(UsageError, match=r"on_level and off_level are of streams in other units.*xela1 in count"):
+        segment(segment.params(on_level=0.5), counted)
+    with pytest.raises(UsageError, match=r"on_count and off_count are of streams in counts.*xela1 in N"):
+        segment(segment.params(on_count=50.0, off_count=20.0), other)
+    with pytest.raises(UsageError, match="on_level is 0; it must be above 0"):
+        segment(segment.params(on_level=0.0), other)
+
+
+def test_a_recording_without_contact_has_a_note_with_thresholds_and_largest_load_in_the_unit(shard: Shard) -> None:
+    quiet = table([0.0, 50.0] * 50)
+    (note,) = segment(segment.params(), shard({"": quiet})).notes
+    assert "no contact of 0.3 s or more was found in this recording" in note
+    assert "xela1 starts contact at a load of 120 count and reaches 50 count. " in note and "lower --on-count." in note
+    (note,) = segment(segment.params(on_level=1.0), shard({"": in_unit(quiet, "N", 0.01)})).notes
+    assert "xela1 starts contact at a load of 1 N and reaches 0.5 N. " in note and "lower --on-level." in note
+    (note,) = segment(segment.params(), shard({"": in_unit(table([0.0] * 50), "N", 0.01)})).notes
+    assert "xela1 never leaves its level at rest" in note
+    assert segment(segment.params(begins="grasped"), shard({"": quiet})).notes == []
+    assert segment(segment.params(), shard({"": table([0.0] * 50 + [500.0] * 50)})).notes == []
+
+
+def test_levels_in_other_units_are_part_of_a_key_only_where_they_are_given() -> None:
+    assert "on_level" not in to_json(segment.params()) and "off_level" not in to_json(segment.params(on_level=0.5))
+    assert to_json(segment.params(on_level=0.5))["on_level"] == 0.5
+    assert from_json(segment, to_json(segment.params(on_level=0.5))) == segment.params(on_level=0.5)
 
 
 def touched(found: pa.Table) -> np.ndarray:
@@ -101,7 +208,7 @@ def test_the_contact_of_a_simulated_trial_is_that_of_its_ground_truth(shard: Sha
     for trial in range(4):
         recording = simulate(simulate.params(duration_s=6.0, friction_scale=4.0), trial)
         synced = synchronize(synchronize.params(), shard(recording.streams)).streams[""]
-        found = contacts(contacts.params(pad_s=0.0), shard({"": synced}))
+        found = contacts(segment.params(pad_s=0.0), shard({"": synced}))
         pressed = synced.column("gt_finger1_normal_n").to_numpy() > 0
         first = synced.column("t_ns").to_numpy()[pressed.argmax()]
         assert found.column("contact").unique().to_pylist() == [-1, 0]
@@ -210,7 +317,7 @@ def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard:
     for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
         recording = ingest(ingest.params(), files)
         synced = synchronize(synchronize.params(), shard(recording.streams)).streams[""]
-        found = contacts(contacts.params(), shard({"": synced}))
+        found = contacts(segment.params(), shard({"": synced}))
         height = synced.column("robot_position_z_m").to_numpy()
         lifted = synced.column("t_ns").to_numpy()[(height > height[0] + 0.02).argmax()]
         assert set(found.column("contact").unique().to_pylist()) <= {-1, 0}

@@ -67,3 +67,34 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -
     blocked = asked("split", scheme="blocked", test=0.25, val=0.0, reverse=True)
     rows = split(blocked, given).recordings["split"].tables.to_pylist()
     assert [row["recording"] for row in rows if row["role"] == "test"] == ["t00", "t01", "t02", "t03"]
+
+
+@pytest.mark.parametrize(
+    ("params", "count", "wanted"),
+    [
+        (
+            {},
+            3,
+            "Fold 0 of 1 has no validation recording: val 0.15 of 3 recordings gives none. Give --val 0.2, or --val 0 ",
+        ),
+        ({"scheme": "kfold", "folds": 2, "val": 0.1}, 4, "Folds 0, 1 of 2 have no validation recording: val 0.1 of 4 "),
+        ({"scheme": "leave-one-out", "val": 0.1}, 4, "Folds 0, 1, 2, 3 of 4 have no validation recording"),
+        ({"scheme": "kfold", "folds": 7, "val": 0.05}, 7, "Folds 0, 1, 2, 3, 4 and 2 more of 7 have"),
+        ({"val": 0.1, "test": 0.0}, 1, "val 0.1 of 1 recordings gives none. Add recordings, or --val 0 "),
+    ],
+)
+def test_folds_without_validation_recordings_are_noted_with_a_share_that_gives_them_some(
+    params: dict[str, Any], count: int, wanted: str, shard: Shard
+) -> None:
+    (note,) = split(split.params(**params), dataset(shard, count)).notes
+    assert wanted in note
+    if "Give --val " in note:
+        enough = float(note.split("Give --val ")[1].split(",")[0])
+        assert split(split.params(**{**params, "val": enough}), dataset(shard, count)).notes == []
+
+
+@pytest.mark.parametrize(("params", "count"), [({"val": 0.0}, 3), ({}, 12), ({"scheme": "kfold", "val": 0.0}, 5)])
+def test_a_split_with_validation_recordings_or_asked_for_without_has_no_note(
+    params: dict[str, Any], count: int, shard: Shard
+) -> None:
+    assert split(split.params(**params), dataset(shard, count)).notes == []
