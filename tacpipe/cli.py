@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from tacpipe import interruption
+from tacpipe import extras, interruption
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.files import told
 
@@ -104,7 +104,8 @@ def answer(arguments: Sequence[str]) -> int:
 
 def _call(arguments: Sequence[str]) -> int:
     try:
-        app(arguments)(arguments, prog_name="tacpipe")
+        with extras.named("This command"):
+            app(arguments)(arguments, prog_name="tacpipe")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return DONE

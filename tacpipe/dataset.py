@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import extras
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.hashing import digest
 from tacpipe.manifest import Manifest, shard_path
@@ -133,7 +134,8 @@ class Dataset:
 
     def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
         """Return one tensor of shape (time, channel) a recording, in the order of ``columns``."""
-        import torch
+        with extras.named("to_torch"):
+            import torch
 
         return {name: torch.from_numpy(values) for name, values in self.to_numpy(stream, columns).items()}
 

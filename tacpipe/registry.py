@@ -11,6 +11,7 @@ from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
+from tacpipe import extras
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
 from tacpipe.stage import Stage
@@ -106,12 +107,23 @@ def _import(name: str, target: str) -> Any:
         loaded = importlib.import_module(module)
         return getattr(loaded, attribute) if attribute else loaded
     except ImportError as error:
-        raise TacpipeError(
-            f"{name} needs {error.name or target}, which cannot be imported ({error}). Install it: "
-            f"`pip install 'tacpipe[all]'` brings what the built-in stages use."
-        ) from error
+        sentence = f"{name} needs {error.name or target}, which cannot be imported ({error})."
+        raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
     except AttributeError as error:
         raise TacpipeError(f"{module} has no {attribute}, though it is registered as {name}.") from error
+
+
+def package(name: str) -> str | None:
+    """Return the name of the installed package that a stage comes from, if it is known."""
+    return _package(stages().get(name, ""))
+
+
+def _package(target: str) -> str | None:
+    """Return the name of the installed package whose entry point ``target`` is, if it is known."""
+    from importlib.metadata import entry_points as every
+
+    found = (point for group in (STAGES, FORMATS, TASKS, SENSORS) for point in every(group=group))
+    return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
 
 
 def summary(name: str) -> str:
