@@ -33,7 +33,8 @@ TOGETHER = "all"  # the extra that brings all others: a user wants the one that 
 def named(needed_by: str, plugin: Callable[[], str | None] = lambda: None) -> Iterator[None]:
     """Have a module that is missing in the block reported in one sentence that begins with ``needed_by``.
 
-    ``plugin`` returns the package that ``needed_by`` comes from, if it is known. Raises `MissingModuleError`, which is an `ImportError` too; other import errors pass.
+    ``plugin`` returns the package that ``needed_by`` comes from, if it is known. Raises `MissingModuleError`, which is an
+    `ImportError` too; other import errors pass.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""The clock that a recording goes by, and waiting on it. Whoever runs a rig without hardware may put another in its place."""
+"""The clock that a recording goes by, and waiting on it; tests put another one in its place."""
 
 from __future__ import annotations
 
