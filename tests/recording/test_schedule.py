@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.recording import recorder
+from tacpipe.recording import recorder, sealing
+from tacpipe.recording.spool import Spooled
+from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab
 from tests.recording import live
 from tests.recording.scripted import Script
@@ -166,3 +168,32 @@ def test_lines_about_a_recording_come_every_five_seconds(lab: Lab, script: Scrip
 
     assert [line.split(":")[0] for line in err] == ["recording one, 5 s", "recording one, 10 s", "one"]
     assert "force 333.0 Hz, jitter 0.0 ms" in err[0]
+
+
+def test_a_long_sealing_is_no_silence_of_the_devices(lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch) -> None:
+    seal = sealing.seal
+
+    def slowly(*given: Any) -> Any:
+        script.sleep(60.0)
+        return seal(*given)
+
+    monkeypatch.setattr(sealing, "seal", slowly)
+    lab.run("acquire rig.toml -o rec --duration 1 --quiet")
+
+
+def test_a_crash_costs_what_came_since_the_last_tick(lab: Lab, script: Script) -> None:
+    seen: list[tuple[float, int]] = []
+
+    def look() -> None:
+        (spool,) = live.spools(lab.folder)
+        blocks = [block for _, block in Spooled(spool).blocks("force")]
+        seen.append((script.t_s, sum(len(block.size) for block in blocks if isinstance(block, Chunks))))
+
+    for at_s in np.linspace(1.0, 3.0, 11):
+        script.happens.append((float(at_s), look))
+    lab.run("acquire rig.toml -o rec --duration 4")
+    began = counts(live.only(lab.folder))[0]
+
+    assert len(seen) == 11
+    for at_s, written in seen:
+        assert (at_s - recorder.TICK_S) * RATE_HZ - 1 <= began + written <= at_s * RATE_HZ + 1
