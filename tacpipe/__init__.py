@@ -24,7 +24,8 @@ def load(path: Any) -> Any:
 
     Raises `UsageError` if ``path`` holds no model.
     """
-    from tacpipe import model_files
+    from tacpipe import extras, model_files
 
     files = open(path).files
-    return model_files.task(files, str(path)).load(files)
+    with extras.named("A model"):
+        return model_files.task(files, str(path)).load(files)

@@ -155,15 +155,16 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     from dataclasses import asdict
 
     from tacpipe.interruption import Ended
+    from tacpipe.recording import clock
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import line
 
     recorder = Recorder(rig)
     with Ended() as ended, recorder.open():
         recorder.await_first(ended)
-        until_s = time.monotonic() + DRY_RUN_S
-        recorder.run(lambda: ended() or time.monotonic() > until_s)
-        figures = {name: watch.figures(time.monotonic_ns()) for name, watch in recorder.watches.items()}
+        until_s = clock.now_s() + DRY_RUN_S
+        recorder.run(lambda: ended() or clock.now_s() > until_s)
+        figures = {name: watch.figures(clock.now_ns()) for name, watch in recorder.watches.items()}
     if as_json:
         return json.dumps({"schema_version": SCHEMA_VERSION, "streams": {n: asdict(f) for n, f in figures.items()}})
     lines = []

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import failures, interruption, places
+from tacpipe import extras, failures, interruption, places
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.files import told
 
@@ -119,7 +119,8 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
     program = app(arguments)
     places.expect_local(program)
     try:
-        code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
+        with extras.named("This command"):
+            code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
     except typer.Abort:
         return FAILED, ""
     except _misuse() as error:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import extras
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.hashing import digest
 from tacpipe.manifest import Manifest, shard_path
@@ -155,7 +156,8 @@ class Dataset:
         """
         from tacpipe import arrays
 
-        return {name: arrays.to_tensors(found) for name, found in self.to_numpy(stream, columns).items()}
+        with extras.named("to_torch"):
+            return {name: arrays.to_tensors(found) for name, found in self.to_numpy(stream, columns).items()}
 
     def _only_stream(self) -> str:
         streams = {stream for shard in self.shards.values() for stream in shard.streams}

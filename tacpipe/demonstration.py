@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tacpipe import interruption
+from tacpipe import extras, interruption
 from tacpipe.errors import TacpipeError
 
 TRIALS = 30
@@ -14,6 +14,8 @@ MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
 OBJECTS, GRASPS = 1, 90  # of each of six families; and as many grasps of each object
 LIVE_S, LIVE_TRIALS = 30, 6  # of the emulated rig
 EMULATED = "emulated"
+LEARNING = ("matplotlib", "safetensors", "scipy", "sklearn", "torch")
+LINKS = ("serial", "websockets")
 
 
 def commands(output: Path) -> list[list[str]]:
@@ -100,6 +102,7 @@ def run_rig(output: Path, rig_file: Path) -> Path:
 
     Raises `TacpipeError` if a command fails.
     """
+    extras.require("The demo on a rig", *LEARNING, *LINKS)
     emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / EMULATED)]
     print("$ tacpipe " + " ".join(emulate) + " &", file=sys.stderr, flush=True)
     serving = subprocess.Popen([sys.executable, "-m", "tacpipe.cli", *emulate], stdout=subprocess.PIPE)
@@ -145,5 +148,6 @@ def run(output: Path) -> Path:
 
     Raises `TacpipeError` if one of them fails.
     """
+    extras.require("The demo", *LEARNING)
     _run(commands(output))
     return output / "report.html"

@@ -35,6 +35,10 @@ class WouldChangeError(TacpipeError):
     exit_code = WOULD_CHANGE
 
 
+class MissingModuleError(TacpipeError, ImportError):
+    """A module of an optional part, or one that a plug-in needs, is not installed."""
+
+
 class StorageError(TacpipeError):
     """The disk or the store failed, which says nothing of what was to be stored."""
 

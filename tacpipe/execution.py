@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe import failures, provenance, registry
+from tacpipe import extras, failures, provenance, registry
 from tacpipe import params as params_of
 from tacpipe.dataset import Dataset, Shard
-from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
+from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
 from tacpipe.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.manifest import ACQUIRE, Manifest, shard_path
 from tacpipe.stage import Recording, Result, Stage
@@ -72,7 +72,7 @@ def compute(task: Task) -> Done:
     except TacpipeError as error:
         with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
             (store.root / "checkpoints" / key).rmdir()
-        at_fault = error.exit_code == FAILED and not isinstance(error, StorageError)
+        at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
         return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
 
 
@@ -85,11 +85,12 @@ class _Scratch:
 
 def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str, Any], list[str]]:
     """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
-    stage = stage_of(task.name)
+    stage, stage_name = stage_of(task.name), task.name.removesuffix(".fit")
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments:
         try:
-            returned = stage(params, **arguments)
+            with extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
+                returned = stage(params, **arguments)
         except Exception as error:
             failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise

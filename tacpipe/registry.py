@@ -11,7 +11,7 @@ from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
-from tacpipe import failures
+from tacpipe import extras, failures
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
 from tacpipe.stage import Stage
@@ -106,10 +106,8 @@ def _import(name: str, target: str) -> Any:
     try:
         loaded = importlib.import_module(module)
     except ImportError as error:
-        raise TacpipeError(
-            f"{name} needs {error.name or target}, which cannot be imported ({error}). Install it: "
-            f"`pip install 'tacpipe[all]'` brings what the built-in stages use."
-        ) from error
+        sentence = f"{name} needs {error.name or target}, which cannot be imported ({error})."
+        raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
     except TacpipeError:
         raise
     except Exception as error:  # a mistake in a plug-in's module
@@ -118,6 +116,19 @@ def _import(name: str, target: str) -> Any:
         return getattr(loaded, attribute) if attribute else loaded
     except AttributeError as error:
         raise TacpipeError(f"{module} has no {attribute}, though it is registered as {name}.") from error
+
+
+def package(name: str) -> str | None:
+    """Return the name of the installed package that a stage comes from, if it is known."""
+    return _package(stages().get(name, ""))
+
+
+def _package(target: str) -> str | None:
+    """Return the name of the installed package whose entry point ``target`` is, if it is known."""
+    from importlib.metadata import entry_points as every
+
+    found = (point for group in (STAGES, FORMATS, TASKS, SENSORS) for point in every(group=group))
+    return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
 
 
 def summary(name: str) -> str:

@@ -71,7 +71,7 @@ def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Tab
     the memory that is left.
     """
     try:
-        file = pq.ParquetFile(pa.BufferReader(content))
+        file = pq.ParquetFile(pa.BufferReader(owned(content)))
         needed = claimed(file.schema, content, columns)
     except BROKEN as error:
         raise _damaged(content, error) from error
@@ -84,6 +84,17 @@ def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Tab
         return table.cast(_with_fields(table.schema, file.schema_arrow.names, json.loads(stored)))
     except BROKEN as error:
         raise _damaged(content, error) from error
+
+
+def owned(content: bytes) -> pa.Buffer:
+    """Return the bytes in memory of Arrow's own.
+
+    Arrow's threads may let go of a buffer after the table is read. One of Python's they cannot release while Python ends:
+    then the process aborts, its work done.
+    """
+    sink = pa.BufferOutputStream()
+    sink.write(content)
+    return sink.getvalue()
 
 
 def _damaged(content: bytes, error: Exception) -> DamagedError:

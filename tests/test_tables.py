@@ -1,5 +1,6 @@
 import io
 import itertools
+import weakref
 from pathlib import Path
 
 import duckdb
@@ -22,6 +23,26 @@ drawn = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, Hea
 @drawn
 def test_a_table_comes_back_to_the_bit_with_its_types_and_what_is_told_of_its_fields(table: pa.Table) -> None:
     assert bits(from_parquet(to_parquet(table))) == bits(table)
+
+
+class Content(bytearray):
+    """Bytes of which it can be seen whether anybody still holds them."""
+
+
+def test_arrow_holds_no_memory_of_python_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread of Arrow's that lets go of it while Python ends aborts the process: rare, and seen, as exit code 134."""
+    opened, files = pq.ParquetFile, []
+
+    def keep(source: pa.NativeFile) -> pq.ParquetFile:
+        files.append(opened(source))
+        return files[-1]
+
+    monkeypatch.setattr(pq, "ParquetFile", keep)
+    content = Content(to_parquet(pa.table({"a": list(range(1000))})))
+    held = weakref.ref(content)
+    assert from_parquet(content).num_rows == 1000  # type: ignore[arg-type]
+    del content
+    assert files and held() is None
 
 
 @given(tables(), st.data())

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe import extras
 from tacpipe.clouds.candidates import Candidate
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.errors import TacpipeError
 from tacpipe.files import readable_errors, write_whole
 
 if TYPE_CHECKING:
@@ -29,13 +29,9 @@ def draw(cloud: Cloud, found: Sequence[Candidate], path: Path) -> None:
     The ending tells the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the file
     cannot be written.
     """
-    try:
+    with extras.named("A picture"):
         import matplotlib
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise TacpipeError(
-            f"matplotlib cannot be imported ({error}); `pip install 'tacpipe[learn]'` brings it."
-        ) from error
 
     with matplotlib.rc_context({"svg.hashsalt": "candidates"}):
         figure = Figure(figsize=(11, 6), layout="constrained", dpi=150)

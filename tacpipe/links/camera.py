@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tacpipe import extras
 from tacpipe.clouds.depth_frame import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links.opened import Arrived, Opened
@@ -19,12 +20,10 @@ PAUSE_S = 0.002  # between looks for a frame; at the fastest they are 11 ms apar
 def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
     """Return the open camera of this number, or of this serial number.
 
-    Raises `DeviceError` where it is not connected, held by another program, or Open3D is not installed.
+    Raises `DeviceError` where it is not connected, or held by another program, `MissingModuleError` without Open3D.
     """
-    try:
+    with extras.named(name):
         import open3d
-    except ImportError:
-        raise DeviceError(f"{name}: cameras need Open3D: `pip install 'tacpipe[clouds]'` brings it.") from None
     kind = getattr(open3d.t.io, "RealSenseSensor", None)
     if kind is None:
         raise DeviceError(f"{name}: this Open3D was built without RealSense; record clouds by folder:PATH instead.")

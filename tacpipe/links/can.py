@@ -8,8 +8,9 @@ import termios
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import extras
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links import ports, serial_port
+from tacpipe.links import serial_port
 from tacpipe.links.arrival import Arrivals
 from tacpipe.links.opened import Arrived, Opened
 from tacpipe.sensors.sensor import Sensor
@@ -31,12 +32,8 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
     Raises `UsageError` for an address that is none, `DeviceError` for an interface that is missing, down, or not permitted.
     """
     kind, channel, bitrate = parsed(place)
-    try:
+    with extras.named(name):
         import can
-    except ImportError:
-        raise DeviceError(
-            f"{name}: CAN needs the package python-can, which is not installed: {ports.INSTALL}."
-        ) from None
     if kind == "slcan":
         serial_port.refuse_missing(channel, name)
     options: dict[str, Any] = {"bitrate": bitrate} if bitrate and kind == "slcan" else {}

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import DeviceError
+from tacpipe import extras
+from tacpipe.errors import DeviceError, MissingModuleError
 
 BY_ID = Path("/dev/serial/by-id")
-INSTALL = "`pip install 'tacpipe[devices]'` brings it"
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,9 @@ class Port:
 
 
 def serial_ports() -> list[Port]:
-    """Return the serial ports that are there."""
-    from serial.tools import list_ports
+    """Return the serial ports that are there. Raises `MissingModuleError` without pyserial."""
+    with extras.named("A serial port"):
+        from serial.tools import list_ports
 
     lasting = {str(path.resolve()): str(path) for path in BY_ID.glob("*")} if BY_ID.is_dir() else {}
     found = []
@@ -46,7 +47,7 @@ def hid_ports() -> list[Port]:
     """Return the interfaces of HID devices that are there; none where hidapi is not installed."""
     try:
         found = hid_module().enumerate()
-    except DeviceError:
+    except (DeviceError, MissingModuleError):
         return []
     return [
         Port(f"hid:{told['path'].decode()}", f"{told['vendor_id']:04x}:{told['product_id']:04x}", _described(told))
@@ -75,17 +76,19 @@ def listed(ports: list[Port]) -> str:
 def hid_module() -> Any:
     """Return hidapi's module: ``hidraw`` on Linux, which leaves the kernel's driver in place, else ``hid``.
 
-    Raises `DeviceError` where it is not installed, or another package's module of the name is in its place.
+    Raises `MissingModuleError` where it is not installed, `DeviceError` where another package's module of the name is in its
+    place.
     """
     name = "hidraw" if sys.platform == "linux" else "hid"
+    found: Any = None
     try:
-        found: Any = importlib.import_module(name)
-    except ImportError:
-        found = None
+        found = importlib.import_module(name)
+    except ImportError as error:
+        absent = extras.missing(error, "A HID device")
+        if absent is not None and importlib.util.find_spec("hid") is None:
+            raise absent from error
     if hasattr(found, "device"):
         return found
-    if found is None and importlib.util.find_spec("hid") is None:
-        raise DeviceError(f"HID devices need the package hidapi, which is not installed: {INSTALL}.")
     raise DeviceError(
         f"Another package has taken the place of hidapi's module {name}: `pip uninstall hid`, then "
         f"`pip install --force-reinstall hidapi`."

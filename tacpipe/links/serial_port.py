@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe import extras
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import holders, ports
 from tacpipe.links.opened import Arrived, Descriptor
@@ -60,7 +61,8 @@ def refused(error: OSError, place: str, name: str) -> DeviceError:
 
 
 def _opened(place: str, baud: int, line: Line, name: str) -> serial.Serial:
-    import serial
+    with extras.named(name):
+        import serial
 
     port = serial.Serial(timeout=0, exclusive=True)
     port.port, port.baudrate = place, baud

@@ -7,6 +7,7 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
+from tacpipe import extras
 from tacpipe.errors import DeviceError
 from tacpipe.links import network
 from tacpipe.links.opened import Arrived, Opened
@@ -27,8 +28,9 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
 
     Raises `DeviceError` for a host that is unknown, unreachable, refuses, or speaks something else.
     """
-    from websockets.exceptions import WebSocketException
-    from websockets.sync.client import connect
+    with extras.named(name):
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
 
     where, _, path = place.partition("/")
     host, port = network.place("ws", where)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 
 from tacpipe.errors import DeviceError
-from tacpipe.recording import stranger
+from tacpipe.recording import clock, stranger
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.station import LOST, Station
@@ -65,21 +64,21 @@ class Recorder:
 
     def run(self, until: Callable[[], bool], each: Callable[[], None] = lambda: None) -> None:
         """Tick until ``until()``; ``each`` is called after every tick."""
-        due_s = time.monotonic()
+        due_s = clock.now_s()
         while not until():
             self.tick()
             each()
-            due_s = max(due_s + TICK_S, time.monotonic())
-            time.sleep(max(0.0, due_s - time.monotonic()))
+            due_s = max(due_s + TICK_S, clock.now_s())
+            clock.sleep(max(0.0, due_s - clock.now_s()))
 
     def await_first(self, stopped: Callable[[], bool]) -> None:
         """Wait until every stream that should gave a sample. Raises `DeviceError` naming those that do not, and why."""
-        deadline_s = time.monotonic() + FIRST_S
+        deadline_s = clock.now_s() + FIRST_S
         late = {name for name, watch in self.watches.items() if watch.stream.sensor.awaited}
 
         def settled() -> bool:
             late.difference_update({name for name in late if self.watches[name].samples})
-            return not late or stopped() or time.monotonic() > deadline_s
+            return not late or stopped() or clock.now_s() > deadline_s
 
         self.run(settled)
         if late and not stopped():
@@ -90,13 +89,13 @@ class Recorder:
         """Spool what comes while in the block, and with ``preroll`` what came right before; then finish the spool."""
         ended = threading.Event()
         syncing = threading.Thread(target=_sync, args=(spool, ended), daemon=True)
-        since_ns = time.monotonic_ns() - round(PREROLL_S * 1e9)
+        since_ns = clock.now_ns() - round(PREROLL_S * 1e9)
         for name, station in self.stations.items():
             self._watched(name, station.take())
             early = _since(self._before[name], since_ns) if preroll else None
             found = station.begin(functools.partial(spool.tally, spool.streams[name]), early)
             if station.error is not None:  # of what happened before a recording nothing else would tell
-                spool.note(Note(time.monotonic_ns(), name, LOST, str(station.error)))
+                spool.note(Note(clock.now_ns(), name, LOST, str(station.error)))
             if early is not None:
                 _spooled(spool, name, [*early, *found])
             self._watched(name, found)
@@ -119,7 +118,7 @@ class Recorder:
         """Return a sentence for each stream whose link is lost now, or open and silent where it should not be."""
         sentences = []
         for name, station in self.stations.items():
-            silent_s = (time.monotonic_ns() - (self.watches[name].last_ns or 0)) / 1e9
+            silent_s = (clock.now_ns() - (self.watches[name].last_ns or 0)) / 1e9
             if station.error is not None:
                 sentences.append(str(station.error))
             elif station.stream.sensor.awaited and silent_s > SILENT_S:
@@ -141,8 +140,8 @@ class Recorder:
         before = self._before[name]
         if blocks:
             self.watches[name].feed(blocks)
-            before.append((time.monotonic_ns(), blocks))
-        while before and before[0][0] < time.monotonic_ns() - PREROLL_S * 1e9:
+            before.append((clock.now_ns(), blocks))
+        while before and before[0][0] < clock.now_ns() - PREROLL_S * 1e9:
             before.popleft()
 
     def _silent(self, name: str) -> str:

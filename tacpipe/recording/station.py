@@ -24,6 +24,7 @@ READ_S = 0.1  # longest wait of a read, after which the thread looks whether it 
 AGAIN_S = (0.1, 2.0)  # between two tries to open a lost link: first, and at most
 MUTE_S = 4.0  # after which a device that should send datagrams and does not is asked anew: nothing else tells its loss
 TARE_S = 5.0  # in which a device must have tared
+STOP_S = 2.0  # in which a thread must have ended
 REPLY_S = 0.5  # after which a device that is asked for each frame is asked once more
 
 Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
@@ -110,7 +111,7 @@ class Station:
         """End the thread, tell the device to stop, close the link."""
         self._ending.set()
         if self._thread.is_alive():
-            self._thread.join(timeout=2.0)
+            self._thread.join(timeout=STOP_S)
         link, self._link = self._link, None
         if link is not None:
             with contextlib.suppress(Exception):  # whatever a device says to its end, the others are to be closed too

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 from tacpipe import interruption
 from tacpipe.errors import TacpipeError
 from tacpipe.interruption import Ended
-from tacpipe.recording import appending, sealing, triggers
+from tacpipe.recording import appending, clock, sealing, triggers
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Spool, Spooled
@@ -108,16 +107,16 @@ def _record(
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
     header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
     spool = Spool(store.root, {**header, "rig": recorder.rig.text}, list(recorder.stations))
-    began_s = time.monotonic()
+    began_s = clock.now_s()
 
     def over() -> bool:
-        late = plan.duration_s is not None and time.monotonic() - began_s >= plan.duration_s
+        late = plan.duration_s is not None and clock.now_s() - began_s >= plan.duration_s
         return ended() or late or stops()
 
     kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
     with interruption.saying(f"tacpipe: interrupted. {kept}."), contextlib.closing(spool):  # nobody else may recover it
         with recorder.recording(spool, preroll=plan.start != "now"):
-            recorder.run(over, lambda: view.show(f"recording {name}, {time.monotonic() - began_s:.0f} s"))
+            recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
         lost = recorder.lost()  # now: while it is sealed nobody looks at what comes
         view.show(f"sealing {name}")
         try:

@@ -7,13 +7,13 @@ import json
 import os
 import select
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
 
 from tacpipe.errors import UsageError
+from tacpipe.recording import clock
 from tacpipe.recording.watch import Watch, tactile_channels
 
 STARTS, STOPS = ("now", "key", "contact", "tap"), ("duration", "key", "contact", "tap")
@@ -99,14 +99,14 @@ class Contact:
             if watch.newest is None or watch.rest is None:
                 continue
             if np.abs(watch.newest[places] - watch.rest[places]).max() > self._threshold:
-                self._touched_s = time.monotonic()
+                self._touched_s = clock.now_s()
                 return True
         return False
 
     def released(self) -> bool:
         """Return whether nothing has been touched for `RELEASE_S` after a touch."""
         touched = self.touched()
-        return not touched and self._touched_s is not None and time.monotonic() - self._touched_s > RELEASE_S
+        return not touched and self._touched_s is not None and clock.now_s() - self._touched_s > RELEASE_S
 
 
 class Tap:
@@ -119,7 +119,7 @@ class Tap:
                 'This rig has no stream of sensor "tap" that could say when to start or stop. Add one to the rig file, or '
                 "start and stop by key, time or contact."
             )
-        self._since_ns = [time.monotonic_ns() for _ in self._watches]
+        self._since_ns = [clock.now_ns() for _ in self._watches]
 
     def said(self, word: str) -> bool:
         """Return whether ``{"event": word}`` came since this was made; what came up to it, or at all, is dealt with."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from tacpipe import progress
+from tacpipe.recording import clock
 from tacpipe.recording.watch import Figures, Watch, tactile_channels
 
 FRAMES_HZ = 8.0  # of the view on a terminal
@@ -25,7 +25,7 @@ class View:
     def __init__(self, watches: Mapping[str, Watch], *, quiet: bool = False) -> None:
         self._watches, self._quiet = watches, quiet
         self._live: Any = None
-        self._shown_s = time.monotonic()
+        self._shown_s = clock.now_s()
         self._tactile = {
             name: [place for place, _ in tactile_channels(watch.stream)] for name, watch in watches.items()
         }
@@ -46,11 +46,11 @@ class View:
 
     def show(self, state: str) -> None:
         """Show what the streams do now, and ``state``: what the rig is doing."""
-        now_s = time.monotonic()
+        now_s = clock.now_s()
         if self._quiet or now_s - self._shown_s < (1 / FRAMES_HZ if self._live else LINE_S):
             return
         self._shown_s = now_s
-        figures = {name: watch.figures(time.monotonic_ns()) for name, watch in self._watches.items()}
+        figures = {name: watch.figures(clock.now_ns()) for name, watch in self._watches.items()}
         if self._live is not None:
             self._live.update(self._picture(state, figures))
         else:

@@ -24,7 +24,7 @@ from tacpipe.links.opening import open_link
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Sensor
 
-SOON_S = 5.0  # that anything may take; nothing waits for so long unless it fails
+SOON_S = 300.0  # that anything may take; nothing waits for so long unless it fails
 
 
 @dataclass

@@ -78,6 +78,7 @@ def talk(count: int, rate_hz: int, *, unplug: bool = False) -> tuple[dict[str, A
 
 
 @mocked
+@pytest.mark.rig
 def test_every_report_comes_and_what_is_written_arrives() -> None:
     found, heard = talk(1500, 1000)
 
@@ -89,6 +90,7 @@ def test_every_report_comes_and_what_is_written_arrives() -> None:
 
 
 @mocked
+@pytest.mark.rig
 def test_a_board_that_is_unplugged_is_lost() -> None:
     found, _ = talk(20, 500, unplug=True)
 

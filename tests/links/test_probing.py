@@ -77,6 +77,7 @@ def played(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[byte
     os.close(master)
 
 
+@pytest.mark.rig
 def test_a_device_that_streams_is_found_at_its_rate_of_baud_without_a_word_to_it() -> None:
     steps: list[str] = []
     with played(*flexitac()) as (path, heard):
@@ -89,6 +90,7 @@ def test_a_device_that_streams_is_found_at_its_rate_of_baud_without_a_word_to_it
     assert len(steps) >= 2 and all("listening at" in step for step in steps)
 
 
+@pytest.mark.rig
 def test_a_silent_device_is_asked_as_its_driver_does_and_told_to_stop() -> None:
     with played(*optoforce()) as (path, heard):
         report = probing.probe(parse(f"serial:{path}"))
@@ -99,6 +101,7 @@ def test_a_silent_device_is_asked_as_its_driver_does_and_told_to_stop() -> None:
     assert b"".join(heard).endswith(bytes.fromhex("aa 00 32 03 00 04 00 00 e3"))  # speed 0: stop
 
 
+@pytest.mark.rig
 def test_nothing_is_written_to_a_device_that_is_only_listened_to() -> None:
     with played(*optoforce()) as (path, heard):
         report = probing.probe(parse(f"serial:{path}"), passive=True)
@@ -121,6 +124,7 @@ def test_a_port_that_cannot_be_opened_is_reported_with_its_reason() -> None:
     assert not report.certain
 
 
+@pytest.mark.rig
 def test_the_command_prints_what_speaks_and_the_lines_for_the_rig_file(lab: Lab) -> None:
     with played(*flexitac()) as (path, _):
         told = lab.run(f"sensors probe {path}").out
@@ -142,6 +146,7 @@ def test_the_command_exits_with_5_where_nothing_is_recognised(lab: Lab) -> None:
     assert "there is no port /dev/ttyNOWHERE" in ran.out
 
 
+@pytest.mark.rig
 def test_datagrams_are_recognised_too(lab: Lab) -> None:
     sensor = rig.make("ati-netft", {}, "test")
     frames = sensor.encode(_some(sensor))

@@ -48,6 +48,7 @@ def stamping() -> Iterator[None]:
         yield
 
 
+@pytest.mark.rig
 @pytest.mark.usefixtures("stamping")
 def test_a_datagram_is_stamped_when_it_came_and_not_when_it_was_read() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:

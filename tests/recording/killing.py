@@ -29,6 +29,7 @@ from tacpipe.simulation.emulation.emulate_command import SWITCH_S
 from tacpipe.simulation.emulation.emulator import Emulator
 
 BIN = Path(sys.executable).parent
+ROOT = Path(__file__).parents[2]
 RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"
 
 
@@ -46,18 +47,28 @@ class Cost:
 @contextmanager
 def emulated(folder: Path) -> Iterator[Emulator]:
     """Serve the rig of the first paper, its rig file with addresses in ``folder``."""
-    with Emulator(rig_of.read(RIG), folder=folder / "emulated") as emulator:
+    with Emulator(rig_of.read(RIG), folder=folder / "emulated", patient=True) as emulator:
         (folder / "rig.toml").write_text(rig_file.text(emulator.rig))
         yield emulator
 
 
-def kill(emulator: Emulator, folder: Path, after_s: float, duration_s: float) -> list[Cost] | None:
-    """Kill a recording ``after_s`` seconds after its start, recover it, compare; None if it had not begun or had ended."""
-    environment = {**os.environ, "TACPIPE_STORE": str(folder / "store")}
+def kill(
+    emulator: Emulator, folder: Path, after_s: float, duration_s: float, *, begun: bool = False
+) -> list[Cost] | None:
+    """Kill a recording ``after_s`` seconds after its start, recover it, compare; None if it had not begun or had ended.
+
+    With ``begun`` the seconds count from the first bytes that are on the disk.
+    """
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "TACPIPE_STORE": str(folder / "store"), "PYTHONPATH": path}
     output = folder / "rec"
     before = set(names(output))
     words = ["acquire", str(folder / "rig.toml"), "-o", str(output), "--duration", str(duration_s), "--quiet"]
-    process = subprocess.Popen([str(BIN / "tacpipe"), *words], env=environment, stdout=subprocess.DEVNULL)
+    recorder = [sys.executable, "-m", "tests.recording.patient", *words]
+    process = subprocess.Popen(recorder, env=environment, stdout=subprocess.DEVNULL)
+    while begun and not any(file.stat().st_size for file in (folder / "store/spool").glob("*/bytes")):
+        assert process.poll() is None, "the recording ended before it began"
+        time.sleep(0.01)
     time.sleep(after_s)
     process.send_signal(signal.SIGKILL)
     killed_ns = time.monotonic_ns()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from tacpipe.simulation.emulation.matching import STAMPS
 from tests.simulation.emulation.rigs import awaited
 
 __all__ = ["awaited"]
+ROOT = Path(__file__).parents[2]
 
 
 def stream(name: str, sensor: str, transport: str, options: str = "{}") -> str:
@@ -39,15 +41,18 @@ PROGRAM = stream("program", "tap", "udp::4010")  # says when to start
 @contextmanager
 def served(folder: Path, *streams: str, faults: Faults | None = None, head: str = "") -> Iterator[Emulator]:
     """Serve a rig of these streams, its rig file with the addresses that were made in ``folder``."""
-    with Emulator(rig_of.parse(head + "".join(streams)), faults=faults, folder=folder / "emulated") as emulator:
+    asked = rig_of.parse(head + "".join(streams))
+    with Emulator(asked, faults=faults, folder=folder / "emulated", patient=True) as emulator:
         (folder / "rig.toml").write_text(rig_file.text(emulator.rig))
         yield emulator
 
 
-def started(folder: Path, options: str, **popen: Any) -> subprocess.Popen[str]:
+def started(folder: Path, options: str, rig: str = "rig.toml", **popen: Any) -> subprocess.Popen[str]:
     """Return ``tacpipe acquire rig.toml -o rec`` with options, running in a process of its own."""
-    words = [sys.executable, "-m", "tacpipe.cli", "acquire", "rig.toml", "-o", "rec", *options.split()]
-    return subprocess.Popen(words, cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **popen)
+    words = [sys.executable, "-m", "tests.recording.patient", "acquire", rig, "-o", "rec", *options.split()]
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(words, cwd=folder, env={**os.environ, "PYTHONPATH": path}, text=True, **pipes | popen)
 
 
 def spools(folder: Path) -> list[Path]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,9 +34,10 @@ def rig(lab: Lab, served: Emulator) -> Emulator:
     return served
 
 
+@pytest.mark.rig
 def test_the_rig_of_the_first_paper_is_recorded_sample_by_sample(lab: Lab) -> None:
     with live.served(lab.folder, killing.RIG.read_text()) as emulator:
-        lab.run("acquire rig.toml -o rec --duration 1.5")
+        lab.run("acquire rig.toml -o rec --duration 1")
         shard = live.only(lab.folder)
 
         assert sorted(shard.streams) == ["proximity", "robot", "xela1", "xela2"]  # and no events
@@ -131,29 +130,17 @@ def test_json_tells_what_was_recorded(lab: Lab, rig: Emulator) -> None:
     assert set(recording["lost"]) == set(rows) and recording["lost"]["force"] == 0
 
 
-def test_a_dry_run_tells_rates_and_writes_nothing(lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.acquire_command.DRY_RUN_S", 1.0)
+def test_a_dry_run_opens_every_stream_and_writes_nothing(
+    lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tacpipe.acquire_command.DRY_RUN_S", 0.2)
     before = sorted(lab.folder.rglob("*"))
-    lines = lab.run("acquire rig.toml --dry-run").out.splitlines()
     told = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
 
-    assert [line.split()[0] for line in lines] == list(rig.rig.streams) and all(
-        " Hz, jitter " in line for line in lines
+    assert {name: found["samples"] > 0 for name, found in told["streams"].items()} == dict.fromkeys(
+        rig.rig.streams, True
     )
-    assert list(told["streams"]) == list(rig.rig.streams)
-    for name, found in told["streams"].items():
-        assert set(found) == {"rate_hz", "jitter_ms", "latency_ms", "samples", "lost", "bytes_lost"}
-        assert found["samples"] > 0 and found["bytes_lost"] == 0
-        assert name == "range" or found["lost"] == 0  # which does not count: a late frame may be taken for a lost one
     assert sorted(lab.folder.rglob("*")) == before
-
-
-def test_a_rate_that_is_not_the_rig_files_is_told(lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.acquire_command.DRY_RUN_S", 1.0)
-    place = str(rig.rig.streams["skin"].address)
-    (lab.folder / "rig.toml").write_text(live.stream("skin", "xela", place, "{ rate_hz = 200 }"))
-
-    assert lab.run("acquire rig.toml --dry-run").out.endswith("; 200 Hz were expected\n")
 
 
 def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: Lab) -> None:
@@ -198,13 +185,12 @@ def test_two_recordings_at_once_are_both_appended(lab: Lab, rig: Emulator) -> No
         stream = rig.rig.streams[name]
         options = "{ axes = 3, rate_hz = 333 }" if name == "force" else "{}"
         (lab.folder / f"{name}.toml").write_text(live.stream(name, stream.kind, str(stream.address), options))
-    words = "acquire {0}.toml -o rec --duration 1 --name {0} --quiet"
     both = [
-        subprocess.Popen([sys.executable, "-m", "tacpipe.cli", *words.format(name).split()], cwd=lab.folder)
-        for name in ("force", "range")
+        live.started(lab.folder, f"--duration 1 --name {name} --quiet", f"{name}.toml") for name in ("force", "range")
     ]
+    told = [one.communicate()[1] for one in both]
 
-    assert [one.wait() for one in both] == [0, 0]
+    assert [one.returncode for one in both] == [0, 0], told
     found = live.shards(lab.folder)
     assert {name: shard.streams[-1:] for name, shard in found.items()} == {"force": ("force",), "range": ("range",)}
     for name, shard in found.items():

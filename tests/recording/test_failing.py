@@ -13,15 +13,14 @@ import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.links.link import LinkLostError
+from tacpipe.recording import clock, sealing, station, triggers
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording import sealing, station, triggers
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.spool import Note, Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples
 from tests.conftest import Lab
-from tests.recording import live
 
 RIG = """
 [[stream]]
@@ -101,7 +100,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, links: dict[str, list[Link]]) -> Rec
 
 
 def until(what: Any, recorder: Recorder) -> None:
-    deadline_s = time.monotonic() + 20
+    deadline_s = time.monotonic() + 300
     recorder.run(lambda: what() or time.monotonic() > deadline_s)
     assert what()
 
@@ -179,6 +178,7 @@ def test_what_is_recorded_before_a_trigger_arrived_within_half_a_second(
 ) -> None:
     recorder = opened(monkeypatch, {"a": [Link([])], "b": [Link([])]})
     now_ns = time.monotonic_ns()
+    monkeypatch.setattr(clock, "now_ns", lambda: now_ns)
     sent = frames(3000)
     late = chunks(
         range(3000), sent, now_ns - 3000 * PERIOD_NS
@@ -190,7 +190,7 @@ def test_what_is_recorded_before_a_trigger_arrived_within_half_a_second(
     spool.close()
 
     (block,) = [block for _, block in Spooled(spool.folder).blocks("a") if isinstance(block, Chunks)]
-    assert 300 < len(block.size) <= 501 and int(block.t_ns[-1]) == int(late.t_ns[-1])
+    assert len(block.size) == 500 and int(block.t_ns[-1]) == int(late.t_ns[-1])
 
 
 def test_a_disk_that_fails_a_sync_ends_the_recording_with_a_sentence(
@@ -253,16 +253,3 @@ def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch)
             assert pressed() is False
             with pytest.raises(UsageError, match="No key can be pressed"):
                 pressed(must=True)
-
-
-def test_a_long_sealing_is_no_silence_of_the_devices(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    seal = sealing.seal
-
-    def slowly(*given: Any) -> Any:
-        time.sleep(1.0)
-        return seal(*given)
-
-    monkeypatch.setattr(sealing, "seal", slowly)
-    monkeypatch.setattr("tacpipe.recording.recorder.SILENT_S", 0.5)
-    with live.served(lab.folder, live.FORCE):
-        lab.run("acquire rig.toml -o rec --duration 1 --quiet")

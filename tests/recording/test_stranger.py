@@ -19,6 +19,7 @@ from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab
 from tests.recording import live
 
+pytestmark = pytest.mark.rig
 SLOW = live.stream("slow", "optoforce", "serial:/dev/ttyACM1", "{ axes = 3, rate_hz = 100, baud = 115200 }")
 ORIGINAL = live.stream("plain", "tfmini", "serial:/dev/ttyUSB1", '{ model = "original" }')
 
@@ -31,9 +32,10 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
 
 
 @pytest.fixture(autouse=True)
-def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for a first frame as long as a test can bear."""
-    monkeypatch.setattr("tacpipe.recording.recorder.FIRST_S", 1.0)
+def patience(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for a first frame as long as a test can bear where none comes, and as usual where a device sends others."""
+    if "served" not in request.fixturenames:
+        monkeypatch.setattr("tacpipe.recording.recorder.FIRST_S", 1.0)
 
 
 @pytest.fixture
@@ -141,7 +143,7 @@ def test_another_sensor_is_named(lab: Lab, served: Emulator) -> None:
     (told,) = refused(lab, live.stream("force", "optoforce", at, "{ baud = 115200 }"))
 
     assert re.fullmatch(
-        re.escape(f"Stream force ({at}): a frame of optoforce was awaited for 1 s, but ")
+        re.escape(f"Stream force ({at}): a frame of optoforce was awaited for 3 s, but ")
         + r"[\d,]+ bytes came that hold none\. They are frames of tfmini: name that in the rig file, or plug in the other "
         r"device\.",
         told,

@@ -122,8 +122,9 @@ def test_a_device_that_is_away_at_the_end_is_an_error_and_the_rest_is_kept(lab: 
     assert not live.spools(lab.folder)
 
 
+@pytest.mark.rig
 def test_a_box_of_datagrams_that_went_mute_is_asked_anew(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.recording.station.MUTE_S", 0.5)
+    monkeypatch.setattr("tacpipe.recording.station.MUTE_S", 3.0)
     with live.served(lab.folder, live.WRENCH, live.FORCE) as rig:
 
         def happen() -> None:

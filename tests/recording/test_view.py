@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from rich.console import Console
 
 from tacpipe import progress
 from tacpipe.links.link import Address
-from tacpipe.recording import rig
+from tacpipe.recording import clock, rig
 from tacpipe.recording import view as view_of
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.view import View
@@ -31,7 +30,7 @@ def force(monkeypatch: pytest.MonkeyPatch) -> Watch:
     watch = Watch(Stream("force", "optoforce", OptoForce(axes=3), Address("serial", "/dev/ttyACM0")))
     sent = list(enumerate(frames(400)))
     watch.feed([Chunks.of([(row * 1_000_000, frame) for row, frame in sent[:100] + sent[107:]])])
-    monkeypatch.setattr(time, "monotonic_ns", lambda: 400_000_000)
+    monkeypatch.setattr(clock, "now_ns", lambda: 400_000_000)
     return watch
 
 
@@ -52,7 +51,7 @@ def pad(touched: int | None = None) -> Watch:
 def rendered(view: View, watches: dict[str, Watch], *, colours: bool = False) -> str:
     """Return what the view draws on a terminal."""
     console = Console(file=io.StringIO(), width=100, force_terminal=colours, color_system="256" if colours else None)
-    figures = {name: watch.figures(time.monotonic_ns()) for name, watch in watches.items()}
+    figures = {name: watch.figures(clock.now_ns()) for name, watch in watches.items()}
     console.print(view._picture("recording one, 3 s", figures))
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return text
@@ -75,7 +74,7 @@ def test_lines_come_now_and_then_and_not_at_all_if_asked(
     force: Watch, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now_s = [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(clock, "now_s", lambda: now_s[0])
     loud, quiet = View({"force": force}), View({"force": force}, quiet=True)
     for step in range(12):
         now_s[0] = 100.0 + step

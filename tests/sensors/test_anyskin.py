@@ -111,6 +111,7 @@ def test_ends_of_frames_among_the_numbers_that_hold_still_mislead_nobody() -> No
     assert set(rows_of(found)) <= sent
 
 
+@pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
     sensor, numbers = AnySkin(), made(100, 6)
     frames = sensor.encode(Samples((numbers,)))

@@ -79,6 +79,7 @@ def test_two_marks_as_far_apart_as_frames_are_make_none() -> None:
     assert (losses[0].cause, losses[0].bytes) == ("start", len(noise))
 
 
+@pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
     sensor = FlexiTac(rows=16, columns=16)
     taxels = made(sensor, 200, 3)

@@ -69,6 +69,7 @@ def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(seed: int, bit: i
     assert len(rows_of(found)) >= 18 and set(rows_of(found)) <= {row.tobytes() for row in taxels}
 
 
+@pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
     taxels, device = made(50, 2), SENSOR.device()
     frames = SENSOR.encode(Samples((taxels,)))

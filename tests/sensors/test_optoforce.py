@@ -70,6 +70,7 @@ def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(axes: int, seed: 
     assert set(rows_of(found)) < set(rows_of([samples]))
 
 
+@pytest.mark.rig
 def test_the_vendors_client_is_served_and_sets_rate_and_filter() -> None:
     sensor, samples = OptoForce(axes=3), made(3, 500, 2)
     frames, device = sensor.encode(samples), sensor.device()

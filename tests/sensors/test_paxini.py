@@ -175,6 +175,7 @@ def test_the_first_forces_that_are_pushed_are_looked_at_and_stay_a_sample() -> N
         pushed(error)
 
 
+@pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
     samples, device = made(HAND, 100, 3), HAND.device()
     frames = HAND.encode(samples)

@@ -116,6 +116,7 @@ def test_the_clock_is_time_once_its_tick_is_known() -> None:
     assert Robotiq(fingers=1, parts=("timestamp",)).decode(frames).t_device_ns is None
 
 
+@pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
     samples, device = made(BOTH, 100, 3), BOTH.device()
     frames = BOTH.encode(samples)

@@ -174,6 +174,7 @@ def test_a_controller_that_refuses_is_told_in_a_sentence(replies: list[str], sen
             ask = dialogue.send(reply_of(ask, reply))
 
 
+@pytest.mark.rig
 def test_the_client_of_ur_rtde_reads_what_our_controller_sends() -> None:
     pytest.importorskip("rtde_receive")
     sensor = UrRtde()

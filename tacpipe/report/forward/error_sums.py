@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -61,13 +60,16 @@ def read(content: bytes) -> ErrorSums:
 
     Raises `TacpipeError` where a column is missing, or where predictors were not judged on the same windows.
     """
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = pq.read_schema(io.BytesIO(content))
+    from tacpipe.tables import owned
+
+    schema = pq.read_schema(pa.BufferReader(owned(content)))
     missing = [name for name in COLUMNS if name not in schema.names]
     if missing:
         raise TacpipeError(f"{FILE} has no column {' and no '.join(missing)}. Evaluate the model again.")
-    table = pq.read_table(io.BytesIO(content), columns=list(COLUMNS))
+    table = pq.read_table(pa.BufferReader(owned(content)), columns=list(COLUMNS))
     table = table.filter(np.logical_not(table["seen"].to_numpy()))
     (predictors, predictor), (groups, group), (recordings, recording) = (
         _coded(table[name]) for name in ("predictor", "group", "recording")

@@ -45,7 +45,7 @@ class Emulator:
     """A rig that is served while the ``with`` statement lasts.
 
     ``rig`` is the same rig with the addresses that were made, ``ledger`` tells for each stream what was sent and what was
-    harmed, ``folder`` holds pseudo-terminals and files.
+    harmed, ``folder`` holds pseudo-terminals and files. With ``patient`` no frame is lost because a host fetches it late.
     """
 
     def __init__(
@@ -55,7 +55,10 @@ class Emulator:
         faults: Faults | None = None,
         folder: Path | None = None,
         world: World | None = None,
+        *,
+        patient: bool = False,
     ) -> None:
+        self.patient = patient
         self.asked, self.seed, self.faults = rig, seed, faults or Faults()
         self.folder = folder or Path()
         self._temporary = folder is None
@@ -131,7 +134,8 @@ class Emulator:
             seed = [*self._seed(stream.name), start_ns]
             return Plan(source, its_pace, self.faults, seed, packets=packets)
 
-        return Transmission(endpoint, stream.sensor, self.ledger[stream.name], planned, rate_hz, self.epoch_ns)
+        ledger, patient = self.ledger[stream.name], self.patient
+        return Transmission(endpoint, stream.sensor, ledger, planned, rate_hz, self.epoch_ns, patient=patient)
 
     def source(self, name: str, its_pace: Pace, rate_hz: float, start_ns: int = 0) -> Sampled:
         """Return the source of a stream."""

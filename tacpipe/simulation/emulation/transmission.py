@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
@@ -20,6 +21,8 @@ from tacpipe.simulation.emulation.source import Sampled
 AHEAD_NS = 1_500_000_000  # that frames are planned before they are due
 IDLE_NS = 20_000_000  # between looks at a stream that nobody receives
 MOST_TOLD = 1000  # messages of the host that the ledger keeps
+PATIENT_S = 30.0  # that a patient device waits for a host to fetch, before a frame is lost after all
+PAUSE_S = 0.002  # between two tries
 
 
 class Plan:
@@ -58,7 +61,10 @@ class Transmission:
         planned: Callable[[float, int], Plan],  # of a rate and a start, ns from the rig's start
         rate_hz: float,
         epoch_ns: int,
+        *,
+        patient: bool = False,  # what a host has no room for waits, and is not lost
     ) -> None:
+        self._patient = patient
         self.endpoint, self.sensor, self.ledger = endpoint, sensor, ledger
         self._planned, self._epoch_ns = planned, epoch_ns
         self._rate_hz = rate_hz
@@ -138,8 +144,22 @@ class Transmission:
     def _post(self, peer: Peer, pieces: Sequence[bytes]) -> list[int]:
         post: Callable[[Sequence[bytes]], list[int]] = getattr(peer, "post", peer.send)
         full = [piece for piece in pieces if piece]
-        taken = iter(post(full) if full else [])
+        taken = iter(self._insisted(peer, post, full) if self._patient else post(full) if full else [])
         return [next(taken) if piece else 0 for piece in pieces]
+
+    def _insisted(self, peer: Peer, post: Callable[[Sequence[bytes]], list[int]], pieces: Sequence[bytes]) -> list[int]:
+        """Post pieces one by one as the host has room for them, as long as it is there; return the size of each."""
+        sizes = [0] * len(pieces)
+        until_s = time.monotonic() + PATIENT_S
+        for number, piece in enumerate(pieces):
+            while sizes[number] < len(piece) and self.endpoint.peers and time.monotonic() < until_s:
+                if not getattr(peer, "full", bool)():
+                    sizes[number] += post([piece[sizes[number] :]])[0]
+                if sizes[number] < len(piece):
+                    if peer.fault == byte_faults.GONE or getattr(self.endpoint, "left", bool)():
+                        return sizes
+                    time.sleep(PAUSE_S)
+        return sizes
 
     def _enter(self, items: Iterable[Item], sizes: Sequence[int], fault: str, now_ns: int) -> None:
         for item, size in zip(items, sizes, strict=True):

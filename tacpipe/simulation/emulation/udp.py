@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Sequence
+from pathlib import Path
 
 from tacpipe.links.link import Address
 from tacpipe.sensors.sensor import Sensor
@@ -12,6 +13,7 @@ from tacpipe.simulation.emulation import byte_faults
 
 HOST = "127.0.0.1"
 MOST = 65_536
+MOST_WAITING = 65_536  # bytes, of the 200 KiB that a queue has by default
 
 
 class Correspondent:
@@ -23,6 +25,10 @@ class Correspondent:
         self.endpoint, self.target = endpoint, target
         self.device = endpoint.sensor.device()
         self.wanted = 0
+
+    def full(self) -> bool:
+        """Whether the host has left so much in its queue that the kernel may soon drop what comes."""
+        return (waiting(self.target[1]) or 0) > MOST_WAITING
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send each piece as a datagram; those that the network refuses are lost."""
@@ -84,6 +90,15 @@ class Udp:
     def close(self) -> None:
         """End."""
         self._socket.close()
+
+
+def waiting(port: int) -> int | None:
+    """Return how many bytes of memory hold what waits at a UDP port of this computer, None if nobody listens."""
+    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+        fields = line.split()
+        if int(fields[1].rpartition(":")[2], 16) == port:
+            return int(fields[4].rpartition(":")[2], 16)
+    return None
 
 
 def free_port() -> int:

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Sequence
 from typing import Any
 
+from tacpipe import extras
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation.tcp import Connection, Tcp
 
@@ -43,6 +44,10 @@ class Websocket(Tcp):
 
     scheme = "ws"
     kind = Client
+
+    def __init__(self, sensor: Sensor) -> None:
+        extras.require("An emulated websocket", "websockets")
+        super().__init__(sensor)
 
     def understood(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
         """Return the messages in the host's bytes, an empty one for a new connection; answer handshakes and pings."""

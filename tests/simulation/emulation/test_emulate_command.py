@@ -9,10 +9,13 @@ import sys
 from pathlib import Path
 
 import pyarrow.parquet as pq
+import pytest
 
 from tacpipe.links.opening import open_link
 from tacpipe.recording import rig
 from tests.simulation.emulation.rigs import FOLDER, awaited
+
+pytestmark = pytest.mark.rig
 
 COMMAND = [sys.executable, "-m", "tacpipe.cli", "sensors", "emulate"]
 

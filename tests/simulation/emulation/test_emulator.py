@@ -29,6 +29,8 @@ from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
 from tests.simulation.emulation.rigs import ALL_SENSORS, FIRST_PAPER, PATIENCE_S, awaited, in_order, one
 
+pytestmark = pytest.mark.rig
+
 FRAMES = 60
 
 

@@ -21,6 +21,8 @@ from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation.emulator import Emulator
 from tests.simulation.emulation.rigs import in_order, one
 
+pytestmark = pytest.mark.rig
+
 FRAMES = 20
 
 

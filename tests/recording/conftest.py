@@ -1,0 +1,25 @@
+"""Recordings of emulated devices run in real time: they are a tier of their own, with limits that measure no computer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.recording import patient
+
+SERVED = {"acquired", "rig", "served"}  # fixtures that emulate devices
+
+
+@pytest.hookimpl(tryfirst=True)  # before markers choose what runs
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if Path(__file__).parent in item.path.parents and SERVED & set(getattr(item, "fixturenames", ())):
+            item.add_marker("rig")
+
+
+@pytest.fixture(autouse=True)
+def patience(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have devices that are emulated in real time awaited for as long as it takes."""
+    if request.node.get_closest_marker("rig"):
+        patient.relax(monkeypatch)

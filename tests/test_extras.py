@@ -1,0 +1,291 @@
+"""Without tacpipe's extras every command either works or ends in one sentence that names the extra and how to install it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import Distribution
+from pathlib import Path
+
+import pytest
+
+from tacpipe import commands, extras, registry
+from tacpipe.errors import MissingModuleError
+from tests import without_extras
+from tests.clouds import shapes
+from tests.conftest import Lab, forget, tacpipe
+from tests.formats import grasp_files, slide_files, xela_files
+from tests.promises.warm import Warm, serving
+from tests.recording.live import stream
+
+BUILT_IN = {name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))}
+GROUPS = {
+    "sensors": ("list", "probe", "emulate"),
+    "store": ("status", "verify", "repair", "gc", "link", "push", "pull"),
+}
+WORK = (  # a command for each that needs no extra; {o} is a new place
+    "simulate forward --trials 9 --duration-s 4 -o {o}",
+    "simulate material --trials 2 -o {o}",
+    "simulate touch --trials 1 -o {o}",
+    "ingest xela-flat flat -o {o}",
+    "ingest xela-psc psc -o {o}",
+    "ingest biotac-slide biotac -o {o}",
+    "ingest roboskin roboskin -o {o}",
+    "ingest vision2tactile grasps -o {o}",
+    "synchronize data/recordings -o {o} --rate-hz 20",
+    "segment contacts data/synced -o {o} --pad-s 0.4",
+    "segment slips data/synced -o {o}",
+    "segment slides data/touched -o {o}",
+    "segment grasps data/pinched -o {o}",
+    "split data/segments -o {o} --scheme random",
+    "label data/recordings trial-000 --set object=cup",
+    "show data/synced",
+    "show models/forward",
+    "explain report.html",
+    "acquire --recover",
+    "sensors list",
+    "store status",
+    "store verify",
+    "store repair",
+    "store gc --dry-run",
+    "store link data/recordings",
+    "store push {o} data/split",
+    "store pull elsewhere data/split",
+)
+LACK = {  # and for each that does need one, with that extra
+    "compress pca data/segments --split data/split -o {o}": "learn",
+    "compress autoencoder data/segments --split data/split -o {o}": "learn",
+    "compress pca data/segments --codec data/latents -o {o}": "learn",
+    "train forward data/segments --split data/split -o {o}": "learn",
+    "train material data/slides --split data/slides-split -o {o}": "learn",
+    "train touch data/grasps --split data/grasps-split -o {o}": "learn",
+    "evaluate models/forward data/latents -o {o}": "learn",
+    "predict models/forward data/latents -o {o}": "learn",
+    "report results/forward -o {o}.html --traces 1": "learn",
+    "candidates bottle.ply": "clouds",
+    "candidates bottle.ply --picture {o}.png": "clouds",
+    "demo -o {o}": "learn",
+    "demo -o {o} --rig serial.toml": "learn",
+    "acquire serial.toml -o {o}": "devices",
+    "acquire serial.toml --dry-run": "devices",
+    "acquire hid.toml -o {o}": "devices",
+    "acquire ws.toml -o {o}": "devices",
+    "acquire can.toml -o {o}": "devices",
+    "acquire camera.toml -o {o}": "clouds",
+    "sensors probe": "devices",
+    "sensors probe /dev/null": "devices",
+    "sensors probe hid:16c0:0486": "devices",
+    "sensors emulate ws.toml -o {o} --duration 1": "devices",
+    "sensors emulate can.toml -o {o} --duration 1": "devices",
+}
+PATIENCE_S = 300.0  # that no command takes unless it hangs
+HEADER = "ply\nformat ascii 1.0\nelement vertex {0}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+RIGS = {
+    "serial": ("optoforce", "serial:/dev/null"),
+    "hid": ("rawhid", "hid:16c0:0486"),
+    "ws": ("xela", "ws:127.0.0.1:1"),
+    "can": ("icub-skin", "can:virtual:none"),
+    "camera": ("clouds", "camera:0"),
+}
+INPUTS = (
+    "simulate material --trials 2 -o data/touched",
+    "segment slides data/touched -o data/slides",
+    "split data/slides -o data/slides-split --scheme random",
+    "simulate touch --trials 4 -o data/pinched",
+    "segment grasps data/pinched -o data/grasps",
+    "split data/grasps -o data/grasps-split --scheme random",
+    "store push elsewhere data/split",
+)
+
+
+def prepare(folder: Path) -> None:
+    """Fill a project with what all commands read, made where every extra is installed."""
+    for command in INPUTS:
+        done = tacpipe(folder, command)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
+    xela_files.write_flat(folder / "flat" / "trial_1")
+    xela_files.write_psc(folder / "psc" / "trial_1")
+    slide_files.write_biotac(folder / "biotac")
+    slide_files.write_roboskin(folder / "roboskin", slide_files.felt())
+    grasp_files.write_grasp(folder / "grasps")
+    points_m = shapes.seen(shapes.cylinder(0.035, 0.2)).points_m.tolist()
+    lines = [" ".join(map(str, point)) for point in points_m]
+    (folder / "bottle.ply").write_text(HEADER.format(len(lines)) + "\n".join(lines) + "\n")
+    for name, (sensor, transport) in RIGS.items():
+        (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory, chained: Path) -> Iterator[Callable[[str], tuple[int, str]]]:
+    """A function that runs a command where no extra is installed: its exit code, and all that it printed."""
+    folder = tmp_path_factory.mktemp("bare")
+    project = shutil.copytree(chained, folder / "project", symlinks=True)
+    prepare(project)
+    hiding = without_extras.hide(folder / "hiding")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(hiding))
+        with serving() as warm:
+            yield lambda command: ran(warm, project, command)
+
+
+def ran(warm: Warm, project: Path, command: str) -> tuple[int, str]:
+    out = project.parent / "printed"
+    out.unlink(missing_ok=True)
+    pid = warm.start(project, command.format(o=f"new/{len(list((project.parent).rglob('*')))}"), out, {})
+    until_s = time.monotonic() + PATIENCE_S
+    while (code := warm.poll(pid)) is None:
+        if time.monotonic() > until_s:
+            os.kill(pid, signal.SIGKILL)
+        time.sleep(0.005)
+    return code, out.read_text()
+
+
+def words(commands_of: Iterator[str] | tuple[str, ...] | dict[str, str]) -> set[str]:
+    """Return the commands among command lines: one word, or two where the first is a group."""
+    groups = {name.partition(".")[0] for name in BUILT_IN if "." in name} | set(GROUPS)
+    split = [line.split() for line in commands_of]
+    return {" ".join(line[: 2 if line[0] in groups else 1]) for line in split}
+
+
+def test_every_command_is_walked() -> None:
+    every = {name.replace(".", " ") for name in BUILT_IN}
+    every |= {name for name in commands.NAMES if name not in GROUPS}
+    every |= {f"{group} {name}" for group, names in GROUPS.items() for name in names}
+
+    assert words(WORK) | words(LACK) == every
+
+
+def test_what_needs_no_extra_works_without_any(bare: Callable[[str], tuple[int, str]]) -> None:
+    failed = {command: told for command in WORK for code, told in [bare(command)] if code}
+
+    assert failed == {}
+
+
+def test_what_needs_an_extra_ends_in_one_sentence_that_names_it(bare: Callable[[str], tuple[int, str]]) -> None:
+    other = {}
+    for command, extra in LACK.items():
+        code, told = bare(command)
+        sentence = (
+            r"tacpipe: [^\n]+ needs [\w-]+, which is not installed: install it with the extra "
+            rf"{extra}, by `[^`\n]+ install [^`\n]*\[{extra}\]'?`\.\n"
+        )
+        if code != 1 or not re.fullmatch(sentence, told):
+            other[command] = (code, told)
+
+    assert other == {}
+
+
+LIBRARY = """
+import sys, tacpipe
+try:
+    {0}
+except ImportError as error:
+    print(type(error).__name__, error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "needed_by"),
+    [('tacpipe.load("models/forward")', "forward"), ('tacpipe.open("data/split").to_torch()', "to_torch")],
+)
+def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str, needed_by: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LIBRARY.format(call)],
+        cwd=chained,
+        env={**os.environ, "PYTHONPATH": str(without_extras.hide(tmp_path / "hiding"))},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    start = f"MissingModuleError {needed_by} needs torch, which is not installed: install it with the extra learn, by `"
+    assert done.stdout.startswith(start) and done.stdout.count("\n") == 1
+
+
+def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, url: dict[str, object] | None) -> None:
+    """Make tacpipe look installed from a URL, by pip."""
+    about = folder / "tacpipe-9.9.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.4\nName: tacpipe\nVersion: 9.9\nRequires-Dist: numpy>=1\n"
+        'Requires-Dist: scipy>=1; extra == "dev"\n'
+        'Requires-Dist: scikit-learn>=1.4; extra == "learn"\nRequires-Dist: torch>=2.4; extra == "learn"\n'
+        "Requires-Dist: tacpipe[learn]; extra == 'all'\n"
+    )
+    (about / "INSTALLER").write_text("pip\n")
+    if url is not None:
+        (about / "direct_url.json").write_text(json.dumps(url))
+    found = Distribution.at(about)
+    monkeypatch.setattr("importlib.metadata.distributions", lambda **_: [found])
+    monkeypatch.setattr(extras, "_pip", lambda: "pip")
+
+
+def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clone, wheel = tmp_path / "a clone", tmp_path / "tacpipe-9.9-py3-none-any.whl"
+    clone.mkdir()
+    wheel.touch()
+    git = {"url": "https://host/tacpipe.git", "vcs_info": {"vcs": "git", "commit_id": "abc"}}
+    cases = {
+        f"pip install -e '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {"editable": True}},
+        f"pip install '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {}},
+        f"pip install '{wheel}[learn]'": {"url": wheel.as_uri(), "archive_info": {}},
+        "pip install 'tacpipe[learn] @ git+https://host/tacpipe.git@abc'": git,
+        "pip install 'tacpipe[learn]'": None,  # of an index
+        "pip install 'scikit-learn>=1.4' 'torch>=2.4'": {"url": "file:///gone/tacpipe.whl", "archive_info": {}},
+    }
+    for number, (wanted, url) in enumerate(cases.items()):
+        (tmp_path / str(number)).mkdir()
+        with monkeypatch.context() as patch:
+            installed(tmp_path / str(number), patch, url)
+            assert extras.command("learn") == wanted
+            patch.chdir(clone)
+            assert extras.command("learn") == wanted.replace(f"-e '{clone}[", "-e '.[").replace(f" '{clone}[", " '.[")
+
+
+def test_modules_belong_to_the_extra_whose_package_brings_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = {"torch": "learn", "sklearn": "learn", "scipy": "learn", "safetensors": "learn", "matplotlib": "learn"}
+    wanted |= {"open3d": "clouds", "serial": "devices", "hid": "devices", "hidraw": "devices", "can": "devices"}
+    wanted |= {"websockets": "devices"}
+
+    assert {module: extras.of(module) for module in wanted} == wanted
+    assert extras.of("numpy") is None and extras.of("nobody") is None
+    installed(tmp_path, monkeypatch, None)
+    assert (extras.of("sklearn"), extras.of("scipy")) == ("learn", "dev")
+
+
+def test_a_mistake_of_our_own_is_no_missing_extra() -> None:
+    for statement in ("import tacpipe.nothing", "from torch import nothing_of_this_name", "import numpy.nothing"):
+        with pytest.raises(ImportError) as raised, extras.named("This"):
+            exec(statement)
+        assert not isinstance(raised.value, MissingModuleError)
+
+
+def test_a_module_that_a_plug_in_needs_is_named_with_its_package(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = lab.folder / "other"
+    (folder / "other_stages-1.egg-info").mkdir(parents=True)
+    (folder / "other_stages-1.egg-info" / "PKG-INFO").write_text(
+        "Metadata-Version: 2.1\nName: other-stages\nVersion: 1\n"
+    )
+    points = "[tacpipe.stages]\nlate = late_stages:late\nearly = early_stages:early\n"
+    (folder / "other_stages-1.egg-info" / "entry_points.txt").write_text(points)
+    stage = "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom tacpipe.stage import stage\n"
+    stage += "@dataclass(frozen=True)\nclass Params:\n    pass\n@stage(version=1)\n"
+    (folder / "late_stages.py").write_text(
+        f"{stage}def late(params: Params, recording: Shard) -> Table:\n    import rarely_there\n"
+    )
+    (folder / "early_stages.py").write_text("import rarely_there\n")
+    monkeypatch.syspath_prepend(folder)
+    forget()
+    lab.run("simulate toy -o data/r")
+    late, early = lab.call("late data/r -o x"), lab.call("early data/r -o y")
+
+    end = "needs the module rarely_there, which is not installed: install the package that brings it.\n"
+    assert (late.code, late.err) == (1, f"tacpipe: Stage late, of the package other-stages, {end}")
+    assert (early.code, early.err) == (1, f"tacpipe: early, of the package other-stages, {end}")
