@@ -133,7 +133,10 @@ def _notes(outcome: Outcome) -> list[str]:
         some = f"all {count} recordings" if len(names) == count else f"{len(names)} recordings ({named})"
         found.append(f"{some}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
     for name, counts in outcome.code.items():
-        stage = execution.stage_of(name)
+        try:
+            stage = execution.stage_of(name)
+        except TacpipeError:  # of a plug-in that is gone: its results stay valid
+            continue
         others = sum(number for code, number in counts.items() if code != provenance.code(stage))
         if others and provenance.code(stage) is not None:
             found.append(
