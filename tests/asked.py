@@ -9,7 +9,7 @@ from tacpipe import params as params_of
 from tacpipe import registry
 
 
-def asked(name: str, preset: str | None = None, **options: Any) -> Any:
+def asked(name: str, preset: str | None = None, /, **options: Any) -> Any:
     """Return the params of stage ``name`` with these options."""
     return params_of.build(name, registry.load(name), preset=preset, options=options)
 

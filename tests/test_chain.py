@@ -126,6 +126,16 @@ def test_a_model_is_loaded_and_predicts_from_python(lab: Lab) -> None:
         tacpipe.load(lab.folder / "data/latents")
 
 
+@pytest.mark.parametrize(("dataset", "architecture"), [("data/latents", "gru"), ("data/segments", "taxelwise")])
+def test_train_without_options_reads_whatever_the_chain_gives(lab: Lab, dataset: str, architecture: str) -> None:
+    done = lab.call(f"train forward {dataset} --split data/split --preset quick --epochs 1 -o models/of-{architecture}")
+    assert done.code == 0, done.err
+    config = json.loads((lab.folder / f"models/of-{architecture}/config.json").read_text())
+    assert config["architecture"] == config["params"]["architecture"] == architecture
+    done = lab.call(f"evaluate models/of-{architecture} {dataset} --split data/split -o results/of-{architecture}")
+    assert done.code == 0, done.err
+
+
 def test_a_preset_changes_what_would_run(lab: Lab) -> None:
     printed = lab.call("train forward data/latents --preset paper --print-params").out
     assert json.loads(printed)["batch"] == 32

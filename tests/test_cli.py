@@ -32,7 +32,7 @@ def test_help_lists_every_command(lab: Lab) -> None:
         ("scale", 2, "Missing argument 'datasets'"),
         ("scale nowhere -o x", 2, "nowhere is empty or not there"),
         ("scale . -o x", 2, "has no manifest.json"),
-        ("scale data/r -o x --factor many", 2, "valid integer"),
+        ("scale data/r -o x --factor many", 2, "--factor is 'many'; it must be a whole number."),
         ("scale data/r -o x --set factor=1.5", 2, "whole number"),
         ("scale data/r -o x --set speed=1", 2, "no param speed"),
         ("scale data/r", 2, "-o"),

@@ -58,7 +58,8 @@ def made(kind: str) -> Files:
     if task == "forward":
         return dict(trials.trained(folder, architecture=architecture, epochs=1))
     if task == "material":
-        return dict(textures.trained(folder, architecture=architecture, epochs=1))
+        short = {} if architecture == "minirocket" else {"epochs": 1}
+        return dict(textures.trained(folder, architecture=architecture, **short))
     changed = {**handmade.POINTNET, **ALL, "epochs": 1} if architecture == "pointnet" else {}
     return dict(handmade.trained(folder, **changed))
 

@@ -9,6 +9,7 @@ import pytest
 
 from tacpipe import registry
 from tacpipe.dataset import Dataset
+from tacpipe.errors import TacpipeError
 from tests.asked import asked
 from tests.stages.learning_fakes import dataset, motion
 from tests.tasks.forward.trials import SMALL, compressed
@@ -38,6 +39,38 @@ def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
     tuned = STAGE(params, training, watched, tmp_path / "b", init).files
     first, second = (json.loads(one["history.jsonl"])["val_loss"] for one in (init.files, tuned))
     assert second < first
+
+
+def test_the_default_model_follows_what_the_dataset_holds(tmp_path: Path) -> None:
+    shards = [motion(seed) for seed in range(2)]
+    params = asked("train.forward", hidden=8, epochs=1, context=5, horizon=4)
+    found = {}
+    for kind, given in (
+        ("raw", dataset(*shards)),
+        ("levels", compressed(*shards)),
+        ("increments", compressed(*shards, of="increments")),
+    ):
+        config = json.loads(STAGE(params, given, given, tmp_path / kind).files["config.json"])
+        assert config["params"]["architecture"] == config["architecture"]
+        found[kind] = (config["architecture"], config["params"]["loss"])
+    assert found == {"raw": ("taxelwise", "absolute"), "levels": ("gru", "absolute"), "increments": ("gru", "huber")}
+
+
+def test_what_is_not_named_is_what_the_model_of_init_is(tmp_path: Path) -> None:
+    training, small = dataset(motion(0)), {"hidden": 8, "epochs": 1, "context": 5, "horizon": 4}
+    first: Dataset = dataset(
+        files=STAGE(asked("train.forward", architecture="tcn", **small), training, training, tmp_path / "a").files
+    )
+    files = STAGE(asked("train.forward", **small), training, training, tmp_path / "b", first).files
+    assert json.loads(files["config.json"])["architecture"] == "tcn"
+
+
+def test_an_architecture_that_cannot_read_latents_is_refused_before_training(tmp_path: Path) -> None:
+    given = compressed(motion(0))
+    given.shards["absent"] = None  # whoever reads on past the first recording trips over this one
+    with pytest.raises(TacpipeError, match=r"reads raw channels .* the recordings hold latents"):
+        STAGE(asked("train.forward", architecture="taxelwise"), given, given, tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("preset", ["paper", "quick"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("preset", "architecture"), [("paper", "pointnet"), ("quick", "strong")])
 def test_presets_name_params_that_exist_and_train(preset: str, architecture: str, tmp_path: Path) -> None:
-    small = {"paper": {"epochs": 1, "points": 20, "head": "fc1"}, "quick": {"trees": 5, "leaf": 2}}[preset]
+    small: dict[str, Any] = {"trees": 5, "leaf": 2} if preset == "quick" else {"epochs": 1, "points": 20, "head": "fc1"}
     params = asked("train.touch", preset, targets="pdc_th,e_mf", **small)
     files = STAGE(params, recordings(), recordings(6, 1), tmp_path).files
     config = json.loads(files["config.json"])
