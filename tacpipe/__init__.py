@@ -20,11 +20,14 @@ def open(path: Any) -> Dataset:
 
 
 def load(path: Any) -> Any:
-    """Return the model at ``path``, ready to ``predict``: what its task makes of the files that `tacpipe train` wrote.
+    """Return the model at ``path``: what its task makes of the files that `tacpipe train` wrote.
 
-    Raises `UsageError` if ``path`` holds no model.
+    ``model.predict(tacpipe.open(PATH))``, or ``predict`` of one recording among the dataset's ``shards``, returns the arrow
+    table that ``tacpipe predict`` writes. It is a `tacpipe.tasks.forward.forecaster.Forecaster`, a
+    `tacpipe.tasks.material.classifier.Classifier` or a `tacpipe.tasks.touch.predictor.Predictor`, whose ``predict`` also
+    reads arrays. Raises `UsageError` if ``path`` holds no model.
     """
     from tacpipe import model_files
 
-    files = open(path).files
-    return model_files.task(files, str(path)).load(files)
+    model = open(path)
+    return model_files.task(model.files, str(path)).load(model.files, model.source.chain)
