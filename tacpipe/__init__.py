@@ -20,12 +20,15 @@ def open(path: Any) -> Dataset:
 
 
 def load(path: Any) -> Any:
-    """Return the model at ``path``, ready to ``predict``: what its task makes of the files that `tacpipe train` wrote.
+    """Return the model at ``path``: what its task makes of the files that `tacpipe train` wrote.
 
-    Raises `UsageError` if ``path`` holds no model.
+    ``model.predict(tacpipe.open(PATH))``, or ``predict`` of one recording among the dataset's ``shards``, returns the arrow
+    table that ``tacpipe predict`` writes. It is a `tacpipe.tasks.forward.forecaster.Forecaster`, a
+    `tacpipe.tasks.material.classifier.Classifier` or a `tacpipe.tasks.touch.predictor.Predictor`, whose ``predict`` also
+    reads arrays. Raises `UsageError` if ``path`` holds no model.
     """
     from tacpipe import extras, model_files
 
-    files = open(path).files
+    model = open(path)
     with extras.named("A model"):
-        return model_files.task(files, str(path)).load(files)
+        return model_files.task(model.files, str(path)).load(model.files, model.source.chain)

@@ -25,11 +25,12 @@ Reader = Callable[[str, str], bytes]  # digest, path within the dataset director
 class Shard:
     """One recording of a dataset: its attributes, and its tables when asked for."""
 
-    def __init__(self, name: str, entry: Mapping[str, Any], read: Reader) -> None:
+    def __init__(self, name: str, entry: Mapping[str, Any], read: Reader, manifest: Manifest | None = None) -> None:
         self.name = name
         self.attributes: Mapping[str, Attribute] = MappingProxyType(dict(entry["attributes"]))
         self._shards = entry["shards"]
         self._read = read
+        self._manifest = manifest
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -46,6 +47,18 @@ class Shard:
         """The digest of the recording's only stream, or of all of them."""
         digests = self.digests
         return digests[""] if set(digests) == {""} else digest(digests)
+
+    @property
+    def alone(self) -> Dataset:
+        """The dataset that it was opened from, with this recording alone.
+
+        Raises `UsageError` for one that a stage was given: what it is part of is unknown there.
+        """
+        if self._manifest is None:
+            raise UsageError(
+                f"Recording {self.name} is not of an opened dataset. Take it from tacpipe.open(PATH).shards."
+            )
+        return Dataset(self._manifest, self._read, [self.name])
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
         """Return a stream as an arrow table with field metadata; its bytes are verified first."""
@@ -81,7 +94,7 @@ class Dataset:
         included = manifest.included
         chosen = sorted(included if names is None else names)
         self.source = manifest
-        self.shards: dict[str, Shard] = {name: Shard(name, included[name], read) for name in chosen}
+        self.shards: dict[str, Shard] = {name: Shard(name, included[name], read, manifest) for name in chosen}
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
 
     @property
@@ -100,21 +113,12 @@ class Dataset:
 
         ``stream`` may be left out where the recordings have one table each.
         """
-        import pyarrow as pa
+        from tacpipe.tables import one_after_another
 
         name = self._only_stream() if stream is None else stream
-        tables = []
-        for shard in self.shards.values():
-            table = shard.table(name, columns)
-            if "recording" in table.column_names:  # of a split: the table says itself which recording a row is of
-                tables.append(table)
-                continue
-            names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([shard.name]))
-            tables.append(table.add_column(0, "recording", names))
-        if not tables:
+        if not self.shards:
             raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
-        plain = [pa.Table.from_arrays(table.columns, names=table.column_names) for table in tables]
-        return pa.concat_tables(plain, promote_options="default").unify_dictionaries()
+        return one_after_another({shard.name: shard.table(name, columns) for shard in self.shards.values()})
 
     def to_pandas(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return all recordings in one frame, after a categorical column ``recording``.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -143,3 +143,17 @@ def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Ta
         merged = {**kept, **metadata.get(field.name, {})}
         fields.append(pa.field(field.name, field.type, metadata=merged or None))
     return table.cast(pa.schema(fields))
+
+
+def one_after_another(tables: Mapping[str, pa.Table]) -> pa.Table:
+    """Return the tables of recordings as one, after a first column ``recording`` with their names; without metadata.
+
+    A table that has such a column keeps its own, as that of a split or of predictions. There must be a table.
+    """
+    named = []
+    for name, table in tables.items():
+        if "recording" not in table.column_names:
+            names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([name]))
+            table = table.add_column(0, "recording", names)
+        named.append(pa.Table.from_arrays(table.columns, names=table.column_names))
+    return pa.concat_tables(named, promote_options="default").unify_dictionaries()

@@ -136,6 +136,53 @@ def test_train_without_options_reads_whatever_the_chain_gives(lab: Lab, dataset:
     assert done.code == 0, done.err
 
 
+def test_a_model_predicts_from_python_what_the_command_writes_to_the_last_bit(lab: Lab) -> None:
+    model, given = tacpipe.load(lab.folder / "models/forward"), tacpipe.open(lab.folder / "data/latents")
+    lab.run("predict models/forward data/latents -o data/predicted")
+    lab.run("predict models/forward data/latents -o data/predicted2 --steps 2,7")
+    assert model.predict(given).equals(tacpipe.open(lab.folder / "data/predicted").table())
+    wanted = tacpipe.open(lab.folder / "data/predicted2").table()
+    assert model.predict(given, steps=[7, 2]).equals(wanted)
+    one = model.predict(given.shards["trial-003"], steps=[2, 7])
+    of_it = [row for row in wanted.to_pylist() if row["recording"] == "trial-003"]
+    assert one.num_rows and one.to_pylist() == of_it
+
+
+def test_windows_of_a_recording_give_its_predictions_and_hold_its_columns_less_rest(lab: Lab) -> None:
+    model = tacpipe.load(lab.folder / "models/forward")
+    shard = tacpipe.open(lab.folder / "data/latents").shards["trial-003"]
+    window, plan, t_ns = model.windows(shard)
+    found, predicted = shard.table(), model.predict(shard, steps=[4])
+    assert t_ns.tolist() == predicted["t_ns"].to_pylist()
+    assert window.shape[2] == len(model.window_columns) + len(model.derived_columns) + 1
+    assert plan.shape[2] == len(model.plan_columns) + len(model.derived_columns)
+    row = found["t_ns"].to_pylist().index(int(t_ns[5]))
+    for index, name in enumerate(model.window_columns):
+        rest = float((found.schema.field(name).metadata or {}).get(b"rest", 0.0))
+        assert window[5, -1, index] == pytest.approx(found[name][row].as_py() - rest, rel=1e-6, abs=1e-6), name
+    for index, name in enumerate(model.plan_columns):
+        assert plan[5, 0, index] == pytest.approx(found[name][row + 1].as_py(), rel=1e-6)
+    told = model.predict(window, plan)[:, 3]  # (window, channel)
+    for index, name in enumerate(model.codec.channels):
+        np.testing.assert_allclose(told[:, index], predicted[f"{name}_t4"].to_numpy(), atol=0.05)
+
+
+def test_recordings_that_lack_a_stage_of_the_model_are_refused_with_the_stages_that_they_lack(lab: Lab) -> None:
+    model = tacpipe.load(lab.folder / "models/forward")
+    missing = (
+        "`tacpipe synchronize`, then `tacpipe segment contacts`, then `tacpipe compress pca --components 6` is missing"
+    )
+    with pytest.raises(tacpipe_errors.UsageError, match=missing):
+        model.predict(tacpipe.open(lab.folder / "data/recordings"))
+    with pytest.raises(tacpipe_errors.UsageError, match="`tacpipe compress pca --components 6` is missing"):
+        model.windows(tacpipe.open(lab.folder / "data/segments").shards["trial-000"])
+    lab.run("synchronize data/recordings -o data/synced25 --rate-hz 25")
+    with pytest.raises(tacpipe_errors.UsageError, match=r"synchronize has rate_hz 25\.0 instead of 50\.0"):
+        model.predict(tacpipe.open(lab.folder / "data/synced25"))
+    with pytest.raises(tacpipe_errors.UsageError, match="A str is not a dataset or a recording"):
+        model.predict("data/latents")
+
+
 def test_a_preset_changes_what_would_run(lab: Lab) -> None:
     printed = lab.call("train forward data/latents --preset paper --print-params").out
     assert json.loads(printed)["batch"] == 32

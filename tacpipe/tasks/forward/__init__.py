@@ -13,11 +13,12 @@ from tacpipe.tasks.forward.forecaster import TASK, Forecaster
 from tacpipe.tasks.forward.judging import evaluate
 from tacpipe.tasks.forward.predicting import predict
 from tacpipe.tasks.forward.training import train
+from tacpipe.tasks.opened import Chain
 
 
-def load(files: Mapping[str, bytes]) -> Forecaster:
-    """Return the forecaster among a model's files: what `tacpipe.load` gives."""
-    return Forecaster.load(files)
+def load(files: Mapping[str, bytes], chain: Chain | None = None) -> Forecaster:
+    """Return the forecaster among a model's files, trained behind the stages ``chain``: what `tacpipe.load` gives."""
+    return Forecaster.load(files, chain)
 
 
 __all__ = ["TASK", "Forecaster", "evaluate", "load", "predict", "train"]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, cast, overload
 
 import numpy as np
 import torch
@@ -23,20 +24,38 @@ from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.rows import acted
+from tacpipe.tasks.opened import Chain, opened
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Dataset, Shard
 
 Floats = NDArray[np.floating[Any]]
 Config = dict[str, Any]
 
 TASK = "forward"
-NEEDED = {
+STEPS = (1, 3, 5, 10)  # ahead, that are predicted unless others are asked for, as by `tacpipe predict`
+FAR = 0.95  # quantile over channels of the levels of a training row, of which the largest is kept
+FARTHEST = 2.0  # times that, beyond which the median level of a window is no level above rest
+NEEDED: dict[str, model_files.Kind] = {
     **dict.fromkeys(("context", "horizon", "params.context", "params.horizon"), int),
     **dict.fromkeys(("architecture", "codec.kind", "codec.of", "params.actions"), str),
     **dict.fromkeys(("inputs.tactile", "inputs.layout", "inputs.orientation_reference", "objects"), list),
     **dict.fromkeys(("scaling.feature_half", "scaling.channel_count"), list),
     **dict.fromkeys(("params", "trained_on"), dict),
     "rate_hz": float,
+    "largest_level": (float, model_files.NONE),  # which older models lack
 }
 CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safetensors"
+
+
+class WindowArrays(NamedTuple):
+    """Windows of a recording, as `Forecaster.predict` reads them."""
+
+    window: Floats  # (window, context, column): `window_columns`, `derived_columns`, width of the gripper in m
+    plan: Floats  # (window, horizon, column): `plan_columns`, `derived_columns`
+    t_ns: NDArray[np.int64]  # (window,), time of the newest row that is read
 
 
 @dataclass(frozen=True)
@@ -47,6 +66,8 @@ class Forecaster:
     config: Config
     codec: codecs.Codec
     baselines: Baselines | None
+    codec_files: Mapping[str, bytes] = field(default_factory=dict)
+    chain: Chain | None = None  # the stages that it was trained behind; None: unknown
 
     @property
     def context(self) -> int:
@@ -70,13 +91,26 @@ class Forecaster:
 
     @property
     def window_columns(self) -> tuple[str, ...]:
-        """The columns of a window for `predict`: counts above rest, then `plan_columns`, then the finger's width."""
-        return (*self.codec.channels, *tracks.ARM, tracks.FINGER)
+        """The first columns of a window for `predict`, each a column of the recordings: tactile channels, then the pose.
+
+        Of a tactile channel a window holds what the recording has less the channel's level at rest, which stands in its
+        field metadata ``rest``; the pose is as recorded.
+        """
+        return (*self.codec.channels, *tracks.POSE)
 
     @property
     def plan_columns(self) -> tuple[str, ...]:
-        """The columns of a plan for `predict`: position, quaternion, velocity, angular velocity."""
-        return tracks.ARM
+        """The first columns of a plan for `predict`, each a column of the recordings: position and quaternion."""
+        return tracks.POSE
+
+    @property
+    def derived_columns(self) -> tuple[str, ...]:
+        """The columns that `windows` adds behind those of window and plan, and that recordings need not hold.
+
+        Velocity and angular velocity, from the joints of a known arm, else as differences of the pose. A window then ends
+        with the width of the gripper's opening, ``robot_finger_m`` of the recordings, 0 where they have none.
+        """
+        return (*tracks.VELOCITY, *tracks.TURNING)
 
     @property
     def tells_change(self) -> bool:
@@ -98,9 +132,19 @@ class Forecaster:
         """The training standard deviation of each channel in counts (channel,)."""
         return np.array(self.config["scaling"]["channel_count"])
 
+    @property
+    def largest_level(self) -> float | None:
+        """The largest 95th percentile over channels of counts from rest, over training rows; None in an older model."""
+        found = self.config.get("largest_level")
+        return None if found is None else float(found)
+
     @classmethod
-    def load(cls, files: Mapping[str, bytes]) -> Forecaster:
-        """Return the forecaster among a model's files. Raises `TacpipeError` where they are of another task."""
+    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Forecaster:
+        """Return the forecaster among a model's files. Raises `TacpipeError` where they are of another task.
+
+        ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
+        that recordings went through the same.
+        """
         config = model_files.tree(files, CONFIG, {"task": str})
         if config["task"] != TASK:
             raise TacpipeError(f"This model was trained for {plain(config['task'])}, not for {TASK}.")
@@ -113,7 +157,11 @@ class Forecaster:
         )
         with model_files.believed("the model"):
             found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
-            made = cls(model.eval(), config, codec, None if found is None else Baselines.from_tensors(found))
+            codec_files = (
+                {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
+            )
+            baselines = None if found is None else Baselines.from_tensors(found)
+            made = cls(model.eval(), config, codec, baselines, codec_files, chain)
             made._try()
         return made
 
@@ -131,7 +179,7 @@ class Forecaster:
         arm = np.zeros((1, self.context + self.horizon, POSE))
         arm[..., -1] = 1
         touch = np.zeros((1, self.context, len(self.codec.channels)))
-        self.predict(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :])
+        self._of_arrays(*self._parts(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :]))
         if self.baselines is not None:
             parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
             moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
@@ -139,23 +187,82 @@ class Forecaster:
             if any(one.shape != (1, self.horizon, touch.shape[2]) for one in told.values()):
                 raise ValueError("the baselines tell another number of steps or channels")
 
-    def predict(self, window: Floats, plan: Floats) -> Floats:
-        """Return the touch to come in counts above rest, float64: (horizon, channel), or (window, horizon, channel).
+    @overload
+    def predict(self, recordings: Dataset | Shard, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
 
-        ``window`` is (context, column) or (window, context, column), newest row last: the columns are
-        `window_columns`, or counts and pose alone; then velocities are differences of the poses, and the finger
-        does not move. ``plan`` has `plan_columns`, or poses alone, for the rows to come. Raises `TacpipeError` for
-        other shapes and for values that are not finite.
+    @overload
+    def predict(self, window: Floats, plan: Floats, /) -> Floats: ...
+
+    def predict(
+        self, given: Dataset | Shard | Floats, plan: Floats | None = None, /, *, steps: Sequence[int] = STEPS
+    ) -> pa.Table | Floats:
+        """Return predicted touch: of a dataset or one of its ``shards`` as a table, of arrays as an array.
+
+        **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes
+        and ``tacpipe.open(OUTPUT).table()`` reads: ``recording``, ``t_ns`` (when it was known) and for each channel and each
+        of ``steps`` the counts above rest that many rows later, as ``xela1_taxel01_z_t5``, float32; a row a window.
+        ``.to_pandas()`` makes a frame of it. Raises `UsageError` where the recordings did not go through the stages that
+        the model was trained behind, `TacpipeError` for a step beyond the horizon.
+
+        **Arrays**, for controllers: ``window`` (context, column) or (window, context, column), newest row last, has
+        `window_columns` or these, `derived_columns` and the width of the gripper; ``plan`` (horizon, column) or (window,
+        horizon, column), the rows to come, has `plan_columns`, or these and `derived_columns`. `windows` makes both of a
+        recording. Velocities that are left out are differences of the poses. Returns counts above rest, float64 (horizon,
+        channel) or (window, horizon, channel).
+
+        Raises `TacpipeError` for other shapes, for values that are not finite, and for raw counts instead of counts above
+        rest: where the median of a window's counts, by absolute value over rows and channels, is more than twice
+        `largest_level`, half of all channels are further from rest than in training hardly any channel ever was. Offsets
+        of a XELA uSkin are at least four times `largest_level` on 52 published trials; true windows reach 0.9 of it if
+        the model was trained on the weakest of these trials alone, and 0.1 if on all. An offset below twice
+        `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
         """
+        if plan is None:
+            from tacpipe.tables import one_after_another
+            from tacpipe.tasks.forward import predicting  # which reads this module
+
+            recordings = opened(cast("Dataset | Shard", given), self.chain)
+            return one_after_another(predicting.tables(self, recordings, sorted(set(steps))))
+        window = np.asarray(given)
         single = window.ndim == 2
-        if single:
-            window, plan = window[None], plan[None]
-        touch, arm, finger = self._parts(window, plan)
+        touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
+        self._check_levels(touch)
+        predicted = self._of_arrays(touch, arm, finger)
+        return predicted[0] if single else predicted
+
+    def windows(self, recording: Shard) -> WindowArrays:
+        """Return all windows of a recording as `predict` reads them: ``window``, ``plan`` and ``t_ns``, when each was known.
+
+        Rows in gaps are in none of them. The recorded motion stands for the plan. Raises as `predict`.
+        """
+        from tacpipe.tasks.forward import predicting  # which reads this module
+
+        return predicting.inputs(self, opened(recording.alone, self.chain))
+
+    def _of_arrays(self, touch: Floats, arm: Floats, finger: Floats) -> Floats:
+        """Return the touch to come (window, horizon, channel) of what `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
         read = Windows(*(torch.from_numpy(np.ascontiguousarray(one.swapaxes(0, 1))) for one in (latent, arm, finger)))
-        predicted = self.decoded(self.told(read), touch[:, -1], latent[:, -1])
-        return predicted[0] if single else predicted
+        return self.decoded(self.told(read), touch[:, -1], latent[:, -1])
+
+    def _check_levels(self, touch: Floats) -> None:
+        """Refuse windows (window, context, channel) whose levels are not near rest, as `predict` says."""
+        largest = self.largest_level
+        if largest is None:
+            warnings.warn(
+                "This model was trained before levels were kept, so it is not checked that windows hold counts above rest.",
+                stacklevel=3,
+            )
+            return
+        found = np.median(np.abs(touch), axis=(1, 2))  # (window,)
+        wrong = np.flatnonzero(found > FARTHEST * largest)
+        if largest > 0 and len(wrong):
+            raise TacpipeError(
+                f"Window {wrong[0]} holds counts of {found[wrong[0]]:.0f} in the median of its channels; in training hardly "
+                f"a channel was further from rest than {largest:.0f}. Subtract each channel's level at rest, as "
+                f"model.windows(recording) does."
+            )
 
     @torch.no_grad()
     def told(self, windows: Windows) -> Floats:
@@ -230,6 +337,11 @@ def network(params: Mapping[str, Any], codec: codecs.Codec) -> nn.Module:
 def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:
     """Return where each raw channel lies; nothing of latents."""
     return codec.layout if codec.kind == "raw" else ()
+
+
+def largest_level(touch: Floats) -> float:
+    """Return the largest 95th percentile over channels of absolute levels ``touch`` (time, channel); 0 without rows."""
+    return float(np.quantile(np.abs(touch), FAR, axis=1).max(initial=0.0)) if touch.size else 0.0
 
 
 def _begins(touch: Floats) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Recording, Result
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.judging import check_rate
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
@@ -29,13 +29,18 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
     Columns are named like ``xela1_taxel01_z_t5``. Raises `TacpipeError` for a step that the model does not reach and
     where the recordings are not what it reads.
     """
-    forecaster = Forecaster.load(model)
+    found = tables(Forecaster.load(model), recordings, steps)
+    return Result({name: Recording(table) for name, table in found.items()})
+
+
+def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) -> dict[str, pa.Table]:
+    """Return the table of each recording's predictions; steps and errors are those of `predict`."""
     for step in steps:
         if not 1 <= step <= forecaster.horizon:
             raise TacpipeError(
                 f"The model tells 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
             )
-    check_codec(model, recordings.files)
+    check_codec(forecaster.codec_files, recordings.files)
     found = {}
     for name, shard in sorted(recordings.shards.items()):
         track = tracks.track(shard, forecaster.codec)
@@ -44,10 +49,25 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
         parts: list[Floats] = [np.zeros((0, len(steps), len(forecaster.codec.channels)))]
         wanted = [step - 1 for step in steps]
         parts += [some.count[:, wanted] for some in forecasts(forecaster, track, starts)]
-        found[name] = Recording(
-            _table(forecaster, track.t_ns[starts + forecaster.context - 1], np.concatenate(parts), steps)
-        )
-    return Result(found)
+        t_ns = track.t_ns[starts + forecaster.context - 1]
+        found[name] = _table(forecaster, t_ns, np.concatenate(parts), steps)
+    return found
+
+
+def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
+    """Return the windows of a dataset's only recording, as `Forecaster.predict` reads them."""
+    check_codec(forecaster.codec_files, recordings.files)
+    (shard,) = recordings.shards.values()
+    track = tracks.track(shard, forecaster.codec)
+    check_rate(track, forecaster)
+    starts = track.starts(forecaster.context, forecaster.horizon)
+    past, ahead = (
+        starts[:, None] + np.arange(*ends)
+        for ends in ((0, forecaster.context), (forecaster.context, forecaster.context + forecaster.horizon))
+    )
+    arm = track.arm.astype(np.float64)
+    window = np.concatenate([track.tactile[past], arm[past], track.finger[past][..., None]], axis=-1)
+    return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
 
 
 def _table(forecaster: Forecaster, t_ns: NDArray[np.int64], counts: Floats, steps: Sequence[int]) -> pa.Table:

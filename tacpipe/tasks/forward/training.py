@@ -23,7 +23,17 @@ from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.alarms import Loads
-from tacpipe.tasks.forward.forecaster import BASELINES, CONFIG, TASK, WEIGHTS, Config, Forecaster, layout, network
+from tacpipe.tasks.forward.forecaster import (
+    BASELINES,
+    CONFIG,
+    TASK,
+    WEIGHTS,
+    Config,
+    Forecaster,
+    largest_level,
+    layout,
+    network,
+)
 from tacpipe.tasks.forward.predictors import told
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
@@ -100,6 +110,7 @@ def train(
             "orientation_reference": reference.tolist(),
         },
         "scaling": _scaling(parts[0]),
+        "largest_level": largest_level(np.concatenate([one.tactile[one.usable] for one in parts[0]])),
         "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
         "trained_on": _trained_on((training, validation), start),
         "objects": sorted({one.object for one in parts[0] if one.object is not None}),

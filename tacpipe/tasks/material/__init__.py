@@ -12,11 +12,12 @@ from tacpipe.tasks.material.classifier import TASK, Classifier
 from tacpipe.tasks.material.judging import evaluate
 from tacpipe.tasks.material.predicting import predict
 from tacpipe.tasks.material.training import train
+from tacpipe.tasks.opened import Chain
 
 
-def load(files: Mapping[str, bytes]) -> Classifier:
-    """Return the classifier among a model's files: what `tacpipe.load` gives."""
-    return Classifier.load(files)
+def load(files: Mapping[str, bytes], chain: Chain | None = None) -> Classifier:
+    """Return the classifier among a model's files, trained behind the stages ``chain``: what `tacpipe.load` gives."""
+    return Classifier.load(files, chain)
 
 
 __all__ = ["TASK", "Classifier", "evaluate", "load", "predict", "train"]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from tacpipe import model_files
+from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
 from tacpipe.models import recurrent_autoencoder
@@ -24,10 +25,11 @@ from tacpipe.models.transfer import Transfer
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.learning import JUDGED, Network
 from tacpipe.tasks.material.slides import Layout, Slides, difference
+from tacpipe.tasks.opened import Chain, opened
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    import pyarrow as pa
 
 TASK = "material"
 CHOSEN = ".chosen"  # ends the name of what a readout was chosen by, which may be NaN
@@ -121,7 +123,8 @@ Reader = NetworkReader | RocketReader | SpectraReader
 class Classifier:
     """Readers of one or more sensors that name the material of a slide."""
 
-    def __init__(self, files: Mapping[str, bytes]) -> None:
+    def __init__(self, files: Mapping[str, bytes], chain: Chain | None = None) -> None:
+        self.chain = chain  # the stages that it was trained behind; None: unknown
         config = model_files.tree(files, CONFIG, NEEDED)
         self.config: Config = config
         self.architecture: str = config["architecture"]
@@ -133,8 +136,12 @@ class Classifier:
         self.baselines = self._baselines(files[BASELINES]) if BASELINES in files else {}
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes]) -> Classifier:
-        """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task."""
+    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Classifier:
+        """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task.
+
+        ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
+        that recordings went through the same.
+        """
         if CONFIG not in files:
             raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train material`.")
         task = model_files.tree(files, CONFIG).get("task")
@@ -142,7 +149,7 @@ class Classifier:
             told = plain(str(task))
             raise TacpipeError(f"This model is of the task {told}, not {TASK}. Give one of `tacpipe train material`.")
         with model_files.believed("the model"):
-            made = cls(files)
+            made = cls(files, chain)
             made._try()
         return made
 
@@ -161,13 +168,52 @@ class Classifier:
             if any(shape != (len(noise), len(self.classes)) for shape in told):
                 raise ValueError(f"slides of {name} get scores of {told}, not of {len(self.classes)} classes")
 
-    def predict(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Materials:
-        """Return the material of each slide: ``slides`` are device counts (slide, time, channel), or one (time, channel).
+    @overload
+    def predict(self, recordings: Dataset | Shard, /) -> pa.Table: ...
 
-        ``sensor`` may be left out where the model knows but one. Raises `TacpipeError` for another shape than the
-        model was trained on, and for values that are not finite.
+    @overload
+    def predict(self, slides: Floats | NDArray[np.float64], /, sensor: str = "") -> Materials: ...
+
+    def predict(
+        self, given: Dataset | Shard | Floats | NDArray[np.float64], /, sensor: str = ""
+    ) -> pa.Table | Materials:
+        """Return the material of slides: of a dataset or one of its ``shards`` as a table, of arrays as an array.
+
+        **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
+        a row a slide with ``recording``, ``sensor``, ``material`` (int32), a ``score_…`` of each class and, of networks, the
+        latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of a dataset are those of the command to the last bit;
+        those of one recording alone may differ in the last digit of a float32, because slides are computed together. Raises `UsageError` where the recordings did not go through the
+        stages that the model was trained behind.
+
+        **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them of a
+        recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64. Raises
+        `TacpipeError` for another shape than the model was trained on, and for values that are not finite.
         """
-        return self.named(self.scores(slides, sensor))
+        if isinstance(given, Dataset | Shard):
+            from tacpipe.tasks.material import predicting  # which reads this module
+
+            return predicting.predictions(self, opened(given, self.chain))
+        return self.named(self.scores(given, sensor))
+
+    def frames(self, recording: Shard) -> tuple[Floats, str]:
+        """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.
+
+        The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.
+        """
+        ((sensor, slides),) = self.read(opened(recording, self.chain)).items()
+        return slides.frames[0], sensor
+
+    def probabilities(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
+        """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
+
+        Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
+        material if all are as likely. Scores of ``minirocket`` are distances to class means of no fixed scale: there it only
+        orders the classes. See `predict` for the arguments.
+        """
+        scores = self.scores(slides, sensor).astype(np.float64)
+        weights = np.exp(scores - scores.max(axis=1, keepdims=True))
+        found: Floats = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+        return found
 
     def scores(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""

@@ -22,7 +22,11 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
     Slides need no label; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where the
     recordings are not what the model reads.
     """
-    classifier = Classifier.load(model)
+    return Result({PREDICTIONS: Recording(predictions(Classifier.load(model), recordings))})
+
+
+def predictions(classifier: Classifier, recordings: Dataset) -> pa.Table:
+    """Return the table of `predict`, which raises the same errors."""
     names: list[str] = []
     sensors: list[str] = []
     told = []
@@ -41,5 +45,4 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
     if latents:
         columns += latent_columns(np.concatenate(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]
-    table = pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))
-    return Result({PREDICTIONS: Recording(table)})
+    return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch.judging import evaluate
 from tacpipe.tasks.touch.predicting import predict
 from tacpipe.tasks.touch.predictor import TASK, Predictor, Touch
 from tacpipe.tasks.touch.training import train
 
 
-def load(files: Mapping[str, bytes]) -> Predictor:
-    """Return the predictor among a model's files: what `tacpipe.load` gives."""
-    return Predictor.load(files)
+def load(files: Mapping[str, bytes], chain: Chain | None = None) -> Predictor:
+    """Return the predictor among a model's files, trained behind the stages ``chain``: what `tacpipe.load` gives."""
+    return Predictor.load(files, chain)
 
 
 __all__ = ["TASK", "Predictor", "Touch", "evaluate", "load", "predict", "train"]

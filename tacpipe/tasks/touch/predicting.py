@@ -24,10 +24,13 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
     Grasps need no reading; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where
     there are no recordings or they are not what the model reads.
     """
-    predictor = Predictor.load(model)
+    return Result({PREDICTIONS: Recording(predictions(Predictor.load(model), recordings), simulated(recordings))})
+
+
+def predictions(predictor: Predictor, recordings: Dataset) -> pa.Table:
+    """Return the table of `predict`, which raises the same errors."""
     grasps = grasps_of.read(recordings, felt=False)
     if not len(grasps):
         raise TacpipeError("There is no grasp to foretell. Give a dataset with recordings of the role asked for.")
     table = told_table(predictor.foretell(grasps))
-    table = table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))
-    return Result({PREDICTIONS: Recording(table, simulated(recordings))})
+    return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import torch
@@ -14,13 +14,20 @@ from numpy.typing import NDArray
 from tacpipe import biotac_sp, model_files
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.errors import UsageError
 from tacpipe.excerpt import excerpt
 from tacpipe.models.forest import Forest
 from tacpipe.models.tensors import under
+from tacpipe.tasks.opened import Chain, opened
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.training.scaling import Affine
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.dataset import Dataset, Shard
 
 Floats = NDArray[np.float64]
 Config = dict[str, Any]
@@ -56,10 +63,15 @@ class Predictor:
     config: Config
     members: Sequence[members.Member]
     baselines: Baselines | None
+    chain: Chain | None = None  # the stages that it was trained behind; None: unknown
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes]) -> Predictor:
-        """Return the model among these files, as `tacpipe train touch` wrote them."""
+    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Predictor:
+        """Return the model among these files, as `tacpipe train touch` wrote them.
+
+        ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
+        that recordings went through the same.
+        """
         config = model_files.tree(files, CONFIG, NEEDED)
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -75,7 +87,7 @@ class Predictor:
                 baselines.check()
             if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
                 raise ValueError(f"its members do not foretell {excerpt(config['targets'])}")
-        return cls(config, found, baselines)
+        return cls(config, found, baselines, chain)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
@@ -90,12 +102,30 @@ class Predictor:
         told = members.averaged((member.targets, member.foretell(grasps)) for member in self.members)
         return {target: told[target] for target in self.targets}
 
-    def predict(self, cloud: Cloud, grasp: Grasp) -> Touch:
-        """Return the touch of one grasp.
+    @overload
+    def predict(self, recordings: Dataset | Shard, /) -> pa.Table: ...
 
-        Raises `TacpipeError` where the grasp lies far from the cloud, and where either lacks what the model reads.
+    @overload
+    def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
+
+    def predict(self, given: Dataset | Shard | Cloud, grasp: Grasp | None = None, /) -> pa.Table | Touch:
+        """Return what grasps would feel like: of a dataset or one of its ``shards`` as a table, of one cloud as `Touch`.
+
+        **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
+        a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.
+        ``.to_pandas()`` makes a frame of it. Raises `UsageError` where the recordings did not go through the stages that
+        the model was trained behind.
+
+        **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` where the grasp
+        lies far from the cloud, and where either lacks what the model reads.
         """
-        return self.predict_all(cloud, [grasp])[0]
+        if isinstance(given, Cloud):
+            if grasp is None:
+                raise UsageError("A cloud alone does not say where the fingers close. Give predict(cloud, grasp).")
+            return self.predict_all(given, [grasp])[0]
+        from tacpipe.tasks.touch import predicting  # which reads this module
+
+        return predicting.predictions(self, opened(given, self.chain))
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud; as `predict`, in one pass."""

@@ -10,10 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.registry import load as load_stage
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import Forecaster, load, tracks
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.conftest import sample_data
+from tests.report.stream_shard import StreamShard
+from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
     HORIZON,
@@ -112,8 +116,10 @@ def test_velocities_that_are_left_out_are_differences_of_poses(forecaster: Forec
 
 
 def test_the_columns_that_it_names_are_those_that_it_reads(forecaster: Forecaster) -> None:
-    assert forecaster.window_columns == (*CHANNELS, *tracks.ARM, "robot_finger_m")
-    assert forecaster.plan_columns == tracks.ARM
+    assert forecaster.window_columns == (*CHANNELS, *tracks.POSE)
+    assert forecaster.plan_columns == tracks.POSE
+    assert set(forecaster.window_columns) < set(TEST.content.column_names)  # a dataset has each
+    assert (*forecaster.plan_columns, *forecaster.derived_columns) == tracks.ARM
     assert (forecaster.context, forecaster.horizon, forecaster.actions) == (CONTEXT, HORIZON, "planned")
 
 
@@ -132,9 +138,9 @@ def test_touch_after_now_does_not_change_what_is_predicted_now(
     name: str, models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
     made, now = load(models[name]), 40
-    tactile = counts(TEST)
-    tactile[now + 1 :] += 500
-    later = FakeShard(TEST.name, table(tactile, poses(TEST)))
+    felt = counts(TEST)
+    felt[now + 1 :] += 500
+    later = FakeShard(TEST.name, table(felt, poses(TEST)))
     shards: list[Any] = [TEST, later]
     if "levels" in name:
         shards = [compressed(one, files=latents["levels"].files).shards[TEST.name] for one in shards]
@@ -187,6 +193,70 @@ def test_what_cannot_be_read_is_one_sentence(given: tuple[Floats, Floats], said:
         forecaster.predict(*given)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_raw_counts_are_refused_and_counts_above_rest_are_not(
+    name: str, models: Mapping[str, Mapping[str, bytes]]
+) -> None:
+    made, (window, plan) = load(models[name]), windows()
+    made.predict(window, plan)
+    window[1:, :, : len(CHANNELS)] += REST
+    with pytest.raises(TacpipeError, match=r"Window 1 holds counts of 1[56]\d\d\d in the median.*level at rest"):
+        made.predict(window, plan)
+
+
+def test_hard_contact_that_training_had_not_is_no_raw_counts(forecaster: Forecaster) -> None:
+    window, plan = windows()
+    assert forecaster.largest_level is not None
+    window[..., :3] = 40 * forecaster.largest_level  # a quarter of all channels
+    assert np.isfinite(forecaster.predict(window, plan)).all()
+    window[..., : len(CHANNELS)] = 1.9 * forecaster.largest_level
+    assert np.isfinite(forecaster.predict(window, plan)).all()
+
+
+def test_a_model_that_keeps_no_level_predicts_with_a_warning(models: Mapping[str, Mapping[str, bytes]]) -> None:
+    config = json.loads(models["gru raw"]["config.json"])
+    del config["largest_level"]
+    older = Forecaster.load({**models["gru raw"], "config.json": json.dumps(config).encode()})
+    with pytest.warns(UserWarning, match="trained before levels were kept"):
+        found = older.predict(*windows())
+    assert np.array_equal(found, load(models["gru raw"]).predict(*windows()))
+
+
+def published(files: Mapping[str, Path]) -> FakeShard:
+    """A published trial after synchronize and segment contacts."""
+    ingest, synchronize, contacts = (
+        load_stage(name) for name in ("ingest.xela-flat", "synchronize", "segment.contacts")
+    )
+    recording = ingest(ingest.params(), files)
+    synced = synchronize(synchronize.params(grid="logged"), StreamShard("trial", recording.streams))
+    made = contacts(contacts.params(), StreamShard("trial", synced.streams))
+    return FakeShard("-".join(sorted(map(str, files.values())))[-60:], made.streams[""], dict(synced.attributes))
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (sample_data() / "xela_flat_pick_move").is_dir(), reason="published recordings are not here")
+def test_raw_counts_of_published_trials_are_always_refused_and_counts_above_rest_never(tmp_path: Path) -> None:
+    ingest = load_stage("ingest.xela-flat")
+    assert ingest.discover is not None
+    found = list(ingest.discover(ingest.params(), sample_data() / "xela_flat_pick_move").values())[::4]
+    training, watched, *others = (published(files) for files in found)
+    asked_for = {"epochs": 1, "stride": 10, "baselines": False}  # trained on one trial, where the limit is least sure
+    made = load(trained(tmp_path, dataset(training), dataset(watched), **asked_for))
+    refused = 0
+    for shard in [watched, *others]:
+        channels = made.codec.channels
+        given = tracks.track(shard, made.codec)  # type: ignore[arg-type]
+        starts = given.starts(CONTEXT, HORIZON)
+        window, plan = asked(given, starts)
+        assert made.predict(window, plan).shape == (len(starts), HORIZON, len(channels))
+        window[..., : len(channels)] += tactile.rest_counts(shard.content.schema, channels)
+        for first in range(0, len(starts), 5):  # a refusal stops at the first window, so not all at once
+            with pytest.raises(TacpipeError, match="level at rest"):
+                made.predict(window[first], plan[first])
+            refused += 1
+    assert refused > 900
+
+
 def test_a_model_of_another_task_is_refused(models: Mapping[str, Mapping[str, bytes]]) -> None:
     files = models["gru raw"]
     config = {**json.loads(files["config.json"]), "task": "material"}
@@ -196,8 +266,8 @@ def test_a_model_of_another_task_is_refused(models: Mapping[str, Mapping[str, by
 
 def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:
     pose, joints = panda(80)
-    tactile = 1000 * (pose[:, :1] - pose[0, :1]) + np.random.default_rng(0).normal(0, 1, (80, len(CHANNELS)))
-    shard = FakeShard("panda", table(tactile, pose, extra=joints))
+    felt = 1000 * (pose[:, :1] - pose[0, :1]) + np.random.default_rng(0).normal(0, 1, (80, len(CHANNELS)))
+    shard = FakeShard("panda", table(felt, pose, extra=joints))
     made = load(trained(tmp_path, dataset(shard), dataset(shard), epochs=1))
     found, starts, some = foretold(made, shard)
     assert np.allclose(made.predict(*asked(found, starts)), some.predictions["model"].count, atol=0.05)

@@ -1,0 +1,74 @@
+"""From Python a loaded model predicts recordings as the command does."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+import tacpipe
+from tacpipe import registry
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.errors import UsageError
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tests.conftest import Lab
+
+
+def test_a_classifier_predicts_from_python_what_the_command_writes_to_the_last_bit(lab: Lab) -> None:
+    lab.run("simulate material --trials 24 --materials 2 -o data/touched")
+    lab.run("segment slides data/touched -o data/slides")
+    lab.run("split data/slides -o data/split --stratify sensor,material")
+    lab.run("train material data/slides --split data/split -o models/material --preset quick")
+    lab.run("predict models/material data/slides -o data/predicted")
+    model, given = tacpipe.load("models/material"), tacpipe.open("data/slides")
+    wanted = tacpipe.open("data/predicted").table()
+    assert model.predict(given).equals(wanted) and wanted.num_rows == 24
+    shard = given.shards["trial-007"]
+    (row,) = model.predict(shard).to_pylist()
+    same = next(one for one in wanted.to_pylist() if one["recording"] == "trial-007")
+    assert row.keys() == same.keys()  # scores of one slide and of many differ by how products of matrices are rounded
+    assert [row[name] for name in ("recording", "sensor", "material")] == list(same.values())[:3]
+    assert list(row.values())[3:] == pytest.approx(list(same.values())[3:], rel=1e-4, abs=1e-5)
+    frames, sensor = model.frames(shard)
+    assert (sensor, frames.dtype) == (row["sensor"], np.float32)
+    assert set(model.layouts[sensor].channels) <= set(shard.table("slide").column_names)
+    assert model.predict(frames, sensor).tolist() == [row["material"]]
+    chances = model.probabilities(frames, sensor)
+    assert chances.sum() == pytest.approx(1.0) and model.classes[chances.argmax()] == row["material"]
+    with pytest.raises(UsageError, match="`tacpipe segment slides` is missing"):
+        model.predict(tacpipe.open("data/touched"))
+
+
+def test_a_predictor_of_touch_predicts_from_python_what_the_command_writes_to_the_last_bit(lab: Lab) -> None:
+    lab.run("simulate touch --trials 12 --objects 1 -o data/pinched")
+    lab.run("segment grasps data/pinched -o data/grasps")
+    lab.run("split data/grasps -o data/split --val 0")
+    lab.run("train touch data/grasps --split data/split -o models/touch --architecture trees --trees 10")
+    lab.run("predict models/touch data/grasps -o data/predicted")
+    model, given = tacpipe.load("models/touch"), tacpipe.open("data/grasps")
+    wanted = tacpipe.open("data/predicted").table()
+    assert model.predict(given).equals(wanted) and wanted.num_rows == 12
+    shard = given.shards["trial-007"]
+    (row,) = model.predict(shard).to_pylist()
+    assert row == next(one for one in wanted.to_pylist() if one["recording"] == "trial-007")
+    touch = model.predict(Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp")))
+    assert np.float32(touch.pdc_th) == row["pdc_th"] and np.float32(touch.e_mf[6]) == row["e_mf_07"]
+    with pytest.raises(UsageError, match="`tacpipe segment grasps` is missing"):
+        model.predict(tacpipe.open("data/pinched").shards["trial-000"])
+    with pytest.raises(UsageError, match="Give predict"):
+        model.predict(Cloud.of(shard.table("cloud")))
+
+
+def test_the_steps_from_python_are_those_of_the_command() -> None:
+    steps = inspect.signature(Forecaster.predict).parameters["steps"].default
+    assert ",".join(map(str, steps)) == registry.load("predict").params().steps
+
+
+def test_a_recording_that_no_dataset_was_opened_for_says_where_to_take_it_from() -> None:
+    from tacpipe.dataset import Shard
+
+    shard = Shard("trial-000", {"attributes": {}, "shards": {}}, lambda digest, path: b"")
+    with pytest.raises(UsageError, match=r"trial-000 is not of an opened dataset\. Take it from tacpipe\.open"):
+        _ = shard.alone
