@@ -13,9 +13,11 @@ MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
+EVERY := 1
 TARGETS :=
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto
-FAULTS := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST)
+FAULTS := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST) --every $(EVERY)
+export PYTHONDONTWRITEBYTECODE := # a command that finds its bytecode starts in a third of the time; tests start hundreds
 PROPERTIES := $(wildcard $(addprefix tests/, test_hashing.py test_keys.py test_dataset.py sensors/test_framing.py \
     sensors/test_every_sensor.py signals/test_clocks.py))
 OLD_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
@@ -30,7 +32,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo test test-long test-faults fuzz test-kernel lint types bless bench clean
+.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults fuzz test-kernel lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -38,16 +40,29 @@ help: ## show the targets
 demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with demo/report.html
 	@$(BIN)/tacpipe demo -o demo
 
+wheel: $(VENV)/.python ## build a wheel into dist/, for computers without a clone
+	@$(PIP) wheel --no-deps -w dist .
+
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
-test: $(VENV)/.dev ## run all tests but the long and the exhaustive ones
-	@$(PYTEST) -m "not faults and not long"
+test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: at most 5 minutes on 2 cores
+	@$(PYTEST) -m "not faults and not long and not rig"
 
-test-long: $(VENV)/.dev ## run the tests that train for long, DVC's chains of all tasks and the README's commands
-	@$(PYTEST) -m long
+test-long: $(VENV)/.dev ## run the tests that take long: training, kills and crowds, DVC's chains, the README's commands
+	@$(PYTEST) -m "long and not faults"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes, and print how many
+test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
+	@$(PYTEST) -m "rig and not faults"
+
+test-ci: $(VENV)/.dev ## run the tests of all three in one go, which is faster
+	@$(PYTEST) -m "not faults"
+
+test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight other processes keep the computer busy
+	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
+	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
+
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20
 	@mkdir -p $(dir $(COUNTS)) && : > $(COUNTS)
 	@$(FAULTS) tests/promises
 	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)
@@ -77,7 +92,7 @@ bench: $(VENV)/.dev ## measure, beside what a user would do instead; writes benc
 	@$(BIN)/python benchmarks/run.py
 
 clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there
-	@rm -rf $(VENV) .cache demo rig-demo build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .cache demo rig-demo build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -not -path './.tacpipe/*' -prune -exec rm -rf {} +
 
 # A stamp in .venv says what is installed there, so a second call installs nothing.

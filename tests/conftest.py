@@ -44,6 +44,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: program
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--every", type=int, default=1, help="Run one of so many of the tests that were chosen.")
+
+
+@pytest.hookimpl(trylast=True)  # after markers chose what runs
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    every: int = config.getoption("--every")
+    config.hook.pytest_deselected(items=[item for number, item in enumerate(items) if number % every])
+    items[:] = items[::every]
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return a worker more than there are cores: tests of recording wait for devices while others compute."""

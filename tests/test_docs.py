@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -134,6 +135,42 @@ def test_the_targets_that_the_texts_name_are_in_the_makefile() -> None:
 
     assert {"demo", "test", "lint", "types", "bench"} <= named
     assert named <= targets
+
+
+def test_the_install_commands_of_the_texts_work_without_a_package_index() -> None:
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wheel = f"./{about['name']}-{about['version']}-py3-none-any.whl"
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "data" / "README.md"]
+    found = [
+        words
+        for page in pages
+        for line in re.findall(r"(?:^|`)(pip (?:install|wheel) [^`#\n]+)", page.read_text(), re.MULTILINE)
+        for words in [shlex.split(line)]
+    ]
+    assert len(found) >= 6
+
+    for words in found:
+        if words[1] == "wheel":
+            assert words == ["pip", "wheel", "--no-deps", "-w", "dist", "."]
+            continue
+        source, _, extras = words[-1].rstrip("]").partition("[")
+        assert source in (".", wheel), " ".join(words)  # a name alone is looked up in an index
+        assert set(extras.split(",")) - {""} <= set(about["optional-dependencies"])
+
+
+def test_what_runs_where_is_told_as_it_is() -> None:
+    text, make, ran = ((ROOT / name).read_text() for name in ("CONTRIBUTING.md", "Makefile", ".ci/run"))
+    (targets,) = re.findall(r"^for target in (.+); do$", ran, re.MULTILINE)
+    first = text.split("\n\n")[1]
+
+    for words in shlex.split(targets):
+        target, _, options = words.partition(" ")
+        assert f"{target}:" in make and f"make {target}" in first
+        assert f"`make {target}{options and ' ' + options}`" in text
+    for marker in ("long", "rig", "faults"):
+        assert (
+            f"`{marker}`" in section(text, "Tests") and f"make test-{marker}" in (ROOT / "pyproject.toml").read_text()
+        )
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

@@ -249,6 +249,7 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
         assert told in page
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
@@ -263,6 +264,7 @@ def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names
     assert "Running stage" not in toy.run("dvc repro")
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_after_a_restore_from_the_run_cache_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
@@ -276,6 +278,7 @@ def test_after_a_restore_from_the_run_cache_tacpipe_reads_what_the_manifest_name
     assert metrics == {name: sum(values) for name, values in expected(2).items()}
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_a_second_clone_with_the_same_caches_gets_the_results_without_running_a_stage(
@@ -298,6 +301,7 @@ def test_a_second_clone_with_the_same_caches_gets_the_results_without_running_a_
     assert clone.values("data/scaled") == expected(2)
 
 
+@pytest.mark.long
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:

@@ -232,7 +232,7 @@ def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monke
     clone.mkdir()
     wheel.touch()
     git = {"url": "https://host/tacpipe.git", "vcs_info": {"vcs": "git", "commit_id": "abc"}}
-    cases = {
+    cases: dict[str, dict[str, object] | None] = {
         f"pip install -e '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {"editable": True}},
         f"pip install '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {}},
         f"pip install '{wheel}[learn]'": {"url": wheel.as_uri(), "archive_info": {}},

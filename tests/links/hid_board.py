@@ -1,7 +1,7 @@
 """A RawHID board as umockdev plays it, run by the system's Python, which has GObject introspection. No test by itself.
 
 Needs the project's root in PYTHONPATH. Prints the folder to run clients with. Reads commands from standard input, a line
-each: ``send COUNT RATE_HZ`` sends so many reference reports, ``heard`` prints what clients wrote, ``unplug`` ends it.
+each: ``send COUNT RATE_HZ`` sends so many more reference reports, ``heard`` prints what clients wrote, ``unplug`` ends it.
 """
 
 from __future__ import annotations
@@ -73,15 +73,16 @@ def answer(_: Any, client: Any) -> bool:
 
 def obey(board: int, loop: Any) -> None:
     """Carry out the commands of standard input."""
-    heard = b""
+    heard, sent = b"", 0
     for line in sys.stdin:
         words = line.split()
         if words[0] == "send":
             due = time.monotonic()
-            for number in range(int(words[1])):
+            for number in range(sent, sent + int(words[1])):
                 time.sleep(max(0.0, due - time.monotonic()))
                 os.write(board, report(number))
                 due += 1 / float(words[2])
+            sent += int(words[1])
         elif words[0] == "heard":
             while len(heard) < 65 and select.select([board], [], [], 5)[0]:
                 heard += os.read(board, 65 - len(heard))

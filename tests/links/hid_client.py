@@ -17,7 +17,7 @@ from tacpipe.sensors.rawhid import RawHid
 
 
 def main(count: int, *, until_lost: bool) -> None:
-    """Print ``open`` once the device is open, and then what came."""
+    """Print ``open`` once the device is open, how many reports came whenever some did, and then what came."""
     there = [str(port) for port in ports.hid_ports()]
     sensor = RawHid()
     link = open_link(parse("hid:16c0:0486"), sensor, "board")
@@ -26,8 +26,9 @@ def main(count: int, *, until_lost: bool) -> None:
     found: list[tuple[int, bytes]] = []
     lost = ""
     begun, busy = time.monotonic(), time.process_time()
-    while len(found) < count and time.monotonic() - begun < 60:
+    while len(found) < count and time.monotonic() - begun < 600:
         found += link.read(0.5)
+        print(f"came {len(found)}", flush=True)
     busy = time.process_time() - busy
     waited = link.read(0.05)
     try:

@@ -29,6 +29,7 @@ def why_not() -> str:
     return "" if done.returncode == 0 else "gir1.2-umockdev-1.0 or python3-gi is not installed"
 
 
+AT_ONCE = 50  # reports: no more than the queue holds, however late they are fetched
 RAW = RawHid()
 LACKING = why_not()
 mocked = pytest.mark.skipif(bool(LACKING), reason=LACKING)
@@ -67,7 +68,11 @@ def talk(count: int, rate_hz: int, *, unplug: bool = False) -> tuple[dict[str, A
             assert client.stdout.readline() == "open\n"
             order("heard")
             heard = bytes.fromhex(board.stdout.readline())
-            order(f"send {count} {rate_hz}")
+            for start in range(0, count, AT_ONCE):
+                more = min(AT_ONCE, count - start)
+                order(f"send {more} {rate_hz}")
+                while client.stdout.readline() != f"came {start + more}\n":
+                    assert client.poll() is None
             line = client.stdout.readline()
             order("unplug")
             if unplug:

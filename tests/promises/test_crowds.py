@@ -74,6 +74,7 @@ def tidy(store: Store) -> None:
     assert list((store.root / "leases").iterdir()) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", CROWDS)
 def test_processes_that_ask_for_the_same_keys_make_each_once_while_garbage_is_collected(
     scene: Scene, size: int
@@ -86,6 +87,7 @@ def test_processes_that_ask_for_the_same_keys_make_each_once_while_garbage_is_co
     tidy(Store(scene.project / ".tacpipe"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", CROWDS)
 def test_processes_that_ask_for_different_keys_all_get_theirs_while_garbage_is_collected(
     scene: Scene, size: int
@@ -99,6 +101,7 @@ def test_processes_that_ask_for_different_keys_all_get_theirs_while_garbage_is_c
     tidy(Store(scene.project / ".tacpipe"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", CROWDS)
 def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, size: int) -> None:
     scene.run("simulate toy --trials 6 --rows 4 -o data/r")
@@ -139,6 +142,7 @@ def test_who_waits_for_a_stopped_process_is_told_whom_and_gives_up(scene: Scene)
     tidy(Store(scene.project / ".tacpipe"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("times", [3, pytest.param(20, marks=pytest.mark.faults)])
 @pytest.mark.parametrize("words", ["scale data/r -o data/s", "label data/r trial-000 --set material=foam"])
 def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs(
@@ -181,6 +185,7 @@ def waited(processes: Sequence[subprocess.Popen[str]]) -> list[dict[str, int]]:
     return told
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not unshares(), reason="another host takes `unshare`, which is not permitted here")
 @pytest.mark.parametrize("size", [4, pytest.param(16, marks=pytest.mark.faults)])
 def test_two_hosts_that_share_a_store_make_each_key_once(scene: Scene, tmp_path: Path, size: int) -> None:
@@ -237,6 +242,7 @@ def shared(scene: Scene) -> Iterator[Scene]:
         yield Scene(lab, server, {"PYTHONPATH": str(lab / "plugin"), "TEST_GROUP": str(GROUP)})
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not ROOT, reason="only root can be several users")
 @pytest.mark.parametrize("size", [4, pytest.param(16, marks=pytest.mark.faults)])
 def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:

@@ -81,6 +81,7 @@ BREAKS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("broken", BREAKS)
 def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tmp_path: Path) -> None:
     script = (

@@ -78,6 +78,7 @@ def computing(scene: Scene) -> bool:
     return bool(held) and all(time.time() - path.stat().st_mtime > 0.3 for path in held)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["scale", "label", "store gc"])
 def test_a_command_that_is_killed_at_a_random_moment_leaves_what_a_rerun_makes_whole(scene: Scene, name: str) -> None:
     case = next(case for case in TOYS if case.name == name)
@@ -104,6 +105,7 @@ def test_a_pool_of_workers_survives_kills_at_all_of_its_moments(scene: Scene) ->
     kills.survive(scene, POOL, strikes, 3 * len(strikes), fresh=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["SIGKILL", "Ctrl-C", "SIGTERM"])
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_call_in_c_that_takes_minutes_ends_with_the_command(scene: Scene, name: str, jobs: int) -> None:
@@ -120,6 +122,7 @@ def test_a_call_in_c_that_takes_minutes_ends_with_the_command(scene: Scene, name
     count("kills survived")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", kills.WORKERS)
 def test_a_worker_that_dies_is_a_sentence_and_what_was_finished_is_kept(scene: Scene, name: str) -> None:
     scene.run("simulate toy --trials 40 --rows 4 -o data/r")
@@ -178,6 +181,7 @@ def test_a_process_that_was_told_to_ignore_interrupts_goes_on(scene: Scene) -> N
     assert process.wait() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["Ctrl-C", "SIGTERM"])
 def test_the_demo_ends_with_the_command_that_it_runs(scene: Scene, name: str) -> None:
     running = scene.start("demo -o demo", fresh=True)

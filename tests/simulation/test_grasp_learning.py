@@ -71,6 +71,7 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
         assert metric["model"]["r2"][target] >= 0.8
 
 
+@pytest.mark.long
 def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_can_know(tmp_path: Path) -> None:
     rig = Rig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)  # drift would be learned from time
     training, tested = grasps(rig, range(1000)), grasps(rig, range(1000, 1200))

@@ -65,6 +65,7 @@ def within_chance(right: int, n: int, share: float, clusters: int) -> bool:
     return abs(right / n - share) <= 3 * math.sqrt(share * (1 - share) / clusters)
 
 
+@pytest.mark.long
 def test_the_strong_classifier_comes_close_to_one_that_knows_the_spectra(tmp_path: Path) -> None:
     training, watched, tested = whole()
     metrics, _ = judged(trained(tmp_path, training, watched, **STRONG), tested)
@@ -114,6 +115,7 @@ def test_labels_dealt_out_anew_are_named_by_chance(tmp_path: Path) -> None:
         assert within_chance(correct, n, 1 / RIG.materials, n), (sensor, correct, n)
 
 
+@pytest.mark.long
 def test_of_materials_that_are_all_the_same_sessions_are_told_and_nothing_is_left_once_they_are_kept_apart(
     tmp_path: Path,
 ) -> None:

@@ -71,6 +71,7 @@ def margin(shares: NDArray[np.float64], chance: float) -> float:
     return float(3 * max(shares.std(ddof=1), np.sqrt(chance * (1 - chance))) / np.sqrt(len(shares)))
 
 
+@pytest.mark.long
 def test_materials_told_to_one_sensor_are_named_by_the_other_three_times_as_often_as_by_chance() -> None:
     shares = named("shared")
     assert shares["every"].mean() >= 3 * CHANCE
@@ -78,6 +79,7 @@ def test_materials_told_to_one_sensor_are_named_by_the_other_three_times_as_ofte
     assert shares["among"].mean() - margin(shares["among"], CHANCE_AMONG_HELD) > CHANCE_AMONG_HELD
 
 
+@pytest.mark.long
 def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> None:
     shares = named("independent")
     assert abs(shares["every"].mean() - CHANCE) <= margin(shares["every"], CHANCE)

@@ -109,12 +109,6 @@ class Pty:
         self.peers = [self._port]
         return [(self._port, b"")]
 
-    def left(self) -> bool:
-        """Whether the host has closed its port."""
-        poll = select.poll()
-        poll.register(self._master, select.POLLIN)
-        return any(event & select.POLLHUP for _, event in poll.poll(0))
-
     def wrong_baud(self) -> bool:
         """Whether the host has set another speed than the device's."""
         self._baud = _speed(self._master) if self._master >= 0 else 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
@@ -21,8 +20,7 @@ from tacpipe.simulation.emulation.source import Sampled
 AHEAD_NS = 1_500_000_000  # that frames are planned before they are due
 IDLE_NS = 20_000_000  # between looks at a stream that nobody receives
 MOST_TOLD = 1000  # messages of the host that the ledger keeps
-PATIENT_S = 30.0  # that a patient device waits for a host to fetch, before a frame is lost after all
-PAUSE_S = 0.002  # between two tries
+PAUSE_NS = 2_000_000  # between two tries of a patient device
 
 
 class Plan:
@@ -65,6 +63,11 @@ class Transmission:
         patient: bool = False,  # what a host has no room for waits, and is not lost
     ) -> None:
         self._patient = patient
+        self._late: deque[tuple[Item | None, bytes]] = (
+            deque()
+        )  # items, or replies, and what of them is still to be sent
+        self._awaited: Peer | None = None  # the host that they are for
+        self._again_ns = 0
         self.endpoint, self.sensor, self.ledger = endpoint, sensor, ledger
         self._planned, self._epoch_ns = planned, epoch_ns
         self._rate_hz = rate_hz
@@ -92,6 +95,8 @@ class Transmission:
     @property
     def next_ns(self) -> int:
         """When something is due, on the monotonic clock; a stream that nobody receives can wait."""
+        if self._late:
+            return self._again_ns
         if not self._items:
             return self._epoch_ns + self._plan.until_ns
         due_ns = self._epoch_ns + self._items[0].due_ns
@@ -101,6 +106,8 @@ class Transmission:
         """Send what is due at ``now_ns`` on the monotonic clock; return whether the device was unplugged or came back."""
         since_ns, items, due = now_ns - self._epoch_ns, self._items, list[Item]()
         plugged = False
+        if self._late:
+            self._push(now_ns)
         if not items:  # the planning thread came too late
             self.fill(since_ns)
         while items and items[0].due_ns <= since_ns:
@@ -129,6 +136,14 @@ class Transmission:
         if not items:
             return
         self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)
+        streaming = next((peer for peer in self._receivers() if peer.device.streaming), None)
+        if self._patient and streaming is not None:
+            if streaming is not self._awaited:
+                self._late.clear()
+            self._awaited = streaming
+            self._late.extend((item, item.data) for item in items)
+            self._push(now_ns)
+            return
         sizes: list[int] | None = None
         fault = byte_faults.SOUND
         pieces = [item.data for item in items]
@@ -144,22 +159,24 @@ class Transmission:
     def _post(self, peer: Peer, pieces: Sequence[bytes]) -> list[int]:
         post: Callable[[Sequence[bytes]], list[int]] = getattr(peer, "post", peer.send)
         full = [piece for piece in pieces if piece]
-        taken = iter(self._insisted(peer, post, full) if self._patient else post(full) if full else [])
+        taken = iter(post(full) if full else [])
         return [next(taken) if piece else 0 for piece in pieces]
 
-    def _insisted(self, peer: Peer, post: Callable[[Sequence[bytes]], list[int]], pieces: Sequence[bytes]) -> list[int]:
-        """Post pieces one by one as the host has room for them, as long as it is there; return the size of each."""
-        sizes = [0] * len(pieces)
-        until_s = time.monotonic() + PATIENT_S
-        for number, piece in enumerate(pieces):
-            while sizes[number] < len(piece) and self.endpoint.peers and time.monotonic() < until_s:
-                if not getattr(peer, "full", bool)():
-                    sizes[number] += post([piece[sizes[number] :]])[0]
-                if sizes[number] < len(piece):
-                    if peer.fault == byte_faults.GONE or getattr(self.endpoint, "left", bool)():
-                        return sizes
-                    time.sleep(PAUSE_S)
-        return sizes
+    def _push(self, now_ns: int) -> None:
+        """Send what waits, in order, as far as the host has room for it; what waited for a host that left is forgotten."""
+        peer = next(iter(self._receivers()), None)
+        if peer is None or peer is not self._awaited:
+            self._late.clear()
+        while self._late and peer is not None and not getattr(peer, "full", bool)():
+            item, left = self._late[0]
+            left = left[self._post(peer, [left])[0] :]
+            if left:
+                self._late[0] = (item, left)
+                break
+            self._late.popleft()
+            if item is not None:
+                self._enter([item], [len(item.data)], peer.fault, now_ns)
+        self._again_ns = now_ns + PAUSE_NS
 
     def _enter(self, items: Iterable[Item], sizes: Sequence[int], fault: str, now_ns: int) -> None:
         for item, size in zip(items, sizes, strict=True):
@@ -177,7 +194,10 @@ class Transmission:
         elif len(self.ledger.events) < MOST_TOLD:
             self.ledger.tell(now_ns, "heard", data.hex())
         replies = [reply for reply in peer.device.hear(data) if reply]
-        if replies:
+        if replies and self._late and peer is self._awaited:  # behind the frame that is half sent
+            for reply in reversed(replies):
+                self._late.insert(1, (None, reply))
+        elif replies:
             peer.send(replies)
         rate_hz = peer.device.rate_hz
         if rate_hz and rate_hz != self._rate_hz:

@@ -278,14 +278,24 @@ def test_an_arm_sends_to_the_port_that_it_was_told() -> None:
 
 
 def test_the_truth_of_two_runs_is_the_same() -> None:
-    sent = []
-    for _ in range(2):
-        with Emulator(one("xela", "ws:127.0.0.1:5000"), 4) as emulator, reading(emulator) as reader:
-            reader.read(150)
-        sent.append(emulator.ledger["load"])
+    asked = one("xela", "ws:127.0.0.1:5000")
+    with (
+        Emulator(asked, 4) as first,
+        Emulator(asked, 4) as second,
+        reading(first) as reader,
+        reading(second) as other,
+    ):
+        sent = [emulator.ledger["load"] for emulator in (first, second)]
+
+        def shared() -> bool:
+            for each in (reader, other):
+                each.take(each.link.read(0.1))
+            found = np.intersect1d(*(ledger.column("number") for ledger in sent))
+            return len(found) > 20
+
+        awaited(shared)
     numbers = [ledger.column("number") for ledger in sent]
     both = np.intersect1d(numbers[0], numbers[1])
-    assert len(both) > 20
     rows = [np.flatnonzero(np.isin(known, both)) for known in numbers]
     once, again = (ledger.samples(part) for ledger, part in zip(sent, rows, strict=True))
     assert np.array_equal(once.values[0], again.values[0])

@@ -58,6 +58,7 @@ def test_the_strong_classifier_names_textures_that_it_can_tell_apart(tmp_path: P
     assert metrics["permuted_labels"]["accuracy"]["biotac"] < 0.7
 
 
+@pytest.mark.long
 def test_a_network_learns_textures_given_time(tmp_path: Path) -> None:
     time = {"epochs": 40, "hidden": 16, "latents": 8, "align_from": 5, "learning_rate": 0.01, "scaling": "standard"}
     metrics, _ = judged(trained(tmp_path, architecture="raec", **time), slides(8, 3))
