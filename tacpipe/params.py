@@ -154,6 +154,15 @@ def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
     return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in values.items() if k in known})
 
 
+def counting(stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of stored params that the chosen kind has; older versions stored those of all kinds.
+
+    All of them are returned where the tag names no kind, as of a plug-in that is not installed.
+    """
+    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), None)
+    return {name: value for name, value in values.items() if kind is None or name in fields_of.hints(kind)}
+
+
 def comments(stage: Stage) -> dict[str, str]:
     """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
     found: dict[str, list[str]] = {}
