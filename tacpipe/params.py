@@ -63,16 +63,12 @@ def build(
     early = [] if file is None else _from_file(file, block or name, required=block is not None)
     late = [_from_set(name, text) for text in sets]
     late += [_Given(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
-    for given in (*early, *late):
-        if given.key not in fields(stage):
-            raise fields_of.unknown(given.key, fields(stage), given.where, "param")
     kind = _chosen(stage, early, late, preset)
-    if tag(stage) and kind is not _named(stage, early):  # the preset or an option chose, over what the file names
-        early = [given for given in early if given.key != tag(stage)]
-    presets = [] if preset is None else _from_preset(name, stage, kind, preset)
+    between = [] if preset is None else _from_preset(name, stage, kind, preset)
     values: dict[str, Any] = {}
-    for given in (*early, *presets, *late):
-        values[given.key] = _checked(stage, kind, given, values)
+    for given in (*early, *between, *late):
+        if given.key != tag(stage) or _holds(kind, tag(stage), {given.key: given.value}):  # others were overruled
+            values[given.key] = _checked(stage, kind, given, values)
     try:
         made = kind(**values)
     except TypeError as error:
@@ -166,6 +162,15 @@ def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
     return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in values.items() if k in known})
 
 
+def counting(stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of stored params that the chosen kind has; older versions stored those of all kinds.
+
+    All of them are returned where the tag names no kind, as of a plug-in that is not installed.
+    """
+    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), None)
+    return {name: value for name, value in values.items() if kind is None or name in fields_of.hints(kind)}
+
+
 def comments(stage: Stage) -> dict[str, str]:
     """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
     found: dict[str, list[str]] = {}
@@ -202,9 +207,9 @@ def _comments(kind: Kind) -> dict[str, str]:
 
 def _chosen(stage: Stage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
     """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
+    kind = _named(stage, early)
     if any(given.key == tag(stage) for given in late):
         return _named(stage, late)
-    kind = _named(stage, early)
     if preset is None or preset in _presets(kind):
         return kind
     return next((other for other in kinds(stage) if preset in _presets(other)), kind)
@@ -227,6 +232,8 @@ def _holds(kind: Kind, name: str | None, values: Mapping[str, Any]) -> bool:
 def _checked(stage: Stage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
     """Return a value as the field of ``kind`` has it."""
     known, name = fields_of.hints(kind), tag(stage)
+    if given.key not in fields(stage):
+        raise fields_of.unknown(given.key, fields(stage), given.where, "param")
     subject = given.name if given.option else f"{given.place}: {given.key}"
     current = before.get(name, kind.__dataclass_fields__[name].default) if name else None
     if given.key in known:

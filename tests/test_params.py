@@ -1,10 +1,11 @@
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
 
 from tacpipe import params as params_of
+from tacpipe.constraints import Range
 from tacpipe.errors import UsageError
 from tacpipe.stage import Stage, stage
 
@@ -132,3 +133,127 @@ def test_tables_fill_the_dataclasses_that_stand_for_them() -> None:
 def test_what_is_wrong_in_a_table_is_told_with_the_table(values: dict[str, object], sentence: str) -> None:
     with pytest.raises(UsageError, match=sentence):
         params_of.filled(Whole, values, "box")
+
+
+@dataclass(frozen=True)
+class Small:
+    size: Literal["small", "tiny"] = "small"  # small, or tiny
+    seed: int = 0  # of draws
+    cells: Annotated[int, Range(1, 9)] = 3  # of a small one
+    PRESETS: ClassVar[dict[str, dict[str, object]]] = {"quick": {"cells": 1}}
+
+
+@dataclass(frozen=True)
+class Large:
+    size: Literal["large"] = "large"  # large
+    seed: int = 0  # of draws
+    # layers of a large one
+    # behind one another
+    layers: Annotated[int, Range(1)] = 4
+    shares: tuple[Annotated[float, Range(0, 1)], ...] = ()
+    PRESETS: ClassVar[dict[str, dict[str, object]]] = {"quick": {"layers": 1}, "paper": {"layers": 9}}
+
+    def check(self) -> None:
+        """Refuse more shares than layers."""
+        if len(self.shares) > self.layers:
+            raise UsageError(f"There are {len(self.shares)} shares for {self.layers} layers.")
+
+
+Sized = Small | Large
+
+
+def grow(params: Sized) -> None: ...
+
+
+GROW: Stage = stage(version=1)(grow)
+
+
+def grown(**given: object) -> Any:
+    return params_of.build("grow", GROW, **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ({}, Small()),
+        ({"options": {"size": "tiny"}}, Small("tiny")),
+        ({"options": {"size": "large", "layers": 2}}, Large(layers=2)),
+        ({"sets": ["size=large", "layers=2"]}, Large(layers=2)),
+        ({"sets": ["grow.size=large"], "options": {"size": "small"}}, Small()),
+        ({"preset": "quick"}, Small(cells=1)),
+        ({"preset": "paper"}, Large(layers=9)),  # the one kind that has it
+        ({"preset": "quick", "options": {"size": "large"}}, Large(layers=1)),
+        ({"preset": "paper", "sets": ["layers=5"]}, Large(layers=5)),
+        ({"options": {"size": "large", "layers": 2, "shares": [0, 0.5]}}, Large(layers=2, shares=(0.0, 0.5))),
+    ],
+)
+def test_the_tag_chooses_the_kind_of_params(given: dict[str, Any], wanted: Sized) -> None:
+    assert grown(**given) == wanted
+    assert params_of.from_json(GROW, params_of.to_json(wanted)) == wanted
+
+
+def test_a_file_chooses_a_kind_and_a_preset_or_an_option_another(tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text("grow: {size: large, seed: 3}\nodd: {size: tiny, cells: 2}\n")
+    assert grown(file=path) == Large(seed=3)
+    assert grown(file=path, preset="quick") == Large(seed=3, layers=1)
+    assert grown(file=path, options={"size": "small"}) == Small(seed=3)
+    assert grown(file=path, block="odd", preset="quick") == Small("tiny", cells=1)
+    with pytest.raises(
+        UsageError, match=r"block odd: cells belongs to the size small or tiny, and the size is large\."
+    ):
+        grown(file=path, block="odd", preset="paper")
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (
+            {"options": {"layers": 2}},
+            r"^--layers belongs to the size large, and the size is small\. Leave it out, or set",
+        ),
+        (
+            {"options": {"size": "large", "cells": 2}},
+            r"^--cells belongs to the size small or tiny, and the size is larg",
+        ),
+        ({"sets": ["layers=2"]}, r"^--set layers=2: layers belongs to the size large, and the size is small"),
+        ({"options": {"size": "huge"}}, r"^--size is 'huge'; it must be one of small, tiny, large\.$"),
+        ({"options": {"cells": 10}}, r"^--cells is 10; it must be a whole number from 1 to 9\.$"),
+        (
+            {"options": {"size": "large", "shares": [0.5, 2]}},
+            r"^--shares is \[0.5, 2\]; .*each item a number from 0 to",
+        ),
+        ({"options": {"size": "large", "layers": 1, "shares": [0, 1]}}, r"^There are 2 shares for 1 layers\.$"),
+        (
+            {"options": {"width": 1}},
+            r"^--width: there is no param width; there are size, seed, cells, layers, shares\.$",
+        ),
+        (
+            {"preset": "paper", "options": {"size": "tiny"}},
+            r"^There is no preset paper for the size small or tiny of gr",
+        ),
+        ({"preset": "huge"}, r"^There is no preset huge for grow; it has quick, paper\.$"),
+    ],
+)
+def test_what_does_not_belong_to_the_kind_is_refused_with_whose_it_is(given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(UsageError, match=sentence):
+        grown(**given)
+
+
+def test_help_of_a_field_stands_behind_it_or_above_it_and_is_joined_over_kinds() -> None:
+    told = params_of.comments(GROW)
+    assert told["layers"] == "layers of a large one behind one another"
+    assert (told["size"], told["seed"]) == ("small, or tiny; large", "of draws")
+    assert params_of.having(GROW, "cells") == ["small", "tiny"] and params_of.having(GROW, "seed") == []
+
+
+def test_params_that_count_are_those_of_the_kind_and_all_where_it_is_unknown() -> None:
+    stored = {"size": "large", "seed": 1, "cells": 3, "layers": 2, "gone": True}
+    assert params_of.counting(GROW, stored) == {"size": "large", "seed": 1, "layers": 2}
+    assert params_of.counting(GROW, {**stored, "size": "vast"}) == {**stored, "size": "vast"}
+
+
+def test_a_preset_with_a_param_that_there_is_none_of_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Small, "PRESETS", {"odd": {"width": 1}})
+    with pytest.raises(UsageError, match=r"^preset odd of grow: there is no param width; there are size, seed"):
+        grown(preset="odd")

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import params as params_of
+from tacpipe import registry
 from tacpipe.report.forward import error_sums
 from tacpipe.report.forward.error_sums import ErrorSums
 
@@ -159,7 +161,8 @@ def _timeline(config: Tree) -> str:
 
 def _params(config: Tree) -> dict[str, Any]:
     """Return the params that make a model what it is, those apart that have a word of their own in a method's name."""
-    return {name: value for name, value in config["params"].items() if name not in _NO_METHOD}
+    found = params_of.counting(registry.load("train.forward"), config["params"])
+    return {name: value for name, value in found.items() if name not in _NO_METHOD}
 
 
 def _key(config: Tree, *, params: bool, without: str = "") -> str:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import params as params_of
+from tacpipe import registry
 from tacpipe.report import contents, provenance
 from tacpipe.report.material import predictions
 from tacpipe.report.material.predictions import Predictions
@@ -47,9 +49,11 @@ class Run:
 
     @property
     def params(self) -> Tree:
-        """What the model was trained with."""
+        """What the model was trained with, as far as it counts for its architecture."""
         found: Tree = self.config.get("params", {})
-        return found
+        if found.get("dropout_mode") == "noop":  # of an older version, whose dropout had no effect then
+            found = {**found, "dropout": 0.0}
+        return params_of.counting(registry.load("train.material"), found)
 
     @property
     def sensors(self) -> tuple[str, ...]:

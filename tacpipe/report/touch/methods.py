@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import biotac_sp
+from tacpipe import biotac_sp, registry
+from tacpipe import params as params_of
 from tacpipe.report import contents, provenance
 from tacpipe.report.naming import told_apart
 from tacpipe.report.touch import predictions
@@ -42,9 +43,9 @@ class Run:
 
     @property
     def params(self) -> Tree:
-        """What the model was trained with."""
+        """What the model was trained with, as far as it counts for its architecture."""
         found: Tree = self.config.get("params", {})
-        return found
+        return params_of.counting(registry.load("train.touch"), found)
 
     @property
     def architecture(self) -> str:

@@ -14,9 +14,17 @@ def methods(*results: Any) -> list[Method]:
 
 def test_runs_that_differ_in_seed_words_or_other_networks_targets_are_one_method() -> None:
     found = methods(
-        result(seed=0), result(seed=1, setting="random"), result(seed=2, baselines={}), result(targets=("pdc_th",))
+        result("patches", seed=0),
+        result("patches", seed=1, setting="random"),
+        result("patches", seed=2, baselines={}),
+        result("patches", targets=("pdc_th",)),
     )
-    assert [(one.name, len(one.runs)) for one in found] == [("strong", 4)]
+    assert [(one.name, len(one.runs)) for one in found] == [("patches", 4)]
+
+
+def test_options_that_another_architecture_has_set_no_method_apart() -> None:
+    found = methods(result(trees=300), result(trees=300, points=64, head="fc1"), result(trees=300, wrist="estimated"))
+    assert [(one.name, len(one.runs)) for one in found] == [("strong", 3)]
 
 
 def test_one_network_for_other_targets_is_another_method() -> None:
