@@ -52,7 +52,7 @@ class Params:
     }
 
 
-@stage(version=2)
+@stage(version=3)
 def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
     """Train the forecast of touch: past touch and motion and the planned motion give the touch to come.
 
