@@ -92,7 +92,7 @@ class Recurrent(Forward):
 Params = Change | Recurrent
 
 
-@stage(version=2)
+@stage(version=3)
 def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
     """Train a model that predicts future touch from past touch, past motion and the planned motion.
 

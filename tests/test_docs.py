@@ -104,6 +104,11 @@ def test_the_commands_of_the_readme_print_what_it_says(tmp_path: Path, monkeypat
     assert done.returncode == 0, done.stderr
     assert "trial-011" in done.stdout
 
+    for page in sorted((ROOT / "docs" / "tasks").glob("*.md")):  # whose models and datasets are those of the README
+        (python,) = blocks(page.read_text(), "python")
+        done = subprocess.run([sys.executable, "-c", python], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{page.name}: {done.stderr}"
+
 
 def test_the_commands_in_the_tasks_and_data_pages_exist(lab: Lab) -> None:
     pages = [*sorted((ROOT / "docs" / "tasks").glob("*.md")), ROOT / "data" / "README.md", ROOT / "README.md"]

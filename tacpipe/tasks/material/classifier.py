@@ -182,8 +182,8 @@ class Classifier:
         **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
         a row a slide with ``recording``, ``sensor``, ``material`` (int32), a ``score_…`` of each class and, of networks, the
         latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of a dataset are those of the command to the last bit;
-        those of one recording alone may differ in the last digit of a float32, because slides are computed
-        together. Raises `UsageError` where the recordings did not go through the stages that the model was trained behind.
+        those of one recording alone may differ in the last digits of a float32, because slides are computed together.
+        Raises `UsageError` where the recordings did not go through the stages that the model was trained behind.
 
         **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them of a
         recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64. Raises
