@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import Distribution
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -209,7 +210,7 @@ def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str,
     assert done.stdout.startswith(start) and done.stdout.count("\n") == 1
 
 
-def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, url: dict[str, object] | None) -> None:
+def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, url: Any) -> None:
     """Make tacpipe look installed from a URL, by pip."""
     about = folder / "tacpipe-9.9.dist-info"
     about.mkdir()
@@ -232,7 +233,7 @@ def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monke
     clone.mkdir()
     wheel.touch()
     git = {"url": "https://host/tacpipe.git", "vcs_info": {"vcs": "git", "commit_id": "abc"}}
-    cases: dict[str, dict[str, object] | None] = {
+    cases: dict[str, Any] = {
         f"pip install -e '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {"editable": True}},
         f"pip install '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {}},
         f"pip install '{wheel}[learn]'": {"url": wheel.as_uri(), "archive_info": {}},
