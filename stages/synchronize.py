@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.constraints import PositiveFloat
+from tacpipe.constraints import PositiveFloat, Rate
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Attribute, Recording, stage
 
@@ -30,7 +30,7 @@ MEDIAN_NS = (
 class Params:
     """The grid, the clock that places samples on it, and what counts as a gap."""
 
-    rate_hz: PositiveFloat = 50.0  # points a second of the uniform grid
+    rate_hz: Rate = 50.0  # points a second of the uniform grid
     # uniform; logged: at the master's own stamps; fresh: at those whose rows are not repeated samples
     grid: Literal["uniform", "logged", "fresh"] = "uniform"
     master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one

@@ -45,7 +45,7 @@ class Range:
         ends = [
             (self.least, "of {} or more"),
             (self.above, "above {}"),
-            (self.most, "of {} or less"),
+            (self.most, "at most {}"),
             (self.below, "below {}"),
         ]
         return f"{kind} " + " and ".join(text.format(end) for end, text in ends if end is not None)
@@ -110,4 +110,5 @@ PositiveFloat = Annotated[float, Range(above=0)]
 NonNegativeFloat = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]  # what numpy, torch and scikit-learn take
+Rate = Annotated[float, Range(above=0, most=1_000_000_000)]  # Hz; stamps are whole nanoseconds
 Names = Annotated[str, CommaList()]

@@ -261,9 +261,9 @@ def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
         ("report nowhere --preset paper", "There is no preset paper for report; it has none."),
         ("report nowhere --traces -1", "--traces is -1; it must be a whole number of 0 or more."),
         ("synchronize nowhere --grid bogus --skip-bad", "--grid is 'bogus'; it must be one of uniform, logged, fresh."),
-        ("synchronize nowhere --rate-hz -5", "--rate-hz is -5; it must be a number above 0."),
-        ("synchronize nowhere --rate-hz nan", "--rate-hz is nan; it must be a number above 0."),
-        ("synchronize nowhere --set rate_hz=-5", "--set rate_hz=-5: rate_hz is -5; it must be a number above 0."),
+        ("synchronize nowhere --rate-hz -5", "--rate-hz is -5; it must be a number above 0 and at most 1000000000."),
+        ("synchronize nowhere --rate-hz nan", "--rate-hz is nan; it must be a number above 0 and"),
+        ("synchronize nowhere --set rate_hz=-5", "--set rate_hz=-5: rate_hz is -5; it must be a number above 0 and"),
         ("synchronize nowhere --jobs -3", "--jobs is -3; it must be a whole number of 0 or more."),
         ("split nowhere --fold 1", "No such option"),
         ("split nowhere --scheme foo", "--scheme is 'foo'; it must be one of random, kfold, blocked, leave-one-out"),
@@ -359,7 +359,7 @@ def test_a_plug_ins_stage_has_choices_ranges_and_kinds_like_a_built_in_one(bendi
         ("--way rough", "--way is 'rough'; it must be one of gentle, hard."),
         ("--angle-deg 91", "--angle-deg is 91; it must be a number from 0 to 90."),
         ("--force-n 2", "--force-n belongs to the way hard, and the way is gentle. Leave it out, or set way to hard."),
-        ("--way hard --force-n 6", "--force-n is 6; it must be a number above 0 and of 5 or less."),
+        ("--way hard --force-n 6", "--force-n is 6; it must be a number above 0 and at most 5."),
         ("--preset paper", "There is no preset paper for bend; it has strong."),
     ):
         ran = bending(f"bend -o out {words}")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe import regular
-from tacpipe.constraints import PositiveFloat
+from tacpipe.constraints import Rate
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import excerpt, plain
 from tacpipe.formats.folders import walk
@@ -45,7 +45,7 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
 class Params:
     """How slides are read."""
 
-    rate_hz: PositiveFloat = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
+    rate_hz: Rate = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
     # time: frames in order of time; authors: in the order in which they were published, to compare with
     layout: Literal["time", "authors"] = "time"
 
