@@ -1,20 +1,25 @@
 """A recorder that gives devices as long as a busy computer may take: it can be run in the place of ``tacpipe.cli``.
 
-How long a device may be silent is tried over a clock that the test turns, in `test_schedule`. Where devices are emulated in
-real time, these limits would measure the computer.
+A trial's duration is counted in samples there: it has lasted a second once every stream gave those of a second. How long a
+device may be silent is tried over a clock that the test turns, in `test_schedule`; here such limits would measure the
+computer.
 """
 
 from __future__ import annotations
 
 import importlib
+import time
 from dataclasses import replace
 
 import pytest
 
 from tacpipe.links import dialogue
+from tacpipe.recording.recorder import Recorder
+from tacpipe.recording.rig import Rig
 from tacpipe.sensors.sensor import Ask
 
 TIMES = 50
+HANGS_S = 600.0
 LIMITS = {
     "tacpipe.recording.recorder": ("FIRST_S", "SILENT_S"),
     "tacpipe.recording.station": ("MUTE_S", "TARE_S", "REPLY_S", "STOP_S"),
@@ -29,8 +34,28 @@ def relax(patch: pytest.MonkeyPatch) -> None:
         module = importlib.import_module(name)
         for limit in limits:
             patch.setattr(module, limit, getattr(module, limit) * TIMES)
+    patch.setattr("tacpipe.recording.trials.clock", Samples(patch))
     reply = dialogue._reply
     patch.setattr(dialogue, "_reply", lambda link, ask, *more: reply(link, longer(ask), *more))
+
+
+class Samples:
+    """A clock of trials, which goes by the samples that the slowest stream of the latest rig gave."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        made, self.until_s = Recorder.__init__, time.monotonic() + HANGS_S
+
+        def remember(recorder: Recorder, rig: Rig) -> None:
+            made(recorder, rig)
+            self.watches = recorder.watches.values()
+
+        patch.setattr(Recorder, "__init__", remember)
+
+    def now_s(self) -> float:
+        """Return the seconds of samples that every stream gave."""
+        assert time.monotonic() < self.until_s, "a stream gives nothing"
+        awaited = [watch for watch in self.watches if watch.stream.sensor.awaited]
+        return min((watch.samples / watch.stream.sensor.rate_hz for watch in awaited), default=time.monotonic())
 
 
 def longer(ask: Ask) -> Ask:
