@@ -15,7 +15,7 @@ import pytest
 
 from tacpipe.links import dialogue
 from tacpipe.recording.recorder import Recorder
-from tacpipe.recording.rig import Rig
+from tacpipe.recording.watch import Watch
 from tacpipe.sensors.sensor import Ask
 
 TIMES = 50
@@ -40,22 +40,28 @@ def relax(patch: pytest.MonkeyPatch) -> None:
 
 
 class Samples:
-    """A clock of trials, which goes by the samples that the slowest stream of the latest rig gave."""
+    """A clock of trials, which goes by what the slowest stream gave while a trial was recorded."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        made, self.until_s = Recorder.__init__, time.monotonic() + HANGS_S
+        tick, self.until_s = Recorder.tick, time.monotonic() + HANGS_S
+        self.counts: dict[Watch, int] = {}
 
-        def remember(recorder: Recorder, rig: Rig) -> None:
-            made(recorder, rig)
-            self.watches = recorder.watches.values()
+        def counted(recorder: Recorder) -> None:
+            watches = [watch for watch in recorder.watches.values() if watch.stream.sensor.awaited]
+            before = [watch.samples for watch in watches]
+            tick(recorder)
+            if recorder._spool is not None:  # what comes between trials is of none
+                came = [
+                    self.counts.get(watch, 0) + watch.samples - had for watch, had in zip(watches, before, strict=True)
+                ]
+                self.counts = dict(zip(watches, came, strict=True))
 
-        patch.setattr(Recorder, "__init__", remember)
+        patch.setattr(Recorder, "tick", counted)
 
     def now_s(self) -> float:
         """Return the seconds of samples that every stream gave."""
         assert time.monotonic() < self.until_s, "a stream gives nothing"
-        awaited = [watch for watch in self.watches if watch.stream.sensor.awaited]
-        return min((watch.samples / watch.stream.sensor.rate_hz for watch in awaited), default=time.monotonic())
+        return min((count / watch.stream.sensor.rate_hz for watch, count in self.counts.items()), default=0.0)
 
 
 def longer(ask: Ask) -> Ask:
