@@ -1,20 +1,25 @@
 """A recorder that gives devices as long as a busy computer may take: it can be run in the place of ``tacpipe.cli``.
 
-How long a device may be silent is tried over a clock that the test turns, in `test_schedule`. Where devices are emulated in
-real time, these limits would measure the computer.
+A trial's duration is counted in samples there: it has lasted a second once every stream gave those of a second. How long a
+device may be silent is tried over a clock that the test turns, in `test_schedule`; here such limits would measure the
+computer.
 """
 
 from __future__ import annotations
 
 import importlib
+import time
 from dataclasses import replace
 
 import pytest
 
 from tacpipe.links import dialogue
+from tacpipe.recording.recorder import Recorder
+from tacpipe.recording.watch import Watch
 from tacpipe.sensors.sensor import Ask
 
 TIMES = 50
+HANGS_S = 600.0
 LIMITS = {
     "tacpipe.recording.recorder": ("FIRST_S", "SILENT_S"),
     "tacpipe.recording.station": ("MUTE_S", "TARE_S", "REPLY_S", "STOP_S"),
@@ -29,8 +34,34 @@ def relax(patch: pytest.MonkeyPatch) -> None:
         module = importlib.import_module(name)
         for limit in limits:
             patch.setattr(module, limit, getattr(module, limit) * TIMES)
+    patch.setattr("tacpipe.recording.trials.clock", Samples(patch))
     reply = dialogue._reply
     patch.setattr(dialogue, "_reply", lambda link, ask, *more: reply(link, longer(ask), *more))
+
+
+class Samples:
+    """A clock of trials, which goes by what the slowest stream gave while a trial was recorded."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        tick, self.until_s = Recorder.tick, time.monotonic() + HANGS_S
+        self.counts: dict[Watch, int] = {}
+
+        def counted(recorder: Recorder) -> None:
+            watches = [watch for watch in recorder.watches.values() if watch.stream.sensor.awaited]
+            before = [watch.samples for watch in watches]
+            tick(recorder)
+            if recorder._spool is not None:  # what comes between trials is of none
+                came = [
+                    self.counts.get(watch, 0) + watch.samples - had for watch, had in zip(watches, before, strict=True)
+                ]
+                self.counts = dict(zip(watches, came, strict=True))
+
+        patch.setattr(Recorder, "tick", counted)
+
+    def now_s(self) -> float:
+        """Return the seconds of samples that every stream gave."""
+        assert time.monotonic() < self.until_s, "a stream gives nothing"
+        return min((count / watch.stream.sensor.rate_hz for watch, count in self.counts.items()), default=0.0)
 
 
 def longer(ask: Ask) -> Ask:
