@@ -30,7 +30,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { text-align: right; padding: .25rem .55rem; border-bottom: 1px solid var(--panel); }
 th:first-child, td:first-child, .words th, .words td { text-align: left; } .scroll { overflow-x: auto; }
 td { vertical-align: top; } td:first-child, small { white-space: nowrap; } small { color: var(--note); font-size: .8rem; }
-.words td:first-child { white-space: normal; }
+.words td:first-child { white-space: normal; } .names th:nth-child(2), .names td:nth-child(2) { text-align: left; }
 tr.best td { font-weight: 600; } tr.quiet td { color: var(--note); }
 code { font-size: .85rem; overflow-wrap: anywhere; }
 """
@@ -133,8 +133,8 @@ def figure(svg: str, caption: str) -> str:
 
 
 def note(text: str) -> str:
-    """Return a paragraph in small print."""
-    return f'<p class="note">{escape(text)}</p>'
+    """Return a paragraph in small print; empty without a text."""
+    return f'<p class="note">{escape(text)}</p>' if text else ""
 
 
 def table(
