@@ -88,7 +88,7 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         compare=given["compare"],
         **paths,
     )
-    shown = stage.headline if not given["check"] else None
+    shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
     _report(pipeline.run(request), shown, as_json=given["json_"], quiet=given["quiet"])
 
 
