@@ -10,6 +10,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
 MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
+BROWSER := chromium fonts-dejavu-core
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
@@ -123,6 +124,9 @@ $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 	fi
 	@if ! command -v umockdev-wrapper > /dev/null; then \
 	    ($(call debian,$(MOCKED_DEVICES))) || echo "Until then the tests that need a HID device are skipped." >&2; \
+	fi
+	@if ! command -v chromium > /dev/null; then \
+	    ($(call debian,$(BROWSER))) || echo "Until then the tests that look at pages in a browser are skipped." >&2; \
 	fi
 	@touch $(VENV)/.learn $@
 

@@ -1,7 +1,8 @@
 """Judge a model on recordings, beside its baselines, with intervals over recordings.
 
-Writes ``metrics.json``, ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the
-sums behind them) and the predictions of each recording. Recordings that the model was trained on are reported apart,
+Prints how the model compares with the best baseline, and writes it to ``headline.json``. Writes ``metrics.json``,
+``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
+predictions of each recording. Recordings that the model was trained on are reported apart,
 under ``seen``.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tacpipe import headline
 from tacpipe.stage import stage
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ class Params:
     """Nothing to choose: how a model is judged is not up to who trained it."""
 
 
-@stage(version=2)
+@stage(version=3, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Judge a model on recordings, by the measures of the task it was trained for."""
     from tacpipe import model_files

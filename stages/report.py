@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class Params:
     """What the page shows."""
 
-    title: str = "Touch, predicted"  # heading of the page
+    title: str = ""  # heading of the page; without one, what its tasks predict
     traces: NonNegativeInt = 2  # recordings of each forecast told in full whose predictions are drawn
 
 
-@stage(version=3)
+@stage(version=4)
 def report(params: Params, results: Datasets) -> Result:
     """Put results on one page: headline, figures, tables, and where every number comes from."""
     from tacpipe.report import page

@@ -15,7 +15,7 @@ Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
     "acquire": "Record a rig: every stream that its rig file lists, without losing or inventing a sample.",
     "label": "Change labels of recordings, or exclude them, without touching a shard.",
-    "show": "Show what is in a dataset: recordings, streams, rates, gaps, saturation, labels.",
+    "show": "Show what is in a dataset: recordings and labels, a split's roles, a model, or a result's headline.",
     "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
     "sensors": "Look after sensors: list those that are known, find out which one speaks on a port, emulate a rig.",
     "store": "Manage the store: status, list, checkout, verify, repair, gc, link, push, pull.",
@@ -54,7 +54,9 @@ def _show(program: typer.Typer) -> None:
     def show(
         dataset: Annotated[Path, typer.Argument(help="A dataset.")],
         as_json: AsJson = False,
-        full: Annotated[bool, typer.Option("--full", help="Every recording, not the first 20.")] = False,
+        full: Annotated[
+            bool, typer.Option("--full", help="Every recording, not the first 20, and every label.")
+        ] = False,
     ) -> None:
         from tacpipe import overview
 

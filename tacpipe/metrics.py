@@ -93,5 +93,6 @@ def bounds(drawn: Floats) -> tuple[Floats, Floats]:
     low, high = np.full(drawn.shape[1], np.nan), np.full(drawn.shape[1], np.nan)
     known = ~np.isnan(drawn).all(axis=0)
     tail = (1 - COVERAGE) / 2
-    low[known], high[known] = np.nanquantile(drawn[:, known], [tail, 1 - tail], axis=0)
+    if known.any():
+        low[known], high[known] = np.nanquantile(drawn[:, known], [tail, 1 - tail], axis=0)
     return low, high

@@ -1,32 +1,78 @@
-"""What is in a dataset: recordings, streams, rates, gaps, holds, saturation, labels."""
+"""What is in a dataset: the streams of recordings, a split's roles, what a model learned from, how a result came out.
+
+What is shown follows from what the dataset holds, whichever stage made it.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from tacpipe import pipeline
+from tacpipe import execution, model_overview
+from tacpipe import manifest as manifest_of
 from tacpipe.dataset import Dataset, Shard
+from tacpipe.headline import counted
+from tacpipe.stage import ROLES
+from tacpipe.store import locate
 
 _SHOWN = 20  # recordings listed before the rest is counted
+_TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
+_SPLIT = ("recording", "fold", "role")  # columns of a split
 _GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 
 
 def of(path: Path) -> dict[str, Any]:
-    """Return what is in the dataset at ``path``: numbers a stream of each recording, labels, files."""
-    opened = pipeline.open_dataset(path)
+    """Return what is in the dataset at ``path``: its ``kind`` (recordings, split, model, result), files, and the rest by it.
+
+    Of recordings, numbers a stream and labels; of a split, recordings by fold and role; of a model and of a result, what
+    `tacpipe.model_overview` finds.
+    """
+    found = manifest_of.find(path)
+    store = locate(found.directory)
+    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),)))
+    about = _about(opened)
+    if model_overview.is_result(opened):
+        return {"kind": "result", **about, **model_overview.of_result(opened, found, store)}
+    if model_overview.is_model(opened):
+        return {"kind": "model", **about, **model_overview.of_model(opened, store)}
+    folds = _folds(opened)
+    if folds:
+        return {"kind": "split", **about, "params": dict(opened.source.params), "folds": folds}
+    return {
+        "kind": "recordings",
+        **about,
+        "recordings": {name: _recording(shard) for name, shard in opened.shards.items()},
+        "attributes": {name: dict(shard.attributes) for name, shard in opened.shards.items()},
+        "excluded": _excluded(opened),
+    }
+
+
+def _about(opened: Dataset) -> dict[str, Any]:
+    """Return what every dataset has: who made it, files and sizes."""
     manifest = opened.source
     return {
         "stage": manifest.stage,
         "digest": manifest.digest,
-        "recordings": {name: _recording(shard) for name, shard in opened.shards.items()},
-        "attributes": {name: dict(shard.attributes) for name, shard in opened.shards.items()},
-        "excluded": _excluded(opened),
         "skipped": dict(manifest.skipped),
         "files": {name: file["bytes"] for name, file in manifest.files.items()},
         "bytes": sum(shard["bytes"] for entry in manifest.recordings.values() for shard in entry["shards"].values()),
         "rows": manifest.rows,
     }
+
+
+def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
+    """Return how many recordings have each role, by fold, where the dataset is a split; else nothing."""
+    shards = list(opened.shards.values())
+    if len(shards) != 1 or shards[0].streams != ("",):
+        return {}
+    table = shards[0].table()
+    if not set(_SPLIT) <= set(table.column_names):
+        return {}
+    found: dict[str, dict[str, int]] = {}
+    for fold, role in zip(table["fold"].to_pylist(), table["role"].to_pylist(), strict=True):
+        counts = found.setdefault(str(fold), {})
+        counts[str(role)] = counts.get(str(role), 0) + 1
+    return found
 
 
 def _excluded(opened: Dataset) -> dict[str, str]:
@@ -68,7 +114,15 @@ def _stream(shard: Shard, stream: str) -> dict[str, Any]:
 
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
-    """Return the overview as lines: one a stream of each recording, then labels, files and totals."""
+    """Return the overview as lines: of recordings, one a stream of each, then labels; then files and totals."""
+    told = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
+    if value["kind"] in told:
+        made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
+        return "\n".join([*told[value["kind"]](value), *_files(value), made])
+    return "\n".join(_recordings_text(value, full))
+
+
+def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
     names = sorted(value["recordings"])
     shown = names if full else names[:_SHOWN]
     lines = [
@@ -84,21 +138,45 @@ def to_text(value: dict[str, Any], *, full: bool = False) -> str:
             )
     if len(names) > len(shown):
         lines.append(f"… and {len(names) - len(shown)} more (--full)")
-    lines += ["", *_labels(value["attributes"])]
+    lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
     lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
-    lines += [f"file: {name}, {size} bytes" for name, size in value["files"].items()]
+    lines += _files(value)
     lines.append(
-        f"{len(names)} recordings, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
+        f"{counted(len(names), 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
         f"made by {value['stage']} [{value['digest'][:12]}]"
     )
-    return "\n".join(lines)
+    return lines
 
 
-def _labels(attributes: dict[str, dict[str, Any]]) -> list[str]:
-    """Return one line a label that takes few values, with how often it takes each."""
+def _split_text(value: dict[str, Any]) -> list[str]:
+    """Return how many recordings have each role, a line a fold."""
+    roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
+    lines = [f"{'fold':<6}" + "".join(f"{role:>8}" for role in roles)]
+    for fold, counts in value["folds"].items():
+        lines.append(f"{fold:<6}" + "".join(f"{counts.get(role, 0):>8}" for role in roles))
+    return [*lines, f"params: {model_overview.flat(value['params'])}"]
+
+
+def _role_order(role: str) -> tuple[int, str]:
+    return (ROLES.index(role) if role in ROLES else len(ROLES)), role
+
+
+def _files(value: dict[str, Any]) -> list[str]:
+    return [f"file: {name}, {size} bytes" for name, size in value["files"].items()]
+
+
+def _labels(attributes: dict[str, dict[str, Any]], full: bool) -> list[str]:
+    """Return one line a label that takes few values, with how often it takes each; a simulator's truth on one in all."""
     lines = []
-    for label in sorted({label for labels in attributes.values() for label in labels}):
+    names = sorted({label for labels in attributes.values() for label in labels})
+    truth = [name for name in names if name.startswith(_TRUTH)]
+    if truth and not full:
+        names = [name for name in names if name not in truth]
+        lines.append(
+            f"{_TRUTH}*: {counted(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
+        )
+    for label in names:
         values = [labels[label] for labels in attributes.values() if label in labels]
         if any(isinstance(value, float) for value in values):
             numbers = [value for value in values if isinstance(value, int | float)]

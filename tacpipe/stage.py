@@ -81,6 +81,7 @@ class Stage:
     )
     fit: Stage | None = None  # makes what a ``Fitted`` argument holds
     discover: Callable[[Any, Path], Mapping[str, Mapping[str, Path]]] | None = None
+    headline: str | None = None  # the file of the result that holds its headlines, which the command prints
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Return what the function returns: no store is involved."""
@@ -140,6 +141,10 @@ def stage(
     reads: tuple[str, ...] | None = None,
     fit: Stage | None = None,
     discover: Callable[[Any, Path], Mapping[str, Mapping[str, Path]]] | None = None,
+    headline: str | None = None,
 ) -> Callable[[Callable[..., Any]], Stage]:
-    """Declare the decorated function a stage. Raise ``version`` whenever its result changes."""
-    return lambda function: Stage(function, version, reads, fit, discover)
+    """Declare the decorated function a stage. Raise ``version`` whenever its result changes.
+
+    ``headline`` names the file of its result (`tacpipe.headline`) that the command prints as a table.
+    """
+    return lambda function: Stage(function, version, reads, fit, discover, headline)

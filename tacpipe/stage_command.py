@@ -95,18 +95,27 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         replace=given["replace"],
         **paths,
     )
-    _report(pipeline.run(request), as_json=given["json_"], quiet=given["quiet"])
+    shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
+    _report(pipeline.run(request), shown, as_json=given["json_"], quiet=given["quiet"])
 
 
-def _report(outcome: pipeline.Outcome, *, as_json: bool, quiet: bool) -> None:
+def _report(outcome: pipeline.Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
     for note in outcome.notes:
         print(f"tacpipe: {note}", file=sys.stderr)
     for name, why in outcome.bad.items():
         print(f"tacpipe: left out {name}: {why}", file=sys.stderr)
     if not quiet:
         print(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s", file=sys.stderr)
+    told: dict[str, Any] = {}
+    if headline is not None and (as_json or not quiet):
+        from tacpipe import headline_table
+
+        found = headline_table.of_output(outcome.output, headline)
+        told["headline"] = [one.to_json() for one in found]
+        if not quiet:
+            headline_table.show(found)
     if as_json:
-        value = {"schema_version": 1, **vars(outcome), "output": str(outcome.output)}
+        value = {"schema_version": 1, **vars(outcome), "output": str(outcome.output), **told}
         del value["said"], value["code"]  # which the notes hold in words
         print(json.dumps(value))
     else:

@@ -71,10 +71,10 @@ def recording_name(material: int, trial: int) -> str:
     return f"biotac-m{material:02d}-t{trial:03d}"
 
 
-@stage(version=1, discover=discover)
+@stage(version=2, discover=discover)
 def biotac_slide(params: Params, files: Files) -> Recording:
     """Return the stream biotac of a slide, and those of the arm that are there; angular velocity that is NaN stays so."""
-    from tacpipe.formats import xela
+    from tacpipe.formats import published, xela
 
     streams: dict[str, pa.Table] = {}
     material = trial = 0
@@ -87,14 +87,19 @@ def biotac_slide(params: Params, files: Files) -> Recording:
         else:
             stream, columns = ARM[match[3]]
             streams[stream] = _arm(path, stream, columns)
+    begin = next(iter(streams.values()))["t_ns"]
+    marked = published.mark("biotac-slide", begin[0].as_py() if len(begin) else 0)
+    # all published slides of a material were recorded in a row; of others nobody says so
+    session = {"session": f"biotac-m{material:02d}"} if marked else {}
     return Recording(
         streams,
         {
             "sensor": "biotac",
             "material": material,
             "trial": trial,
-            "session": f"biotac-m{material:02d}",  # all slides of a material were recorded in a row
+            **session,
             "rate_hz": RATE_HZ,
+            **marked,
             **xela.authors_role(params.authors_role),
         },
     )

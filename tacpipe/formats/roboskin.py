@@ -80,12 +80,12 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return found
 
 
-@stage(version=1, discover=discover)
+@stage(version=2, discover=discover)
 def roboskin(params: Params, files: Files) -> Recording:
     """Return the stream roboskin of a slide: 60 columns, triangle by triangle, one row a frame; stamps are made."""
     import numpy as np
 
-    from tacpipe.formats import channels
+    from tacpipe.formats import channels, published
     from tacpipe.signals.resampling import uniform_grid
     from tacpipe.signals.scrambling import scramble
 
@@ -106,6 +106,7 @@ def roboskin(params: Params, files: Files) -> Recording:
             "session": f"roboskin-m{material:02d}",
             "rate_hz": params.rate_hz,
             "layout": params.layout,
+            **published.mark("roboskin"),
             **_part(block),
         },
     )

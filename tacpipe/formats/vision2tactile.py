@@ -73,14 +73,14 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return dict(sorted(found.items()))
 
 
-@stage(version=1, discover=discover)
+@stage(version=2, discover=discover)
 def vision2tactile(params: Params, files: Files) -> Recording:
     """Return the streams cloud, grasp and reading of a grasp; one with the reading of an earlier one is marked."""
     import numpy as np
 
     from tacpipe import biotac_sp
     from tacpipe.clouds.files import require_metres
-    from tacpipe.formats import channels, pcd
+    from tacpipe.formats import channels, pcd, published
 
     own = {Path(name).name: path for name, path in files.items() if not name.startswith(TWIN)}
     label, time_s, _ = next(name for name in files if not name.startswith(TWIN)).split("/")
@@ -102,6 +102,7 @@ def vision2tactile(params: Params, files: Files) -> Recording:
             "sensor": "biotac-sp",
             "object": label,
             "session": session(label, int(time_s)),
+            **published.mark("vision2tactile", t_ns),
             **({"duplicate_of": twins[0]} if twins else {}),
         },
     )

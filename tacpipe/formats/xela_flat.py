@@ -25,12 +25,12 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return trials(source, NAMES)
 
 
-@stage(version=1, discover=discover)
+@stage(version=2, discover=discover)
 def xela_flat(params: Params, files: Files) -> Recording:
     """Return the streams xela1, xela2, robot, marker1 and marker2 of a trial; an unseen marker is NaN."""
     import numpy as np
 
-    from tacpipe.formats import channels, folders, xela
+    from tacpipe.formats import channels, folders, published, xela
     from tacpipe.signals.resampling import uniform_grid
 
     trial = folders.require(files, NAMES)
@@ -74,6 +74,7 @@ def xela_flat(params: Params, files: Files) -> Recording:
             "rate_hz": rate_hz,
             "trial": trial,
             **{f"{name}_unseen_ratio": round(unseen, 4) for name, (_, unseen) in markers.items()},
+            **published.mark("xela-flat", meta.utc_ns("start_time")),
             **xela.authors_role(params.authors_role),
         },
     )

@@ -29,6 +29,8 @@ COLOURS = {"model": "#010301", "persistence": "#010302", "codec": "#010303", "ot
 _THEME = {INK: "currentColor", FAINT: "var(--faint)", **{hexes: f"var(--{name})" for name, hexes in COLOURS.items()}}
 STYLES = tuple(itertools.product(("-", "--", ":"), ("model", "persistence", "codec", "other")))  # of lines
 LEGEND = 52  # letters of a line
+_COLUMN = 6.0  # inches; a wider figure keeps its size on a small screen and is scrolled, or its text could not be read
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "text.parse_math": False,  # and a dollar in a name is one
@@ -61,6 +63,8 @@ def svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float
         figure = Figure(figsize=size, layout="constrained")
         grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
         draw(list(grid[:, 0]))
+        for axes in grid[:, 0]:
+            _write_plainly(axes)
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         figure.savefig(content, format="svg", transparent=True, metadata=nothing)
     drawn = re.sub(r"<metadata>.*?</metadata>", "", content.getvalue(), flags=re.DOTALL)
@@ -69,7 +73,37 @@ def svg(draw: Callable[[list[Axes]], None], title: str, size: tuple[float, float
     drawn = re.sub(r' id="([\w.-]+)"', lambda found: found[0] if found[1] in wanted else "", drawn)
     for colour, variable in _THEME.items():
         drawn = drawn.replace(colour, variable)
-    return drawn.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
+    wide = ' class="wide"' if size[0] > _COLUMN else ""
+    return drawn.replace("<svg", f'<svg role="img"{wide} aria-label="{escape(title)}"', 1)
+
+
+def plain_number(value: float) -> str:
+    """Return a tick of a logarithmic axis as text: powers of ten in superscript digits where there are many zeros.
+
+    >>> plain_number(0.24), plain_number(1.0), plain_number(3e-5), plain_number(1e6)
+    ('0.24', '1', '3×10⁻⁵', '10⁶')
+    """
+    if value == 0 or 1e-4 < abs(value) < 1e5:
+        return f"{value:.10g}".replace("-", "−")
+    digits, _, exponent = f"{value:.3e}".partition("e")
+    power = f"10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+    factor = f"{float(digits):g}".replace("-", "−")
+    return power if factor == "1" else f"{factor}×{power}"
+
+
+def _write_plainly(axes: Axes) -> None:
+    """Write the ticks of logarithmic axes as text: matplotlib's own are mathtext, which stays raw where text is text."""
+    from matplotlib.ticker import LogFormatter
+
+    class Plain(LogFormatter):
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return plain_number(x) if super().__call__(x, pos) else ""  # which ticks have room for a label
+
+    for axis in (axes.xaxis, axes.yaxis):
+        if isinstance(axis.get_major_formatter(), LogFormatter):
+            axis.set_major_formatter(Plain())
+        if isinstance(axis.get_minor_formatter(), LogFormatter):
+            axis.set_minor_formatter(Plain(labelOnlyBase=False))
 
 
 def legend_below(axes: Axes, columns: int = 1) -> None:

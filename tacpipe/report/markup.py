@@ -15,7 +15,7 @@ STYLE = """
 @media (prefers-color-scheme: dark) { :root { --paper: #15171a; --text: #e3e5e8; --panel: #1f2226;
   --faint: #7d838c; --note: #a6adb7; --model: #6cabff; --persistence: #ff9d4d; --codec: #5fce93; --other: #b79cf2; } }
 body { background: var(--paper); color: var(--text); font: 16px/1.5 system-ui, sans-serif; max-width: 72rem;
-  margin: 2rem auto; padding: 0 1rem; }
+  margin: 2rem auto; padding: 0 1rem; overflow-wrap: break-word; }
 h1 { font-size: 1.4rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; } h3 { font-size: 1rem; margin-bottom: .3rem; }
 .headline { background: var(--panel); border-left: .35rem solid var(--faint); padding: .8rem 1.1rem; font-size: 1.3rem; }
 .better { border-color: var(--codec); } .worse { border-color: var(--persistence); }
@@ -23,12 +23,14 @@ h1 { font-size: 1.4rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; } h3 { fo
 .badge { background: var(--persistence); color: var(--paper); border-radius: .3rem; padding: .1rem .5rem;
   font-size: .85rem; vertical-align: middle; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 24rem), 1fr)); gap: 1.5rem; }
+.pair > * { min-width: 0; }
 figure { margin: 1rem 0; } figcaption { color: var(--note); font-size: .9rem; } svg { max-width: 100%; height: auto; }
+svg.wide { max-width: none; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { text-align: right; padding: .25rem .55rem; border-bottom: 1px solid var(--panel); }
 th:first-child, td:first-child, .words th, .words td { text-align: left; } .scroll { overflow-x: auto; }
 td { vertical-align: top; } td:first-child, small { white-space: nowrap; } small { color: var(--note); font-size: .8rem; }
-.words td:first-child { white-space: normal; }
+.words td:first-child { white-space: normal; } .names th:nth-child(2), .names td:nth-child(2) { text-align: left; }
 tr.best td { font-weight: 600; } tr.quiet td { color: var(--note); }
 code { font-size: .85rem; overflow-wrap: anywhere; }
 """
@@ -127,12 +129,12 @@ def listed(names: list[str]) -> str:
 
 def figure(svg: str, caption: str) -> str:
     """Return a figure with what it shows."""
-    return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
+    return f'<figure><div class="scroll">{svg}</div><figcaption>{escape(caption)}</figcaption></figure>'
 
 
 def note(text: str) -> str:
-    """Return a paragraph in small print."""
-    return f'<p class="note">{escape(text)}</p>'
+    """Return a paragraph in small print; empty without a text."""
+    return f'<p class="note">{escape(text)}</p>' if text else ""
 
 
 def table(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,10 @@ TASKS = {  # the package whose functions ``report`` and ``reads`` tell of a task
 }
 
 
-def render(given: Sequence[Dataset], *, title: str, traces: int = 2) -> bytes:
+def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> bytes:
     """Return the page for results of ``tacpipe evaluate``, as UTF-8; the same results give the same bytes.
 
+    Without a ``title``, it is made of what the tasks on the page predict.
     Results are told by task, in the order in which tasks first come, and datasets that are no results beside those whose
     task can use them. Raises `TacpipeError` where none can, and without any result.
     """
@@ -42,6 +43,7 @@ def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
     packages: dict[str, Any] = {name: importlib.import_module(TASKS[name]) for name in results if name in TASKS}
     if not results or not all(_users(one, packages) for one in others):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
+    title = title or _title(results, packages)
     parts = []
     for name, found in results.items():
         if name in packages:
@@ -54,6 +56,13 @@ def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
         f'<meta name="viewport" content="width=device-width"><style>{markup.STYLE}</style></head>\n'
         f"<body><h1>{escape(title)}</h1>\n{''.join(parts)}</body></html>\n"
     ).encode()
+
+
+def _title(tasks: Iterable[str], packages: dict[str, Any]) -> str:
+    """Return what the tasks on a page are about."""
+    told = [str(packages[name].TITLE) if name in packages else name.replace("_", " ") for name in tasks]
+    title = markup.listed([one for one in told if one]) or "results"
+    return f"{title[0].upper()}{title[1:]}"
 
 
 def _task(result: Dataset) -> str:

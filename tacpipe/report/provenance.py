@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from tacpipe.origin import PUBLISHED
 from tacpipe.report import markup
 
 if TYPE_CHECKING:
@@ -18,6 +19,15 @@ Tree = Mapping[str, Any]
 def simulated(result: Dataset) -> bool:
     """Say whether any recording of a result was simulated."""
     return any(bool(shard.attributes.get("simulated")) for shard in result.shards.values())
+
+
+def published(result: Dataset, sets: Collection[str]) -> bool:
+    """Say whether all recordings of a result are of published ``sets``: what their papers say is about these data alone.
+
+    The attribute ``published``, which `tacpipe ingest` sets, names the set of a recording.
+    """
+    named = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.shards.values()]
+    return bool(named) and all(one and set(one.split(",")) <= set(sets) for one in named)
 
 
 def section(manifest: Tree) -> str:

@@ -100,9 +100,19 @@ def test_material_trial_and_session_follow_from_the_names_of_the_files(tmp_path:
         "material": 12,
         "trial": 5,
         "session": "biotac-m12",
+        "published": "biotac-slide",
         "rate_hz": 100.0,
         "authors_role": "test",
     }
+
+
+def test_slides_of_another_time_are_a_labs_own_and_of_no_known_session(tmp_path: Path) -> None:
+    write_biotac(tmp_path / "mat12", 12, 5, arm=False)
+    (file,) = (tmp_path / "mat12").glob("*_bio.csv")
+    head, *rows = file.read_text().splitlines()
+    later = [f"{float(row.split(',')[0]) + 1e8:.6f},{row.partition(',')[2]}" for row in rows]
+    file.write_text("\n".join([head, *later, ""]))
+    assert {"session", "published"} & set(read(tmp_path, Params()).attributes) == set()
 
 
 def test_slides_are_found_at_any_depth_with_the_streams_of_the_arm_that_are_there(tmp_path: Path) -> None:

@@ -97,6 +97,7 @@ def test_the_block_tells_the_authors_part(tmp_path: Path, name: str, recording: 
         "material": 7,
         "trial": 0,
         "session": "roboskin-m07",
+        "published": "roboskin",
         "rate_hz": 50.0,
         "layout": "time",
         **part,

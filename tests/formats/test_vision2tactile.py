@@ -37,7 +37,8 @@ def test_a_grasp_has_its_cloud_its_points_and_one_reading_at_its_folders_time(tm
     write_grasp(tmp_path)
     ((name, found),) = read(tmp_path).items()
     assert name == "bleach-1561629162"
-    assert found.attributes == {"sensor": "biotac-sp", "object": "bleach", "session": "bleach-2019-06-27"}
+    marked = {"session": "bleach-2019-06-27", "published": "vision2tactile"}
+    assert found.attributes == {"sensor": "biotac-sp", "object": "bleach", **marked}
     assert set(found.streams) == {"cloud", "grasp", "reading"}
     cloud = Cloud.of(found.streams["cloud"])
     np.testing.assert_array_equal(cloud.points_m, points_m())

@@ -77,6 +77,7 @@ def test_what_is_known_of_a_trial_becomes_attributes(flat_trial: Trial) -> None:
         "trial": "data_sample_2021-11-24-15-19-34",
         "marker1_unseen_ratio": 0.0,
         "marker2_unseen_ratio": round(1 / 6, 4),
+        "published": "xela-flat",
         "authors_role": "test",
     }
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 IN_FULL = 2  # results that are told in full where there are no more
 
+TITLE = "forecasts of tactile signals"
+
 
 def reads(dataset: Dataset) -> bool:
     """Say whether a dataset that is no result helps to tell of forecasts: those of ``tacpipe compress`` do."""
@@ -39,6 +41,7 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
             told = [*chosen, *(one for one in results if id(one) not in compared)]
             parts.append(markup.note(f"Below, {len(told)} of the {len(results)} results in full."))
     elif others:
-        parts.append(representations.section(sweep.read([*results, *others])))
+        published = all(provenance.published(one, overview.PAPERS_SETS) for one in results)
+        parts.append(representations.section(sweep.read([*results, *others]), published))
     parts += [section.render(one, number, len(told), traces) for number, one in enumerate(told, 1)]
     return "".join(parts)

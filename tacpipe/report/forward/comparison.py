@@ -7,7 +7,7 @@ intervals come from drawing whole recordings anew (`tacpipe.metrics`).
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe import metrics
+from tacpipe.headline import Headline
+from tacpipe.headlines import forward as headlines
+from tacpipe.headlines.pairing import Sums
 from tacpipe.metrics import Interval
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.error_sums import BASELINE, MODEL
@@ -23,7 +26,6 @@ from tacpipe.report.spread import Spread, spread
 
 Floats = NDArray[np.floating[Any]]
 
-SHOWN_STEPS = (1, 3, 5, 10)
 _draws = functools.lru_cache(maxsize=8)(metrics.draws)
 
 
@@ -104,7 +106,7 @@ class Represented:
 
 def shown_steps(runs: Sequence[Run]) -> tuple[int, ...]:
     """Return the steps to tell of, those that all runs predict."""
-    return tuple(step for step in SHOWN_STEPS if all(step in run.errors.steps for run in runs))
+    return headlines.shown(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
 
 
 def pool(runs: Sequence[Run], predictor: str, group: str = "both", known: bool | None = None) -> Pool | None:
@@ -153,6 +155,38 @@ def difference(one: Pool, other: Pool, steps: Sequence[int]) -> Interval | None:
         return Interval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
     drawn = _draws(len(common))
     return Interval(mean, *metrics.bounds(_skills(drawn, pair[0], steps) - _skills(drawn, pair[1], steps)))
+
+
+def headline(method: Method, others: Sequence[Method], steps: Sequence[int], known: bool | None) -> Headline | None:
+    """Return how a method compares with its baselines on known objects, unseen ones or all; None where it has no errors.
+
+    Baselines that its own runs do not hold are those of ``others``, as in `rows`.
+    """
+    source = by_method.reference([method, *others])
+    names = dict.fromkeys([*_predictors(method), *_predictors(source)])
+    baselines = {}
+    for name in filter(headlines.legitimate, names):
+        held = method if name in _predictors(method) else source
+        baselines[name] = _sums(held.runs, name, steps, known)
+    return headlines.headline(
+        method.name, steps, _sums(method.runs, MODEL, steps, known), baselines, known, len(method.runs)
+    )
+
+
+def _sums(runs: Sequence[Run], predictor: str, steps: Sequence[int], known: bool | None) -> Sums:
+    """Return what a headline is computed from, by seed and recording."""
+    found: dict[tuple[Hashable, str], Floats] = {}
+    for run in runs:
+        one = _part(run, predictor, "both", known)
+        if one is None:
+            continue
+        squared, absolute, still = (one.at(values, steps) for values in (one.squared, one.absolute, one.baseline))
+        for at, name in enumerate(one.recordings):
+            values = float(one.windows[at]) * one.channels
+            told = headlines.sums(squared[at], absolute[at], still[at], values)
+            key = run.config["params"].get("seed"), name
+            found[key] = found[key] + told if key in found else told
+    return found
 
 
 def rows(methods: Sequence[Method], steps: Sequence[int], known: bool | None) -> list[Row]:
@@ -247,15 +281,9 @@ def _row(name: str, predictor: str, method: Method, steps: Sequence[int], known:
 
 def own(predictor: str) -> bool:
     """Say whether a predictor is a model's or a codec's own, and not a baseline that is the same for all of a split."""
-    return predictor.startswith((MODEL, "codec"))
+    return not headlines.legitimate(predictor)
 
 
 def best(found: Sequence[Row]) -> Row | None:
     """Return the best method among rows, those that were shown a wrong plan left out."""
     return next((row for row in found if row.predictor == MODEL and row.method.actions != "shuffled"), None)
-
-
-def baseline_above(found: Sequence[Row], row: Row) -> Row | None:
-    """Return the best baseline that does better than ``row``; the codec's own, which know the future, do not count."""
-    others = (one for one in found if not own(one.predictor))
-    return next((one for one in others if one.score > row.score), None)

@@ -45,6 +45,7 @@ class ErrorSums:
     channels: Mapping[str, int]  # by group
     squared: Floats  # (predictor, group, recording, step)
     absolute: Floats  # (predictor, group, recording, step)
+    named: bool = True  # whether any recording names its object: else none is known or unseen
 
     def of(self, predictor: str, group: str) -> tuple[Floats, Floats] | None:
         """Return squared and absolute sums, both (recording, step); None where there are none."""
@@ -69,8 +70,10 @@ def read(content: bytes) -> ErrorSums:
     missing = [name for name in COLUMNS if name not in schema.names]
     if missing:
         raise TacpipeError(f"{FILE} has no column {' and no '.join(missing)}. Evaluate the model again.")
-    table = pq.read_table(pa.BufferReader(owned(content)), columns=list(COLUMNS))
+    objects = ["object"] if "object" in schema.names else []
+    table = pq.read_table(pa.BufferReader(owned(content)), columns=[*COLUMNS, *objects])
     table = table.filter(np.logical_not(table["seen"].to_numpy()))
+    named = not objects or table["object"].null_count < table.num_rows or not table.num_rows
     (predictors, predictor), (groups, group), (recordings, recording) = (
         _coded(table[name]) for name in ("predictor", "group", "recording")
     )
@@ -98,6 +101,7 @@ def read(content: bytes) -> ErrorSums:
         {groups[code]: int(width) for code, width in zip(group, table["channels"].to_numpy(), strict=True)},
         sums[0],
         sums[1],
+        named,
     )
 
 

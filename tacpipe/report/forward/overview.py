@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe import headline as headline_of
+from tacpipe.headline import Headline, counted
 from tacpipe.metrics import Interval
-from tacpipe.report import markup
+from tacpipe.report import headline_box, markup, provenance
 from tacpipe.report.forward import comparison, figures, representations, sweep, tables, traces
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.comparison import Row
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FIGURE_STEPS = (3, 5, 10)  # those of the paper's figures 5 and 6
 FLOOR = -1.0  # skill at which figures end
+PAPERS_SETS = ("xela-flat",)  # whose paper's tables and figures stand next to ours
 
 
 class Overview:
@@ -35,14 +38,26 @@ class Overview:
         self.main = [one for one in self.methods if one.timeline == self.timeline]
         self.steps = comparison.shown_steps(runs)
         known = np.concatenate([run.errors.known for method in self.main for run in method.runs])
-        self.parts: list[bool | None] = [part for part in (True, False) if (known == part).any()]
+        named = any(run.errors.named for method in self.main for run in method.runs)
+        self.parts: list[bool | None] = [part for part in (True, False) if (known == part).any()] if named else [None]
         self.rows = {part: comparison.rows(self.main, self.steps, part) for part in self.parts}
-        self.paper = by_method.papers(self.main)
+        self.published = all(provenance.published(run.dataset, PAPERS_SETS) for run in runs)
+        self.paper = by_method.papers(self.main) if self.published else None
 
     def best(self) -> Method | None:
         """Return the method that does best on unseen objects, or on known ones where there are no others."""
         row = comparison.best(self.rows[self.parts[-1]])
         return row.method if row else None
+
+    def headlines(self) -> dict[bool | None, Headline]:
+        """Return how the best method compares with its baselines, on known objects, unseen ones or all."""
+        found = {}
+        for part in self.parts:
+            row = comparison.best(self.rows[part])
+            told = comparison.headline(row.method, self.main, self.steps, part) if row else None
+            if told:
+                found[part] = told
+        return found
 
     def told_apart(self) -> list[Run]:
         """Return the runs that are worth a section of their own: of the best method and the paper's, a median one."""
@@ -65,53 +80,42 @@ class Overview:
 
 def render(overview: Overview, codecs: Sequence[sweep.Tree], simulated: bool) -> str:
     """Return the comparison of all results."""
-    sentences, word = headline(overview)
+    found = overview.headlines()
     badge = ' <span class="badge">simulated</span>' if simulated else ""
     runs = sum(len(one.runs) for one in overview.methods)
     parts = [
         f"<h2>{len(overview.methods)} methods in {runs} results{badge}</h2>",
-        f'<p class="headline {word}">{"<br>".join(map(escape, sentences))}</p>',
+        headline_box.box(headline(overview)),
+        headline_box.table(list(found.values())),
         markup.note(_basis(overview, simulated)),
         _skill_figures(overview),
-        "<h3>The paper's table</h3>",
-        tables.representations(overview.main),
-        markup.note(
-            "Each row is in its own representation's space, scaled to ±1 on the training recordings, as in the paper. Rows "
-            "of different spaces cannot be compared: a space that leaves out what is hard to foresee has the lower "
-            "error. Persistence in the same space says what a row is worth: below 1 in the column beside it, the model "
-            "is better. The paper's own recordings are not public; its numbers stand here as printed."
-        ),
+        _representations(overview),
         _comparable(overview),
         _ablations(overview),
         tables.anticipation(overview.main),
-        _paper_traces(overview),
-        representations.section(codecs),
+        _paper_traces(overview) if overview.published else "",
+        representations.section(codecs, overview.published),
     ]
     return "\n".join(part for part in parts if part) + "\n"
 
 
-def headline(overview: Overview) -> tuple[list[str], str]:
-    """Return what came out, a sentence or two for known objects and for unseen ones, and a word for the latter."""
-    sentences, word = [], ""
+def headline(overview: Overview) -> list[tuple[str, str]]:
+    """Return how the best method compares with the best baseline and persistence, a sentence a part, and its verdict."""
+    said = []
     averaged = _steps(overview.steps)
-    for part in overview.parts:
+    for part, found in overview.headlines().items():
         row = comparison.best(overview.rows[part])
-        if row is None:
-            continue
-        told = f"On {tables.OBJECTS[part]}, {row.name} {_against(row)}, averaged over {averaged}"
+        assert row is not None  # it is what the headline is of
+        told = f"{headline_of.sentence(found)} Over persistence it has {_told(row)}, averaged over {averaged}"
         paper = overview.row_of(overview.paper, part) if overview.paper else None
         if paper is row:
             told += "; it is the paper's method"
         elif paper:
             told += f"; the paper's method, {paper.name}, has {_told(paper)}"
-        above = comparison.baseline_above(overview.rows[part], row)
-        if above:
-            told += f". No method is as good as the baseline {above.name}, which has {_told(above)}"
         if row.standard_skill is not None:
-            told += f". In standardised channels, where shear counts as pressure does, {_skill(row.standard_skill)}"
-        sentences.append(told + ".")
-        word = _word(row)
-    return sentences, word
+            told += f". With every channel in units of its standard deviation in training, {_skill(row.standard_skill)}"
+        said.append((f"{told}.", found.verdict))
+    return said
 
 
 def _basis(overview: Overview, simulated: bool) -> str:
@@ -122,37 +126,49 @@ def _basis(overview: Overview, simulated: bool) -> str:
         pools = [row.pool for row in overview.rows[part] if row.predictor == MODEL]
         recordings = len({name for pool in pools for name in pool.recordings})
         most = max((pool.distinct_windows for pool in pools), default=0)
-        windows.append(
-            f"{recordings:,} recording{'s' if recordings != 1 else ''} of {tables.OBJECTS[part]} ({most:,} windows)"
-        )
-    text = (
-        f"Judged on {' and '.join(windows)}, none of which its model was trained on; a recording may be known to one "
-        f"run and unseen to another. Settings: {settings}. Skill is 1 − squared error / squared error of persistence, "
-        f"both in counts over all channels. Intervals are 95 %, from drawing whole recordings anew, with the errors of a "
-        f"recording in several runs kept together; they do not tell of other seeds, the sd over runs does. The best of "
-        f"many methods was picked on these very recordings, which flatters it a little. The recorded motion stands for "
-        f"the plan: all this holds for an arm that follows its plan perfectly."
-    )
-    if simulated:
-        text += " These recordings were simulated: nothing here is evidence about a real sensor."
-    return text
+        of = f" of {tables.OBJECTS[part]}" if part is not None else ""
+        windows.append(f"{headline_of.counted(recordings, 'recordings')}{of} ({most:,} windows)")
+    runs = [run for method in overview.methods for run in method.runs]
+    known: dict[str, set[bool]] = {}
+    for run in runs:
+        for name, one in zip(run.errors.recordings, run.errors.known, strict=True):
+            known.setdefault(name, set()).add(bool(one))
+    both = any(len(one) > 1 for one in known.values())
+    text = [
+        f"Evaluated on {' and '.join(windows)}, none of which its model was trained on"
+        f"{'; objects of some recordings are known to one run and unseen to another' if both else ''}.",
+        f"Settings: {settings}." if settings else "",
+        "Skill over persistence is 1 − squared error / squared error of persistence, both in counts over all channels.",
+        "Intervals are 95 %, from drawing whole recordings anew.",
+        "In tables, the errors of a recording in several runs are kept together; the sd over runs is about other seeds."
+        if any(len(method.runs) > 1 for method in overview.methods)
+        else "",
+        "The best of several methods was picked on these very recordings, which flatters it a little."
+        if len(overview.methods) > 1
+        else "",
+        "The recorded motion stands for the plan: errors of methods that read it hold for an arm that follows its plan "
+        "perfectly."
+        if any(method.actions == "planned" for method in overview.methods)
+        else "",
+        "These recordings were simulated: nothing here is evidence about a real sensor." if simulated else "",
+    ]
+    return " ".join(filter(None, text))
 
 
-def _against(row: Row) -> str:
-    """Return how a method does against persistence, no more surely than its interval."""
-    return {
-        "unclear": f"cannot be told from persistence: {_told(row)}",
-        "better": f"is {markup.gain(row.score)} than persistence: {_told(row)}",
-        "worse": f"is {markup.gain(row.score)} than persistence: {_told(row)}",
-    }.get(_word(row), f"has {_told(row)}, on a single recording")
-
-
-def _word(row: Row) -> str:
-    """Return ``better``, ``worse`` or ``unclear``; empty without an interval."""
-    low, high = float(row.skill.low[-1]), float(row.skill.high[-1])
-    if np.isnan([low, high]).any():
+def _representations(overview: Overview) -> str:
+    """Return the recurrent models' errors in their own spaces, next to what the paper printed where these are its data."""
+    found = tables.representations(overview.main, overview.published)
+    if not found:
         return ""
-    return "better" if low > 0 else "worse" if high < 0 else "unclear"
+    text = (
+        "Each row is in its own representation's space, scaled to ±1 on the training recordings. Rows of different spaces "
+        "cannot be compared: a space that leaves out what is hard to predict has the lower error. Persistence in the same "
+        "space says what a row is worth: below 1 in the column beside it, the model is better."
+    )
+    if overview.published:
+        text += " The paper's own recordings are not public; its numbers are given as printed."
+    title = "The paper's table" if overview.published else "Representations in their own spaces"
+    return f"<h3>{title}</h3>{found}{markup.note(text)}"
 
 
 def _told(row: Row) -> str:
@@ -221,10 +237,10 @@ def _comparable(overview: Overview) -> str:
     parts = [
         "<h3>All in counts</h3>",
         markup.note(
-            f"Every representation is taken back to counts of all channels before it is judged, so all rows can be "
-            f"compared. Baselines, in grey, are those of the {len(source.runs)} runs of {source.name}; those of a codec "
-            f"are told for each, and codec and codec_anchored know the true future. Errors without a step are means "
-            f"over all steps."
+            f"Every representation is decoded to counts of all channels before it is evaluated, so all rows can be "
+            f"compared. Baselines, in grey, are those of {counted(len(source.runs), 'runs')} of {source.name}; those of a "
+            f"codec are given for each, and codec and codec_anchored know the true future. Errors without a step are "
+            f"means over all steps."
         ),
     ]
     parts += [tables.comparable(overview.rows[part], overview.steps, part) for part in overview.parts]

@@ -12,8 +12,11 @@ from tacpipe.report.forward import figures, sweep, tables
 COMPONENTS = 40  # bars of the explained variance
 
 
-def section(codecs: Sequence[sweep.Tree]) -> str:
-    """Return what codecs hold and lose: Figure 4 of the paper, and loss by number of latents; empty without codecs."""
+def section(codecs: Sequence[sweep.Tree], published: bool) -> str:
+    """Return what codecs hold and lose: variance, covariance, and loss by number of latents; empty without codecs.
+
+    Where the data are ``published``, next to what the paper says of them.
+    """
     found = sweep.losses(codecs)
     if not codecs:
         return ""
@@ -22,8 +25,8 @@ def section(codecs: Sequence[sweep.Tree]) -> str:
     if pca and pca.get("explained_ratio"):
         kept, ratio = int(pca["latents"]), pca["explained_ratio"]
         caption = (
-            f"Variance by principal component, as in Figure 4 of the paper. The {kept} that are kept hold "
-            f"{100 * sum(ratio[:kept]):.1f} %; in the paper 20 hold 82 %."
+            f"Variance by principal component{', as in Figure 4 of the paper' if published else ''}. The {kept} that are "
+            f"kept hold {100 * sum(ratio[:kept]):.1f} %{'; in the paper 20 hold 82 %' if published else ''}."
         )
         drawn.append(markup.figure(figures.explained_variance(ratio[:COMPONENTS], kept), caption))
     for name, codec in (("PCA", pca), ("AE-C1", autoencoder)):

@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.report import contents, markup, provenance
-from tacpipe.report.forward import figures, traces
+from tacpipe import headline as headline_of
+from tacpipe.headline import Headline
+from tacpipe.headlines.forward import legitimate
+from tacpipe.report import contents, headline_box, markup, provenance
+from tacpipe.report.forward import comparison, figures, methods, traces
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
@@ -37,43 +40,50 @@ EXPLAINED = {
 OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
 
 
-def headline(metrics: Tree, rate_hz: float = 0.0) -> tuple[str, str]:
-    """Return the result in a sentence or two, and a word for it: ``better``, ``worse`` or ``unclear``.
+def headlines(result: Dataset) -> list[Headline]:
+    """Return how the model of one result compares with its baselines, on known objects and unseen ones, or on all.
 
-    It speaks of the last step's squared error in counts; the 95 % interval is over recordings.
+    Empty without the error sums of recordings that the model has not seen.
     """
-    told = metrics.get("skill", {}).get("mse_counts", {})
-    steps = [int(name[1:]) for name in told if name != "mean"]
-    if not steps:
-        return (
-            "No recording was left to judge the model on: it has seen all that were given, or none holds a window.",
-            "",
+    if not methods.comparable(result):
+        return []
+    run = methods.Run.read(result)
+    if not run.errors.recordings:
+        return []
+    (method,) = methods.grouped([run])
+    steps = comparison.shown_steps([run])
+    parts = (True, False) if run.errors.named else (None,)
+    found = (comparison.headline(method, [], steps, part) for part in parts)
+    return [one for one in found if one is not None]
+
+
+def sentences(found: Sequence[Headline], metrics: Tree) -> list[tuple[str, str]]:
+    """Return the result in a sentence or two, each with its verdict (`tacpipe.headline.verdict`)."""
+    if found:
+        return [(headline_of.sentence(one), one.verdict) for one in found]
+    if "skill" not in metrics:
+        told = (
+            "No recording was left to evaluate the model on: it has seen all that were given, or none holds a window."
         )
-    step = max(steps)
-    one = told[f"t{step}"]
-    when = f"t+{step}" + (f" ({1000 * step / rate_hz:.0f} ms ahead)" if rate_hz else "")
-    recordings = metrics["counts"]["recordings"]
-    if "low" not in one:
-        return (
-            f"The model is {markup.gain(one['mean'])} than persistence at {when}, on a single recording: no interval.",
-            "",
-        )
-    interval = f"95 % interval {markup.skill(one['low'])} to {markup.skill(one['high'])} over {recordings} recordings"
-    if one["low"] <= 0 <= one["high"]:
-        sentence = (
-            f"The model cannot be told from persistence at {when}: skill {markup.skill(one['mean'])}, {interval}."
-        )
-        return sentence, "unclear"
-    word = "better" if one["low"] > 0 else "worse"
-    told = f"skill {markup.skill(one['mean'])}, {interval}"
-    return f"The model is {markup.gain(one['mean'])} than persistence at {when}: {told}.", word
+        return [(told, "")]
+    errors = {name: float(_both(metrics[name]["mse_counts"])["mean"]) for name in _predictors(metrics)}
+    others = {name: error for name, error in errors.items() if name in EXPLAINED and legitimate(name)}
+    if not others or "model" not in errors:
+        return [("The model was evaluated without a baseline.", "")]
+    best = min(others, key=lambda name: others[name])
+    told = (
+        f"Mean squared error over all steps: {markup.number(errors['model'])} counts² for the model, "
+        f"{markup.number(others[best])} for {best}, the best of {len(others)} baselines. This result holds no sums by "
+        f"recording, so there is no interval: evaluate the model again."
+    )
+    return [(told, "")]
 
 
 def render(result: Dataset, number: int, of: int, drawn: int) -> str:
     """Return the part of the page that one result has: the ``number``-th ``of`` so many, with ``drawn`` traces."""
     metrics, config = (contents.tree(result, name) for name in ("metrics.json", "config.json"))
     rate_hz = float(config.get("rate_hz", 0.0))
-    sentence, word = headline(metrics, rate_hz)
+    found = headlines(result)
     badge = ' <span class="badge">simulated</span>' if provenance.simulated(result) else ""
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     if isinstance(config.get("codec"), Mapping):
@@ -81,7 +91,8 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
     trials = list(csv.DictReader(io.StringIO(result.files.get("trials.csv", b"").decode())))
     parts = [
         f"<h2>{f'{number}. ' if of > 1 else ''}{escape(name.replace('_', ' '))}{badge}</h2>",
-        f'<p class="headline {word}">{escape(sentence)}</p>',
+        headline_box.box(sentences(found, metrics)),
+        headline_box.table(found),
         _floor(metrics),
         _counts(metrics, provenance.simulated(result)),
         _horizon_figures(metrics, rate_hz),
@@ -100,10 +111,11 @@ def _counts(metrics: Tree, badge: bool) -> str:
     """Return how much the result rests on."""
     counts = metrics.get("counts", {})
     text = (
-        f"{counts.get('recordings', 0)} recordings that the model has not seen, {counts.get('windows', 0)} windows; "
-        f"because windows overlap, they are worth about {counts.get('effective_windows', 0)}. "
+        f"{headline_of.counted(counts.get('recordings', 0), 'recordings')} that the model has not seen, "
+        f"{counts.get('windows', 0)} windows; because windows overlap, they are worth about "
+        f"{counts.get('effective_windows', 0)}. "
         "Intervals come from drawing whole recordings anew. "
-        "Skill is 1 − squared error of the model / squared error of persistence."
+        "Below, skill is 1 − squared error of the model / squared error of persistence."
     )
     if badge:
         text += " These recordings were simulated: nothing here is evidence about a real sensor."
@@ -191,7 +203,7 @@ def _error_tables(metrics: Tree) -> str:
         parts.append(markup.table(title, ["", *heads], rows))
     told = [name for name in names if "mse_feature" in metrics[name]]
     rows = [[name, *(markup.number(metrics[name]["mse_feature"][step]) for step in shown)] for name in told]
-    parts.append(markup.table("Mean squared error (latents scaled to ±1, as in the paper)", ["", *heads], rows))
+    parts.append(markup.table("Mean squared error (latents scaled to ±1)", ["", *heads], rows))
     rows = []
     for measure, skill in metrics["skill"].items():
         rows.append([measure, *(markup.interval(skill.get(step, {})) for step in shown)])
@@ -277,8 +289,9 @@ def _seen(metrics: Tree) -> str:
     told = seen.get("skill", {}).get("mse_counts", {}).get("mean", {})
     if "mean" not in told:
         return ""
+    count = headline_of.counted(seen["counts"]["recordings"], "recordings")
     text = (
-        f"Left out of all above: {seen['counts']['recordings']} recordings that the model was trained or stopped on. "
+        f"Left out of all above: {count} that the model was trained or stopped on. "
         f"Its skill on these is {markup.skill(told['mean'])}, averaged over all steps."
     )
     return f'<h3>Recordings the model has seen</h3><p class="note">{escape(text)}</p>'

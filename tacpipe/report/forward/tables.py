@@ -22,11 +22,16 @@ PRINTED = {  # validation and test error in Table 1 of the paper
     "AE-C3": (0.0405, 0.0510),
     "PCA": (0.0298, 0.0363),
 }
-OBJECTS = {None: "all objects", True: "known objects", False: "unseen objects"}
+KNOWN = "test, known objects"
+HEADS = ("representation", "validation", "test", KNOWN, "persistence, test", "test ÷ persistence")
+OBJECTS = {None: "all recordings", True: "known objects", False: "unseen objects"}
 
 
-def representations(methods: Sequence[Method]) -> str:
-    """Return Table 1 in the paper's form: the recurrent model on each representation, beside what the paper printed."""
+def representations(methods: Sequence[Method], published: bool) -> str:
+    """Return the recurrent model on each representation: Table 1 in the paper's form where the data are ``published``.
+
+    Empty where no recurrent model was run and there is nothing printed to hold against.
+    """
     found = [one for one in methods if one.recurrent and one.actions == "planned"]
     order = list(PRINTED)
 
@@ -35,40 +40,36 @@ def representations(methods: Sequence[Method]) -> str:
         rank = order.index(row) if row else len(order)
         return rank, str(method.codec["kind"]), int(method.codec["latents"]), method.name
 
+    named = any(run.errors.named for method in found for run in method.runs)
+    heads = [head for head in HEADS if named or head != KNOWN]
     rows = []
     for method in sorted(found, key=place):
         told = comparison.represented(method)
         if told is None:
             continue
-        printed = PRINTED.get(by_method.paper_row(method.codec) or "")
+        printed = PRINTED.get(by_method.paper_row(method.codec) or "") if published else None
         rows.append(
             [
                 method.name.split(" · ", 1)[1],
                 markup.with_sd(told.validation.mean, told.validation.sd),
                 markup.with_sd(told.test.mean, told.test.sd),
-                markup.with_sd(told.known.mean, told.known.sd) if told.known else NONE,
+                *([markup.with_sd(told.known.mean, told.known.sd) if told.known else NONE] if named else []),
                 markup.with_sd(told.persistence.mean, told.persistence.sd),
                 f"{told.test.mean / told.persistence.mean:.3g}" if told.persistence.mean else NONE,
-                *(f"{value:.4f}" for value in printed or ()),
-                *([NONE, NONE] if printed is None else ()),
+                *([f"{value:.4f}" for value in printed] if printed else [NONE, NONE] if published else []),
                 str(len(method.runs)),
             ]
         )
+    if not published:
+        title = "Mean squared error in each representation's own space, mean ± sd over runs"
+        return markup.table(title, [*heads, "runs"], rows) if rows else ""
     present = {by_method.paper_row(one.codec) for one in found}
     rows += [
-        [name, *[NONE] * 5, *(f"{value:.4f}" for value in PRINTED[name]), "0"] for name in order if name not in present
+        [name, *[NONE] * (len(heads) - 1), *(f"{value:.4f}" for value in PRINTED[name]), "0"]
+        for name in order
+        if name not in present
     ]
-    heads = [
-        "representation",
-        "validation",
-        "test",
-        "test, known objects",
-        "persistence, test",
-        "test ÷ persistence",
-        "paper: validation",
-        "paper: test",
-        "runs",
-    ]
+    heads += ["paper: validation", "paper: test", "runs"]
     return markup.table("Table 1 in the paper's form: mean squared error, mean ± sd over runs", heads, rows)
 
 

@@ -12,6 +12,8 @@ from tacpipe.report.material.methods import Run
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
+TITLE = "recognition of materials by touch"
+
 
 def reads(dataset: Dataset) -> bool:
     """Say whether a dataset that is no result helps to tell of materials: one of slides does."""

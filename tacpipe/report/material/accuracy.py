@@ -45,7 +45,7 @@ class Verdicts:
 
 def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accuracy | None:
     """Return how many slides of a sensor a predictor of these runs names right; None where none says anything."""
-    each = [right for run in runs if (right := _right(run, sensor, predictor))]
+    each = [right for run in runs if (right := named_right(run, sensor, predictor))]
     if not each:
         return None
     found = _pooled(each)
@@ -60,7 +60,7 @@ def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accura
 
 def verdicts(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Verdicts:
     """Return the share of runs that named each slide of a sensor right, in the order of names."""
-    return _pooled([right for run in runs if (right := _right(run, sensor, predictor))])
+    return _pooled([right for run in runs if (right := named_right(run, sensor, predictor))])
 
 
 def skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> float:
@@ -75,7 +75,7 @@ def skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> float:
     return 1 - (1 - found.share) / (1 - level.share)
 
 
-def _right(run: Run, sensor: str, predictor: str) -> dict[str, bool]:
+def named_right(run: Run, sensor: str, predictor: str) -> dict[str, bool]:
     """Return whether each slide was named right, by recording."""
     rows = run.predictions.of(sensor)
     if predictor not in rows.said:

@@ -25,7 +25,7 @@ class _Points:
 
 
 def convergence(methods: Sequence[Method]) -> str:
-    """Return Figure 9 in the paper's form, one figure a sensor: validation accuracy by epoch; empty without epochs."""
+    """Return validation accuracy by epoch, Figure 9 of the paper, one figure a sensor; empty without epochs."""
     chosen = [one for kind in ("RAEC joint", "RAEC independent") for one in methods if one.plain and one.kind == kind]
     order = [one.name for one in chosen]
     drawn = []
@@ -35,10 +35,8 @@ def convergence(methods: Sequence[Method]) -> str:
         if held:
             title = f"Validation accuracy by epoch, {shown(sensor)}"
             svg = epochs.by_epoch(held, "validation accuracy (%)", title, order)
-            caption = (
-                f"Figure 9 in the paper's form: validation accuracy on {shown(sensor)} by epoch. Thick: mean over runs; "
-                f"thin: single runs."
-            )
+            text = f"validation accuracy on {shown(sensor)} by epoch. Thick: mean over runs; thin: single runs."
+            caption = wording.form("Figure 9", text, all(one.published for one in chosen))
             drawn.append(markup.figure(svg, caption))
     return _pair(drawn)
 
@@ -51,10 +49,10 @@ def alignment(methods: Sequence[Method]) -> str:
     if not held:
         return ""
     svg = epochs.by_epoch(held, "mean squared latent difference", "Latent difference of pairs by epoch", log=True)
-    caption = (
-        "Figure 10 in the paper's form: mean squared difference between the two latents of a training pair, by epoch. "
-        "Pairs of permuted materials fall as real ones do where labels alone drive the alignment."
-    )
+    text = "mean squared difference between the two latents of a training pair, by epoch."
+    caption = wording.form("Figure 10", text, all(one.published for one in chosen))
+    if any(comparison.control(one) for one in chosen):
+        caption += " Pairs of permuted materials fall as real ones do where labels alone drive the alignment."
     return markup.figure(svg, caption)
 
 
@@ -91,7 +89,7 @@ def few_slides(methods: Sequence[Method]) -> str:
             drawn.append(markup.figure(svg, caption))
     if not drawn:
         return ""
-    note = markup.note(wording.caution(any(one.simulated for one in chosen)))
+    note = markup.note(wording.caution(chosen))
     return f"<h3>Few slides</h3>{_pair(drawn)}{note}"
 
 

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tacpipe.headline import Headline, clause
+from tacpipe.headlines import material as headlines_of
 from tacpipe.report import markup
 from tacpipe.report.material import comparison, curves, tables, wording, zero_shot
-from tacpipe.report.material.accuracy import Accuracy, accuracy, skill
+from tacpipe.report.material.accuracy import Accuracy, accuracy, named_right
 from tacpipe.report.material.comparison import Difference
 from tacpipe.report.material.methods import Method, shown
-from tacpipe.report.material.predictions import LEVEL, SWAPPED
+from tacpipe.report.material.predictions import SWAPPED
 
 ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
 APART = 0.2  # of accuracy: where exchanging classifiers costs more, there is no alignment to explain
@@ -22,16 +24,27 @@ NO_CONTROL = (
 )
 
 
-def sentences(methods: Sequence[Method]) -> list[str]:
-    """Return the best method of each sensor, what joint learning does, and what controls say, a sentence or two each."""
+def headlines(methods: Sequence[Method]) -> list[Headline]:
+    """Return how the best method of each sensor compares with its baselines."""
     plain = [one for one in methods if one.plain]
-    told = [_best(plain, sensor) for sensor in tables.sensors_of(plain)]
+    found = (_headline(plain, sensor) for sensor in tables.sensors_of(plain))
+    return [one for one in found if one is not None]
+
+
+def sentences(methods: Sequence[Method]) -> list[tuple[str, str]]:
+    """Return the best method of each sensor with its verdict, what joint learning does, and what controls say.
+
+    Only the first are about baselines, so the others have no verdict.
+    """
+    plain = [one for one in methods if one.plain]
+    found = [_best(plain, sensor) for sensor in tables.sensors_of(plain)]
+    told = []
     main = comparison.main(plain)
     if main:
         told += _joint(main, [one for one in plain if one.kind == "RAEC independent"])
         told.append(control(main, [one for one in methods if comparison.control(one)]))
     told += zero_shot.sentences(methods)
-    return [one.replace(" %", "\N{NO-BREAK SPACE}%") for one in told if one]
+    return [*(one for one in found if one[0]), *((" ".join(told), "") for told in [list(filter(None, told))] if told)]
 
 
 def control(joint: Method, controls: Sequence[Method]) -> str:
@@ -73,22 +86,34 @@ def control(joint: Method, controls: Sequence[Method]) -> str:
     return f"Pairs of permuted materials {verdict} as real ones ({numbers})."
 
 
-def _best(methods: Sequence[Method], sensor: str) -> str:
-    """Return which method names most slides of a sensor right."""
+def _best(methods: Sequence[Method], sensor: str) -> tuple[str, str]:
+    """Return which method names most slides of a sensor right, how that compares with the best baseline, and the verdict."""
     method = tables.leader(methods, sensor)
     if method is None:
-        return ""
+        return "", ""
+    found, compared = accuracy(method.of(sensor), sensor), _headline(methods, sensor)
+    assert found is not None and compared is not None  # the leader was evaluated
+    several = len([one for one in methods if one.of(sensor)]) > 1
+    best = "is the best method and " if several else ""
+    told = f"{shown(sensor)}: {method.name} {best}names {_share(found)} of unseen slides right; it {clause(compared)}."
+    return told, compared.verdict
+
+
+def _headline(methods: Sequence[Method], sensor: str) -> Headline | None:
+    """Return how the best method on a sensor compares with its baselines."""
+    method = tables.leader(methods, sensor)
+    if method is None:
+        return None
     runs = method.of(sensor)
-    found = accuracy(runs, sensor)
-    assert found is not None  # the leader was judged
-    told = f"{shown(sensor)}: {method.name} is best and names {_share(found)} of unseen slides right"
-    worth, level = skill(runs, sensor), accuracy(runs, sensor, LEVEL)
-    if level and not np.isnan(worth):
-        told += (
-            f"; the mean level alone names {wording.percent(level.share)} %, which makes its skill over that "
-            f"{markup.decimals(worth)}"
-        )
-    return told + "."
+    right: dict[str, dict[tuple[object, str], tuple[int, int]]] = {}
+    for run in runs:
+        for predictor in run.predictions.said:
+            for name, one in named_right(run, sensor, predictor).items():
+                key = run.params.get("seed"), name
+                times, asked = right.setdefault(predictor, {}).get(key, (0, 0))
+                right[predictor][key] = times + one, asked + 1
+    classes = len(runs[0].config.get("classes", ()))
+    return headlines_of.headline(method.name, shown(sensor), right, classes, runs=len(runs))
 
 
 def _joint(joint: Method, others: Sequence[Method]) -> list[str]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Tree = Mapping[str, Any]
 
+PAPERS_SETS = ("biotac-slide", "roboskin")  # whose paper's tables and figures stand next to ours
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
 _ARCHITECTURES = {"minirocket": "MiniRocket", "x-lstm": "X-LSTM", "raec": "RAEC", "spectra": "spatial spectra"}
 _PLAIN = {
@@ -89,6 +90,11 @@ class Run:
         """Whether its slides were simulated."""
         return provenance.simulated(self.dataset)
 
+    @property
+    def published(self) -> bool:
+        """Whether its slides are those of the paper."""
+        return provenance.published(self.dataset, PAPERS_SETS)
+
 
 @dataclass(frozen=True)
 class Method:
@@ -129,6 +135,11 @@ class Method:
     def simulated(self) -> bool:
         """Whether its slides were simulated."""
         return bool(self.settings["simulated"])
+
+    @property
+    def published(self) -> bool:
+        """Whether all its runs were evaluated on slides of the paper."""
+        return all(run.published for run in self.runs)
 
     def differs_only(self, *names: str) -> bool:
         """Say whether, but for these settings, it is as `plain` asks."""

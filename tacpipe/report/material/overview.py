@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from tacpipe.report import markup, provenance
+from tacpipe.report import headline_box, markup, provenance
 from tacpipe.report.material import (
     confusion,
     curves,
@@ -21,17 +21,11 @@ from tacpipe.report.material import (
     zero_shot,
 )
 from tacpipe.report.material.methods import Method, shown
+from tacpipe.report.material.predictions import LAST, LEVEL
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
-POOLED = (
-    "Accuracy ± standard deviation over runs; in small print, slides named right of all that runs of the method were "
-    "judged on, then the 95 % interval (Wilson) over slides, each counted once however many runs judged it. Networks have "
-    "the weights that did best in validation, unless the name says otherwise; last epoch is what those of the last one "
-    "do, which the paper's code reports. Skill is 1 − errors / errors of the mean level alone, a linear readout of the "
-    "time-averaged channels. Mapping to a known space is told of the sensor that was mapped to the other's. "
-)
 PAIRED = (
     "A slide that several runs judged counts as the share of runs that named it right; the interval is from drawing slides "
     "anew. McNemar's test takes a slide for right where at least half of the runs are; the t test pairs accuracies of the "
@@ -47,15 +41,15 @@ def render(methods: Sequence[Method], slides: Sequence[Dataset]) -> str:
     runs = sum(len(one.runs) for one in methods)
     several = f"{len(methods)} methods in {runs} results" if runs > 1 else methods[0].name
     said = headline.sentences(methods)
-    told = f'<p class="headline">{"<br>".join(map(escape, said))}</p>' if said else ""
-    caution = markup.note(wording.caution(simulated))
+    caution = markup.note(wording.caution(methods))
     others = tables.elsewhere(methods)
     reduced, swaps, paired = reduction.tables(methods), tables.swaps(methods), tables.differences(methods)
     parts = [
         f"<h2>{'Materials by touch: ' if runs > 1 else ''}{escape(several)}{badge}</h2>",
-        told,
-        markup.note(f"{_basis(methods)} {wording.caution(simulated)}"),
-        *(["<h3>Which material it is</h3>", tables.accuracies(methods), markup.note(POOLED + printed.BASIS), caution]
+        headline_box.box(said),
+        headline_box.table(headline.headlines(methods)),
+        markup.note(f"{_basis(methods)} {wording.caution(methods)}"),
+        *(["<h3>Which material it is</h3>", tables.accuracies(methods), markup.note(_pooled(plain)), caution]
           if plain else []),
         *([others, caution] if others else []),
         *([paired, markup.note(PAIRED), caution] if paired else []),
@@ -73,6 +67,31 @@ def render(methods: Sequence[Method], slides: Sequence[Dataset]) -> str:
         _source(methods),
     ]  # fmt: skip
     return "\n".join(part for part in parts if part) + "\n"
+
+
+def _pooled(methods: Sequence[Method]) -> str:
+    """Return what the table of accuracies of these methods holds."""
+    runs = [run for one in methods for run in one.runs]
+    published = all(one.published for one in methods)
+    last = any(LAST in run.predictions.said for run in runs)
+    told = [
+        "Accuracy ± standard deviation over runs; in small print, slides named right of all that runs of the method were "
+        "evaluated on, then the 95 % interval (Wilson) over slides, each counted once however many runs named it.",
+        "Networks have the weights that did best in validation, unless the name says otherwise."
+        if any(run.history for run in runs)
+        else "",
+        f"Last epoch is what the weights of the last one do{', which the paper’s code reports' if published else ''}."
+        if last
+        else "",
+        "Skill is 1 − errors / errors of the mean level alone, a linear readout of the time-averaged channels."
+        if any(LEVEL in run.predictions.said for run in runs)
+        else "",
+        "Mapping to a known space is reported for the sensor that was mapped to the other's."
+        if any(one.settings["known"] for one in methods)
+        else "",
+        printed.BASIS if published else "",
+    ]
+    return " ".join(filter(None, told))
 
 
 def _training(methods: Sequence[Method]) -> str:
@@ -96,7 +115,7 @@ def _basis(methods: Sequence[Method]) -> str:
         if values:
             settings[name] = ", ".join(str(value) for value in sorted(values))
     shown_settings = "; ".join(f"{name} {values}" for name, values in settings.items())
-    text = f"Judged on {markup.listed(told)}, none of which its model was trained on. Materials are numbers, without names."
+    text = f"Evaluated on {markup.listed(told)}, none of which its model was trained on."
     return f"{text} Settings: {shown_settings}." if settings else text
 
 

@@ -29,13 +29,25 @@ class Predictions:
     materials: NDArray[np.int64]  # (slide,), the truth
     said: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
     latents: Floats | None  # (slide, latent); None where the model has none
+    sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that tell of none
 
     def of(self, sensor: str) -> Predictions:
         """Return the rows of one sensor."""
         rows = self.sensors == sensor
         said = {name: values[rows] for name, values in self.said.items()}
         latents = None if self.latents is None else self.latents[rows]
-        return Predictions(self.recordings[rows], self.sensors[rows], self.materials[rows], said, latents)
+        sessions = None if self.sessions is None else self.sessions[rows]
+        return Predictions(self.recordings[rows], self.sensors[rows], self.materials[rows], said, latents, sessions)
+
+    @property
+    def one_session_each(self) -> bool:
+        """Whether all slides of a material that a sensor felt are of one session, so that both cannot be told apart."""
+        if self.sessions is None or not len(self.sessions) or (self.sessions == "").any():
+            return False
+        sessions: dict[tuple[str, int], set[str]] = {}
+        for sensor, material, session in zip(self.sensors, self.materials, self.sessions, strict=True):
+            sessions.setdefault((str(sensor), int(material)), set()).add(str(session))
+        return all(len(one) == 1 for one in sessions.values())
 
 
 def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
@@ -57,6 +69,9 @@ def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
             if name in table.column_names
         },
         latents if latents is not None and np.isfinite(latents).all() else None,
+        np.array([one or "" for one in table["session"].to_pylist()], dtype=np.str_)
+        if "session" in table.column_names
+        else None,
     )
 
 

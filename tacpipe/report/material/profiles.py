@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.report import markup
+from tacpipe.report import markup, provenance
 from tacpipe.report.markup import listed
-from tacpipe.report.material import figures
-from tacpipe.report.material.methods import ordered, shown
+from tacpipe.report.material import figures, wording
+from tacpipe.report.material.methods import PAPERS_SETS, ordered, shown
 
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset, Shard
@@ -29,13 +29,14 @@ def section(datasets: Sequence[Dataset]) -> str:
     shards = [shard for one in datasets for shard in one.shards.values() if reads(one)]
     if not shards:
         return ""
+    published = all(provenance.published(one, PAPERS_SETS) for one in datasets)
     sensors = ordered({str(shard.attributes.get("sensor", "")) for shard in shards})
     parts = [_counts([shard for shard in shards if shard.attributes.get("sensor", "") == one], one) for one in sensors]
     drawn = []
     for sensor in sensors:
         held = [one for one in shards if one.attributes.get("sensor", "") == sensor and PROFILE in one.streams]
         if held:
-            drawn.append(_figures(typical(held), sensor))
+            drawn.append(_figures(typical(held), sensor, published))
     return f"<h3>The slides</h3>{markup.note(' '.join(parts))}{''.join(drawn)}"
 
 
@@ -53,13 +54,15 @@ def _counts(shards: Sequence[Shard], sensor: str) -> str:
     """Return how many slides there are of a sensor, and how many kept to the protocol."""
     outside = [one for one in shards if one.attributes.get("outside_protocol")]
     some = f"{len(shards):,} slide{'s' if len(shards) > 1 else ''}"
+    if not any("outside_protocol" in one.attributes for one in shards):
+        return f"{some} of {shown(sensor)}."
     text = f"{some} of {shown(sensor)}, {len(outside):,} of them outside the protocol"
     reasons = Counter(str(one.attributes.get("outside_protocol_why", "")) for one in outside)
     told = [f"{count} {reason}" for reason, count in reasons.most_common() if reason]
     return text + (f" ({listed(told)})." if told else ".")
 
 
-def _figures(shard: Shard, sensor: str) -> str:
+def _figures(shard: Shard, sensor: str, published: bool) -> str:
     """Return force and speed of one slide."""
     table = shard.table(PROFILE)
     time_ns = table["t_ns"].to_numpy()
@@ -69,14 +72,14 @@ def _figures(shard: Shard, sensor: str) -> str:
     force = {"force": table["force_n"].to_numpy()} if "force_n" in table.column_names else {}
     if force and np.isfinite(force["force"]).any():
         svg = figures.profile(time_s, force, during, "force (N)", f"Force over a slide, {shown(sensor)}")
-        caption = f"Figure 5 in the paper's form: force on {shown(sensor)} in {shard.name}, the slide of median force."
+        text = f"force on {shown(sensor)} in {shard.name}, the slide of median force."
+        caption = wording.form("Figure 5", text, published)
         drawn.append(markup.figure(svg, f"{caption} Shaded: the slide."))
     names = {"speed_raw_m_s": "as measured", "speed_m_s": "median of 3"}
     speed = {label: 1000 * table[name].to_numpy() for name, label in names.items() if name in table.column_names}
     speed = {label: values for label, values in speed.items() if np.isfinite(values).any()}
     if speed:
         svg = figures.profile(time_s, speed, during, "speed (mm/s)", f"Speed over a slide, {shown(sensor)}")
-        drawn.append(
-            markup.figure(svg, f"Figure 6 in the paper's form: speed in the same slide, {listed(list(speed))}.")
-        )
+        text = f"speed in the same slide, {listed(list(speed))}."
+        drawn.append(markup.figure(svg, wording.form("Figure 6", text, published)))
     return f'<div class="pair">{"".join(drawn)}</div>'

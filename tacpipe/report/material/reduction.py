@@ -17,12 +17,14 @@ JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 
 
 def tables(methods: Sequence[Method]) -> str:
-    """Return a table a reduced sensor, in the paper's form; empty where no sensor was reduced.
+    """Return a table a reduced sensor, in the paper's form; empty where no sensor was reduced or other data are shown.
 
     A sensor is reduced where it learns from a share of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
     """
     chosen = [one for one in methods if one.differs_only("reduce", "few")]
+    if not all(one.published for one in chosen):
+        return ""
     told = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("reduce", "few_of")}
     return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in told)
 

@@ -18,8 +18,11 @@ BASELINES = {LEVEL: "mean level alone", SHUFFLED: "trained on shuffled labels"}
 
 
 def accuracies(methods: Sequence[Method]) -> str:
-    """Return Table I in the paper's form, then what is not the paper's, and baselines."""
+    """Return accuracy and skill of each method and baseline; where the slides are the paper's, as its Table I has them."""
     plain = [one for one in methods if one.plain]
+    published = all(one.published for one in plain)
+    last = published or any(LAST in run.predictions.said for one in plain for run in one.runs)
+    parts = ["", *(["last epoch"] if last else []), "skill", *(["paper"] if published else [])]
     sensors = sensors_of(plain)
     rows: list[list[str]] = []
     kinds: dict[int, str] = {}
@@ -29,24 +32,25 @@ def accuracies(methods: Sequence[Method]) -> str:
         for method in same:
             if method in best.values():
                 kinds[len(rows)] = "best"
-            rows.append([method.name, *_row(method, sensors, kind), str(len(method.runs))])
-        if not same:
-            rows.append([kind, *[cell for sensor in sensors for cell in [*[NONE] * 3, _paper(kind, sensor)]], "0"])
+            rows.append([method.name, *_row(method, sensors, kind, parts), str(len(method.runs))])
+        if not same and published:
+            blank = [NONE] * (len(parts) - 1)
+            rows.append([kind, *[cell for sensor in sensors for cell in [*blank, _paper(kind, sensor)]], "0"])
     source = reference(plain)
     for predictor, name in BASELINES.items():
         cells = []
         for sensor in sensors:
             found = accuracy(source.of(sensor), sensor, predictor)
             told = markup.decimals(skill(source.of(sensor), sensor, predictor)) if found else NONE
-            cells += [wording.share(found), NONE, told.replace("+nan", NONE), NONE]
+            values = {"": wording.share(found), "skill": told.replace("+nan", NONE)}
+            cells += [values.get(part, NONE) for part in parts]
         kinds[len(rows)] = "quiet"
         rows.append([name, *cells, str(len(source.runs))])
     kinds[len(rows)] = "quiet"
     chance = wording.percent(1 / max(len(source.runs[0].config.get("classes", ())), 1))
-    rows.append(["chance", *[cell for _ in sensors for cell in (chance, *[NONE] * 3)], NONE])
-    parts = ("", "last epoch", "skill", "paper")
+    rows.append(["chance", *[cell for _ in sensors for cell in (chance, *[NONE] * (len(parts) - 1))], NONE])
     heads = ["", *(f"{shown(sensor)} {part}".strip() for sensor in sensors for part in parts), "runs"]
-    return markup.table("Table I in the paper's form: accuracy (%)", heads, rows, kinds)
+    return markup.table(wording.form("Table I", "accuracy (%)", published), heads, rows, kinds)
 
 
 def elsewhere(methods: Sequence[Method]) -> str:
@@ -89,14 +93,18 @@ def swaps(methods: Sequence[Method]) -> str:
         rows.append([*row, str(len(method.runs))])
     if not rows:
         return ""
+    published = all(one.published for one in held)
+    heads = ["", *(f"{shown(sensor)} {part}" for sensor in sensors for part in ("before", "after", "points")), "runs"]
+    text = "accuracy (%) before and after the sensors' classifiers are exchanged"
+    title = wording.form("Table II", text, published)
+    if not published:
+        return markup.table(title, heads, rows)
     cells = []
     for sensor in sensors:
         before, after = printed.ACCURACIES["RAEC joint"].get(sensor), printed.SWAPPED.get(sensor)
         told = [NONE] * 3 if before is None or after is None else [f"{before:.2f}", f"{after:.2f}"]
         cells += told if len(told) == 3 else [*told, wording.points(((after or 0) - (before or 0)) / 100)]
     rows.append(["paper: RAEC joint", *cells, NONE])
-    heads = ["", *(f"{shown(sensor)} {part}" for sensor in sensors for part in ("before", "after", "points")), "runs"]
-    title = "Table II in the paper's form: accuracy (%) before and after the sensors' classifiers are exchanged"
     return markup.table(title, heads, rows, {len(rows) - 1: "quiet"})
 
 
@@ -173,20 +181,21 @@ def reference(methods: Sequence[Method]) -> Method:
     return max(methods, key=place)
 
 
-def _row(method: Method, sensors: Sequence[str], kind: str) -> list[str]:
-    """Return what Table I says of a method, four cells a sensor."""
+def _row(method: Method, sensors: Sequence[str], kind: str, parts: Sequence[str]) -> list[str]:
+    """Return what the table of accuracies says of a method, a cell a sensor and part."""
     cells = []
     for sensor in sensors:
         runs = method.of(sensor)
         found = accuracy(runs, sensor)
         last = accuracy(runs, sensor, LAST)
         worth = skill(runs, sensor)
-        cells += [
-            wording.share(found),
-            wording.percent(last.share) if last else NONE,
-            NONE if np.isnan(worth) else markup.decimals(worth),
-            _paper(kind, sensor) if found else NONE,
-        ]
+        told = {
+            "": wording.share(found),
+            "last epoch": wording.percent(last.share) if last else NONE,
+            "skill": NONE if np.isnan(worth) else markup.decimals(worth),
+            "paper": _paper(kind, sensor) if found else NONE,
+        }
+        cells += [told[part] for part in parts]
     return cells
 
 

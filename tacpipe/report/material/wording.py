@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from tacpipe.report.markup import NONE, Markup
 from tacpipe.report.material.accuracy import Accuracy
+from tacpipe.report.material.methods import Method
 
 SESSIONS = (
     "Each material was recorded in one session, so texture cannot be told apart from session in these data: a model that "
-    "knows a session by its drift or its mean level is right as well."
+    "recognises a session by its drift or its mean level is right as well."
 )
 SIMULATED = "These slides were simulated: nothing here is evidence about a real sensor."
 
 
-def caution(simulated: bool) -> str:
-    """Return what is said beside every table of accuracies."""
-    return SIMULATED if simulated else SESSIONS
+def caution(methods: Sequence[Method]) -> str:
+    """Return what these slides cannot show, beside every table of accuracies; empty where nothing is known against them."""
+    if any(one.simulated for one in methods):
+        return SIMULATED
+    runs = [run for one in methods for run in one.runs]
+    return SESSIONS if runs and all(run.predictions.one_session_each for run in runs) else ""
+
+
+def form(what: str, text: str, published: bool) -> str:
+    """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
+
+    >>> form("Figure 9", "validation accuracy", True), form("Figure 9", "validation accuracy", False)
+    ("Figure 9 in the paper's form: validation accuracy", 'Validation accuracy')
+    """
+    return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
 
 
 def percent(share: float) -> str:

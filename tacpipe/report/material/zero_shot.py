@@ -46,7 +46,7 @@ def table(methods: Sequence[Method]) -> str:
     if not rows:
         return ""
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
-    caution = wording.caution(any(method.simulated for method in methods))
+    caution = wording.caution(methods)
     told = markup.table("Zero shot: accuracy on held-out materials", heads, rows)
     return f"<h3>Materials that one sensor never saw</h3>{told}{markup.note(NOTE + caution)}"
 

@@ -13,6 +13,8 @@ from tacpipe.touch_results import PREDICTIONS
 if TYPE_CHECKING:
     from tacpipe.dataset import Dataset
 
+TITLE = "prediction of fingertip readings from point clouds"
+
 
 def reads(dataset: Dataset) -> bool:
     """Say whether a dataset that is no result helps to tell of touch: one of clouds and grasps does."""

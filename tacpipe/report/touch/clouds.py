@@ -37,8 +37,8 @@ def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
     )
     drawn = [_figure(shards[name], words) for name, words in told.items()]
     note = (
-        "Blue points lie near the first contact, orange ones near the second. One camera sees one side of an object: what a "
-        "finger touches on the other is not in the cloud."
+        "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the "
+        "cloud, though a finger may touch it."
     )
     return f'<h3>Clouds and their grasps</h3><div class="pair">{"".join(drawn)}</div>{markup.note(note)}'
 

@@ -43,9 +43,10 @@ def figure_8(methods: Sequence[Method]) -> str:
     quantity = "loss (RMSE, share of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
     svg = epochs.by_epoch(curves, quantity, "Training and validation loss by epoch", log=True)
     simulated = " Simulated." if method.simulated else ""
+    text = f"training and validation loss by epoch, {method.name}, {wording.TARGETS.get(target, 'all targets')}."
+    printed = " The paper's figure has 1,000 epochs." if method.published else ""
     caption = (
-        f"Figure 8 in the paper's form: training and validation loss by epoch, {method.name}, "
-        f"{wording.TARGETS.get(target, 'all targets')}. {wording.basis([method])} The paper's figure has 1,000 epochs."
+        f"{wording.form('Figure 8', text, method.published)} {wording.basis([method])}{printed}"
         f"{_unwatched([method])}{simulated}"
     )
     return markup.figure(svg, caption)

@@ -91,9 +91,11 @@ def cloud(points_m: Floats, contacts_m: Floats, title: str) -> str:
                 _dots(axes[0], points[nearest == part][:, [across, 1]] * np.array([1, -1]) + np.array([at, 0]), colour)
             places = contacts[:, [across, 1]] * np.array([1, -1]) + np.array([at, 0])
             axes[0].plot(*places.T, color=INK, linewidth=1, marker="o", markersize=5)
-            for place, text in zip(places, ("g1", "g2"), strict=True):
-                axes[0].annotate(text, place, (5, 4), textcoords="offset points", fontsize=9)
-            axes[0].text(shift, -everything[:, 1].min() + 6, name, fontsize=8)
+            # on either side: seen along the line between them, both contacts lie in one place
+            for place, text, side in zip(places, ("g1", "g2"), (-1, 1), strict=True):
+                how: dict[str, Any] = {"textcoords": "offset points", "ha": "right" if side < 0 else "left"}
+                axes[0].annotate(text, place, (5 * side, 4), fontsize=9, **how)
+            axes[0].annotate(name, (shift, -everything[:, 1].min()), (0, 20), textcoords="offset points", fontsize=8)
             shift += np.ptp(everything[:, across]) + GAP_MM
         below = -everything[:, 1].max() - 8
         axes[0].plot([0, BAR_MM], [below, below], color=INK, linewidth=2)

@@ -18,6 +18,7 @@ TARGET = "pdc_th"  # on which the paper compares settings
 class Form:
     """A table of the paper: which setting varies, its values, and what was printed."""
 
+    number: str  # of the table or figure in the paper
     title: str
     setting: str
     names: Mapping[object, str]  # what a row is called, by the setting's value
@@ -28,7 +29,8 @@ class Form:
 
 FORMS = (
     Form(
-        "Table I in the paper's form: number of hidden layers of the head",
+        "Table I",
+        "number of hidden layers of the head",
         "head",
         {
             "fc1": "FC1: 1024",
@@ -41,13 +43,15 @@ FORMS = (
         printed.HEADS,
     ),
     Form(
-        "Table II in the paper's form: number of points",
+        "Table II",
+        "number of points",
         "points",
         {count: f"{count} points" for count in printed.POINTS},
         printed.POINTS,
     ),
     Form(
-        "Figure 9 in the paper's form: what the network is told",
+        "Figure 9",
+        "what the network is told",
         "inputs",
         {
             "xyz": "XYZ",
@@ -61,14 +65,16 @@ FORMS = (
         also=("wrist",),
     ),
     Form(
-        "Table III in the paper's form: normalisation of a cloud",
+        "Table III",
+        "normalisation of a cloud",
         "normalisation",
         {"none": "none", "sphere": "unit sphere", "minmax": "min-max", "wrist": "wrist frame"},
         printed.NORMALISATIONS,
         also=("wrist",),
     ),
     Form(
-        "Table IV in the paper's form: random rotation in training",
+        "Table IV",
+        "random rotation in training",
         "rotation_deg",
         {angle: f"±{angle}°" if angle else "none" for angle in printed.ROTATIONS},
         printed.ROTATIONS,
@@ -88,7 +94,8 @@ ESTIMATED = (
 def section(methods: Sequence[Method]) -> str:
     """Return the tables of which at least two rows were run; empty where there is none."""
     told = "".join(_table(form, methods) for form in FORMS)
-    return f"{told}{markup.note(printed.SCALES)}" if told else ""
+    published = all(one.published for one in methods)
+    return f"{told}{markup.note(printed.SCALES if published else '')}" if told else ""
 
 
 def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
@@ -112,18 +119,27 @@ def _table(form: Form, methods: Sequence[Method]) -> str:
     found = family(methods, form)
     if len(found) < 2:
         return ""
+    published = all(one.published for one in found.values())
     told = {value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names}
     least = min((one.each.mean, name) for value, name in form.names.items() if (one := told[value]))[1]
-    rows = [[name, *tables.cells(told[value]), *_printed(form, value)] for value, name in form.names.items()]
-    kinds = {number: "best" for number, name in enumerate(form.names.values()) if name == least}
+    shown = {value: name for value, name in form.names.items() if published or told[value]}
+    rows = [
+        [name, *tables.cells(told[value]), *(_printed(form, value) if published else [])]
+        for value, name in shown.items()
+    ]
+    kinds = {number: "best" for number, name in enumerate(shown.values()) if name == least}
     baselines = tables.baseline_rows(list(found.values()), TARGET, True)
-    blank = [NONE] * bool(form.printed)
+    blank = [NONE] * bool(form.printed and published)
     kinds |= dict.fromkeys(range(len(rows), len(rows) + len(baselines)), "quiet")
     rows += [[name, *tables.cells(one), *blank] for name, one in baselines]
-    heads = ["", *tables.ROWS, *(["paper: RMSE"] if form.printed else [])]
+    heads = ["", *tables.ROWS, *(["paper: RMSE"] if form.printed and published else [])]
     simulated = any(one.simulated for one in found.values())
-    title = f"{form.title}{' (simulated)' if simulated else ''}"
-    notes = [wording.basis(list(found.values())), wording.caution(simulated), ORDER if form.drawn else ""]
+    title = f"{wording.form(form.number, form.title, published)}{' (simulated)' if simulated else ''}"
+    notes = [
+        wording.basis(list(found.values())),
+        wording.caution(list(found.values())),
+        ORDER if form.drawn and published else "",
+    ]
     notes += [ESTIMATED] if any(one.settings.get("wrist") == "estimated" for one in found.values()) else []
     drawn = _figure(form, told, dict(baselines)) if form.drawn else ""
     table = markup.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)

@@ -10,7 +10,7 @@ from tacpipe.report.touch import printed, scores, tables, wording
 from tacpipe.report.touch.methods import DEFAULT, PAPERS, Method
 from tacpipe.report.touch.scores import Score
 
-TITLE = "Figures 10 and 11 in the paper's form: known objects (test) beside novel ones"
+TITLE = "Figures 10 and 11", "known objects (test) next to novel ones"
 PARTS = ("RMSE over runs", "R²", "skill")
 
 
@@ -44,6 +44,7 @@ def _targets(method: Method, known: bool) -> list[str]:
 
 
 def _table(known: Method, novel: Method) -> str:
+    published = known.published and novel.published
     rows: list[list[str]] = []
     pairs: list[tuple[Score | None, Score | None]] = []
     kinds: dict[int, str] = {}
@@ -52,21 +53,21 @@ def _table(known: Method, novel: Method) -> str:
         if test is None and other is None:
             continue
         pairs.append((test, other))
-        rows.append([name, *_cells(test, other), *_printed(target)])
+        rows.append([name, *_cells(test, other), *(_printed(target) if published else [])])
         baselines = zip(
             *(tables.baseline_rows([one], target, of) for one, of in ((known, True), (novel, False))), strict=False
         )
         for (called, first), (_, second) in baselines:
             kinds[len(rows)] = "quiet"
-            rows.append([f"· {called.partition(':')[0]}", *_cells(first, second), *[NONE] * 3])
+            rows.append([f"· {called.partition(':')[0]}", *_cells(first, second), *([NONE] * 3 if published else [])])
     heads = ["", *(f"test: {part}" for part in PARTS), *(f"novel: {part}" for part in PARTS), "change (%)"]
-    heads += ["paper: test", "paper: novel", "change (%)"]
+    heads += ["paper: test", "paper: novel", "change (%)"] if published else []
     simulated = known.simulated or novel.simulated
     chosen = [known] if known is novel else [known, novel]
     counted = [max(one.grasps for one in told if one) for told in zip(*pairs, strict=True)]
-    judged = f"Judged on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
-    note = f"{wording.basis(chosen)} {judged} {printed.FOUND_ON} {wording.caution(simulated)}"
-    title = f"{TITLE}{' (simulated)' if simulated else ''}; {known.name}"
+    judged = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
+    note = f"{wording.basis(chosen)} {judged} {printed.FOUND_ON if published else ''} {wording.caution(chosen)}"
+    title = f"{wording.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known.name}"
     return f"{markup.table(title, heads, rows, kinds)}{markup.note(note)}"
 
 

@@ -2,96 +2,120 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-from tacpipe.report import markup
+from tacpipe import headline as headline_of
+from tacpipe.headline import BETTER, UNCLEAR, WORSE, Headline
 from tacpipe.report.markup import listed
 from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import DEFAULT, Group, Method
-from tacpipe.touch_results import OBJECT_MEAN
 
 NO_EVIDENCE = "no evidence of generalisation"
+VERDICTS = {
+    BETTER: "is better than the best baseline on",
+    UNCLEAR: "does not differ measurably from the best baseline on",
+    WORSE: "is worse than the best baseline on",
+    headline_of.NO_VERDICT: "was evaluated on too few {cluster} for an interval on",
+}
 
 
-def sentences(groups: Sequence[Group]) -> list[str]:
-    """Return what the default method does on known objects and on novel ones, and which is best, for each split."""
+def headlines(groups: Sequence[Group]) -> list[Headline]:
+    """Return how the default method compares with its baselines on each target, of the first split that has any."""
+    for group in groups:
+        found = [one for known in (True, False) for one in _compared(group, known)]
+        if found:
+            return found
+    return []
+
+
+def sentences(groups: Sequence[Group]) -> list[tuple[str, str]]:
+    """Return how the default method does on known objects and on novel ones, for each split, with the verdict of each."""
     told = []
     # splits on which variants of another network were compared, on one target, have their tables and no sentence
     first = [one for one in groups if one.default.architecture == DEFAULT or len(one.targets) > 1] or groups
     for group in first:
         where = f" ({wording.place(group.split, group.simulated)})" if len(groups) > 1 else ""
         told += [_known(group, where), _novel(group, where)]
-    return [one.replace(" %", "\N{NO-BREAK SPACE}%") for one in told if one]
+    return [one for one in told if one[0]]
 
 
 def beating(methods: Sequence[Method], target: str, known: bool) -> list[Method]:
-    """Return the methods whose skill over the constant has an interval above 0."""
-    found = [(one, scores.score(one.runs, target, known)) for one in methods]
-    return [one for one, told in found if told and told.skill.low > 0]
+    """Return the methods whose gain over their best baseline has an interval above 0."""
+    return [one for one in methods if (told := scores.headline(one, target, known)) and told.verdict == BETTER]
 
 
-def _known(group: Group, where: str) -> str:
-    """Return skill on known objects, and which method is best where that is not the default."""
-    skills = _skills(group.default, True)
-    if not skills:
-        return ""
-    grasps = _counted(group.default, True)
-    told = f"Known objects{where}: {group.default.name} has a skill over the constant of {skills}, judged on {grasps}."
+def _known(group: Group, where: str) -> tuple[str, str]:
+    """Return how the default does on known objects, and which method is best where that is not the default."""
+    found = _compared(group, True)
+    if not found:
+        return "", ""
+    told = f"Known objects{where}: {_against(group.default, found)}."
     others = {}
     for target, name in wording.TARGETS.items():
         best = scores.best(group.methods, target, True)
-        found = scores.score(best.runs, target, True) if best else None
-        if best and found and best is not group.default:
-            others[name] = f"{best.name} on {name} with {wording.skill_within(found)}"
-    told += f" {_object_means(group)}"
-    return (f"{told} Better there: {listed(list(others.values()))}." if others else told).rstrip()
+        if best and best is not group.default:
+            others[name] = f"{best.name} on {name}"
+    if others:
+        told += f" Other methods have a lower error there: {listed(list(others.values()))}."
+    return told, headline_of.verdict(found)
 
 
-def _novel(group: Group, where: str) -> str:
-    """Return skill on novel objects, and whether there is evidence of any."""
-    skills = _skills(group.default, False)
+def _novel(group: Group, where: str) -> tuple[str, str]:
+    """Return how the default does on novel objects, and whether any method is better than its baselines there."""
+    found = _compared(group, False)
     tried = [one for one in group.methods if any(scores.score(one.runs, target, False) for target in one.targets)]
-    judged = [target for target in wording.TARGETS if scores.best(tried, target, False)]
-    if not judged:
-        return ""
+    targets = [target for target in wording.TARGETS if scores.best(tried, target, False)]
+    if not targets:
+        return "", ""
     told = f"Novel objects{where}: "
-    if skills:
-        told += f"{group.default.name} has a skill of {skills}, judged on {_counted(group.default, False)}. "
-    evident = {target: found for target in judged if (found := beating(tried, target, False))}
+    if found and group.default in tried:
+        told += f"{_against(group.default, found)}. "
+    evident = {target: better for target in targets if (better := beating(tried, target, False))}
+    verdict = headline_of.verdict(found)
     if not evident:
-        alone = "It" if skills else tried[0].name
-        none = f"None of {len(tried)} methods beats" if len(tried) > 1 else f"{alone} does not beat"
-        return f"{told}{none} the constant with an interval above zero on any target: {NO_EVIDENCE}."
-    ahead = [f"{listed([one.name for one in found])} on {wording.TARGETS[target]}" for target, found in evident.items()]
-    told += f"With an interval above zero, the constant is beaten by {'; by '.join(ahead)}."
-    rest = [wording.TARGETS[target] for target in judged if target not in evident]
-    return f"{told} On {listed(rest)} nothing does: {NO_EVIDENCE}." if rest else told
+        none = f"None of the {len(tried)} methods is" if len(tried) > 1 else f"{tried[0].name} is not"
+        told += f"{none} better than the best baseline with an interval above zero on any target: {NO_EVIDENCE}."
+        return told, verdict
+    ahead = [
+        f"{listed([one.name for one in better])} on {wording.TARGETS[target]}" for target, better in evident.items()
+    ]
+    told += f"Better than the best baseline, with an interval above zero: {'; '.join(ahead)}."
+    rest = [wording.TARGETS[target] for target in targets if target not in evident]
+    return (f"{told} On {listed(rest)}, none: {NO_EVIDENCE}." if rest else told), verdict
 
 
-def _object_means(group: Group) -> str:
-    """Return the skill of the mean of each known object, which knows nothing of a grasp; empty where none tells it."""
-    found = {}
-    for target, name in wording.TARGETS.items():
-        source = scores.reference(group.methods, target, OBJECT_MEAN)
-        score = scores.score(source.runs, target, True, OBJECT_MEAN) if source else None
-        if score and not math.isnan(score.skill.mean):
-            found[name] = markup.decimals(score.skill.mean)
-    means = listed([f"{skill} on {name}" for name, skill in found.items()])
-    return f"The mean of the object alone, whatever the grasp, has {means}." if means else ""
+def _compared(group: Group, known: bool) -> list[Headline]:
+    """Return how the default method compares with its baselines on each target."""
+    method = group.default
+    found = (scores.headline(method, target, known) for target in method.targets)
+    return [one for one in found if one is not None]
 
 
-def _skills(method: Method, known: bool) -> str:
-    """Return a method's skill on each target with its interval."""
-    found = {target: scores.score(method.runs, target, known) for target in method.targets}
-    return listed([f"{wording.skill_within(one)} on {wording.TARGETS[name]}" for name, one in found.items() if one])
+def _against(method: Method, found: Sequence[Headline]) -> str:
+    """Return on which targets a method is better than its baselines, on which it is not, and what that rests on."""
+    if not any(one.best for one in found):
+        return f"{method.name} was evaluated without a baseline"
+    parts = []
+    for verdict, words in VERDICTS.items():
+        alike = [f"{one.target} ({_gain(one)})" for one in found if one.verdict == verdict]
+        if alike:
+            parts.append(f"{words.format(cluster=found[0].cluster)} {listed(alike)}")
+    return f"{method.name} {'; '.join(parts)}; {_counted(method, found[0].part == wording.OBJECTS[True])}"
+
+
+def _gain(one: Headline) -> str:
+    """Return the gain on one target: "skill +0.2, 0.1 to 0.3, over constant"."""
+    best = one.best
+    assert best is not None  # every result that has one baseline has it on all targets
+    interval = f", {headline_of.bounds(one)}" if one.verdict else ""
+    return f"{headline_of.amount(one)}{interval}, over {best.name}"
 
 
 def _counted(method: Method, known: bool) -> str:
-    """Return on how much a skill rests."""
+    """Return on how much a comparison rests."""
     told = [one for target in method.targets if (one := scores.score(method.runs, target, known))]
     grasps, objects, runs = (max(getattr(one, name) for one in told) for name in ("grasps", "objects", "runs"))
     return (
-        f"{grasps:,} grasps of {objects} object{'s' if objects > 1 else ''} in {runs} run{'s' if runs > 1 else ''} "
-        f"(95 % intervals over {'grasps' if known else 'objects'})"
+        f"{headline_of.counted(grasps, 'grasps')} of {headline_of.counted(objects, 'objects')} in "
+        f"{headline_of.counted(runs, 'runs')} (95 % intervals over {'grasps' if known else 'objects'})"
     )

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 Tree = Mapping[str, Any]
 
+PAPERS_SETS = ("vision2tactile",)  # whose paper's tables and figures stand next to ours
 PAPERS = "pointnet"  # the architecture of the paper
 DEFAULT = "strong"  # the one that is trained where none is named
 NAMES = {PAPERS: "PointNet"}
@@ -68,6 +69,11 @@ class Run:
         """Whether its grasps were simulated."""
         return provenance.simulated(self.dataset)
 
+    @property
+    def published(self) -> bool:
+        """Whether its grasps are those of the paper."""
+        return provenance.published(self.dataset, PAPERS_SETS)
+
 
 @dataclass(frozen=True)
 class Method:
@@ -91,6 +97,11 @@ class Method:
     def simulated(self) -> bool:
         """Whether its grasps were simulated."""
         return bool(self.settings["simulated"])
+
+    @property
+    def published(self) -> bool:
+        """Whether all its runs were evaluated on grasps of the paper."""
+        return all(run.published for run in self.runs)
 
     @property
     def targets(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from tacpipe.report import markup, provenance
+from tacpipe.report import headline_box, markup, provenance
 from tacpipe.report.touch import clouds, curves, electrodes, forms, generalisation, headline, pressure, tables, wording
 from tacpipe.report.touch import methods as by_method
 from tacpipe.report.touch.methods import Group, Method
@@ -20,7 +20,7 @@ MIXED = " What is marked simulated is no evidence about a real sensor."
 POOLED = (
     "PDC is the pressure of the fluid in a fingertip. RMSE is global, over all grasps and electrodes of all runs of a "
     "method, as a share of the target's fixed range and in device counts; over runs it is mean ± standard deviation; batch "
-    "mean is over batches of 10, as the paper reports it. Skill is 1 − RMSE / RMSE of the constant on the same grasps, with "
+    "mean is the mean RMSE of batches of 10. Skill is 1 − RMSE / RMSE of the constant on the same grasps, with "
     "the 95 % interval from drawing grasps anew (known objects) or objects (novel ones). R² is about the mean of the judged "
     "grasps, so a constant lies at 0 or below. A novel object has no mean of its own: the constant stands for it. "
 )
@@ -34,19 +34,21 @@ def render(methods: Sequence[Method], grasps: Sequence[Dataset]) -> str:
     runs = sum(len(one.runs) for one in methods)
     several = f"{len(methods)} methods in {runs} results" if runs > 1 else methods[0].name
     said = headline.sentences(parted)
-    told = f'<p class="headline">{"<br>".join(map(escape, said))}</p>' if said else ""
     first = parted[0].default
     chosen = {one.recording: f"{one.place} by error" for one in electrodes.chosen(first.runs)}
-    papers = forms.section(methods) + generalisation.section(methods) + curves.figure_8(methods)
+    forms_told = forms.section(methods) + generalisation.section(methods) + curves.figure_8(methods)
+    published = all(one.published for one in methods)
+    title = "The paper's tables and figures" if published else "What settings change"
     parts = [
         f"<h2>{'Touch from clouds: ' if runs > 1 else ''}{escape(several)}{badge}</h2>",
-        told,
-        markup.note(wording.caution(simulated) + (MIXED if simulated != parted[-1].simulated else "")),
+        headline_box.box(said),
+        headline_box.table(headline.headlines(parted)),
+        markup.note(wording.caution(methods) + (MIXED if simulated != parted[-1].simulated else "")),
         *(_group(group, len(parted) > 1) for group in parted),
         f"<h3>The pressure, {escape(first.name)}</h3>" + pressure.section(first),
         electrodes.section(first),
         clouds.section(grasps, chosen),
-        f"<h3>The paper's tables and figures</h3>{papers}" if papers else "",
+        f"<h3>{title}</h3>{forms_told}" if forms_told else "",
         "<h3>All runs</h3>",
         tables.every_run(methods),
         _source(first),
@@ -58,7 +60,7 @@ def _group(group: Group, several: bool) -> str:
     """Return the tables of one way to part grasps."""
     badge = BADGE if group.simulated else ""
     title = f"Errors: {wording.split(group.split)}" if several else "Errors"
-    caution = markup.note(wording.caution(group.simulated))
+    caution = markup.note(wording.caution(group.methods))
     told = [tables.errors(group, known) for known in (True, False)]
     parts = [f"<h3>{escape(title)}{badge}</h3>", markup.note(f"{wording.basis(group.methods)} {POOLED}")]
     parts += [f"{one}{caution}" for one in (*told, tables.by_object(group)) if one]

@@ -32,6 +32,15 @@ class Predictions:
     known: NDArray[np.bool_]  # (grasp,), whether the model was trained on other grasps of the object
     true: Touch
     said: Mapping[str, Touch]  # by predictor
+    t_ns: NDArray[np.int64] | None = None  # (grasp,)
+
+    @property
+    def in_a_row(self) -> tuple[int, int]:
+        """How many grasps, in the order of time, follow one of the same object, and how many follow any."""
+        if self.t_ns is None or len(self.t_ns) < 2 or len(set(self.objects.tolist())) < 2:
+            return 0, 0
+        ordered = self.objects[np.argsort(self.t_ns, kind="stable")]
+        return int((ordered[1:] == ordered[:-1]).sum()), len(ordered) - 1
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -46,7 +55,8 @@ class Predictions:
         """Return some rows, told by a mask (grasp,) or by their numbers."""
         said = {name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.said.items()}
         true = {target: one[chosen] for target, one in self.true.items()}
-        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, said)
+        t_ns = None if self.t_ns is None else self.t_ns[chosen]
+        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, said, t_ns)
 
 
 def read(shard: Shard) -> Predictions:
@@ -59,6 +69,7 @@ def read(shard: Shard) -> Predictions:
         np.array(grasps["known"].to_pylist(), dtype=bool),
         others.pop(TRUE),
         others,
+        grasps["t_ns"].to_numpy() if "t_ns" in grasps.column_names else None,
     )
     return found.rows(~np.array(grasps["seen"].to_pylist(), dtype=bool))
 

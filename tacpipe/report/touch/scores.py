@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe import biotac_sp, regression
+from tacpipe.headline import Headline
+from tacpipe.headlines import touch as headlines
 from tacpipe.regression import Interval
 from tacpipe.report.spread import Spread, spread
 from tacpipe.report.touch.methods import Method, Run
@@ -81,6 +83,24 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
         len(np.unique(rows.objects)),
         len(parts),
     )
+
+
+def headline(method: Method, target: str, known: bool | None) -> Headline | None:
+    """Return how a method compares with its baselines on a target; None where it says nothing of it."""
+    errors: dict[str, dict[tuple[object, str], tuple[float, int]]] = {}
+    objects: dict[str, str] = {}
+    for run in method.runs:
+        for predictor in run.predictions.said:
+            for rows in _rows([run], target, known, predictor):
+                squared = regression.squared_sums(rows.true, rows.said)
+                objects |= dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
+                for name, one in zip(rows.recordings.tolist(), squared.tolist(), strict=True):
+                    key = run.params.get("seed"), name
+                    total, values = errors.setdefault(predictor, {}).get(key, (0.0, 0))
+                    errors[predictor][key] = total + one, values + rows.true.shape[1]
+    model = errors.pop(MODEL, {})
+    low, high = biotac_sp.RANGES[target]
+    return headlines.headline(method.name, target, high - low, model, errors, known, objects, len(method.runs))
 
 
 def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:

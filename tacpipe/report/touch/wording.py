@@ -26,16 +26,30 @@ BASELINES = {  # rows that every table has
     NEAREST_IN_TIME: "mean of the nearest in time",
 }
 OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
-SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor or about the paper's numbers."
+SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor."
 RECORDED = (
-    "An object's grasps were recorded together, so what is told of known objects rests on its session as well: the mean of "
-    "the grasps nearest in time, whatever their object, says how much."
+    "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
+    "were recorded as well: the mean of the grasps nearest in time, whatever their object, says how much."
 )
+IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by turns
 
 
-def caution(simulated: bool) -> str:
-    """Return what is said beside every table of errors."""
-    return SIMULATED if simulated else RECORDED
+def caution(methods: Sequence[Method]) -> str:
+    """Return what these grasps cannot show, beside every table of errors; empty where nothing is known against them."""
+    if methods and all(one.simulated for one in methods):
+        return SIMULATED
+    found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.runs]
+    same, every = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
+    return RECORDED.format(same=f"{same:,}", all=f"{every:,}") if every and same / every >= IN_A_ROW else ""
+
+
+def form(what: str, text: str, published: bool) -> str:
+    """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
+
+    >>> form("Table II", "number of points", True), form("Table II", "number of points", False)
+    ("Table II in the paper's form: number of points", 'Number of points')
+    """
+    return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
 
 
 def baseline(predictor: str) -> str:
@@ -113,7 +127,7 @@ def schedule(run: Run) -> str:
     params = run.params
     epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
     told = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
-    if run.architecture != PAPERS:
+    if run.architecture != PAPERS or not run.published:
         return told
     if (batch, rate) == (printed.BATCH, printed.LEARNING_RATE) and int(epochs or 0) >= printed.EPOCHS:
         return f"paper schedule ({told})"

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tacpipe import headline
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.stage import Recording, Result
@@ -62,7 +63,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     tree = scorecard.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):
         tree["anticipation"] = warned
+    method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
+        headline.FILE: headline.write(scorecard.headline(method, trials, forecaster.horizon)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
         "horizons.csv": scorecard.horizons_csv(tree, forecaster.config["rate_hz"]),
         "trials.csv": scorecard.trials_csv(trials),

@@ -14,6 +14,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe import metrics
+from tacpipe.headline import Headline
+from tacpipe.headlines import forward as headlines
 from tacpipe.tables import to_parquet
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
 
@@ -114,6 +116,36 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     parts["seen"] = [one for one in trials if one.seen]
     tree = _summary(fresh, groups, horizon, channel_scale, seed)
     return tree | {name: _summary(part, groups, horizon, channel_scale, seed) for name, part in parts.items() if part}
+
+
+def headline(method: str, trials: Sequence[Trial], horizon: int) -> list[Headline]:
+    """Return how the model compares with its baselines on recordings that it has not seen, of known objects and unseen ones.
+
+    Where nobody named an object, all are taken together.
+    """
+    fresh = [one for one in trials if not one.seen and one.windows]
+    steps = headlines.shown(range(1, horizon + 1))
+    at = [step - 1 for step in steps]
+
+    def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], Floats]:
+        found: dict[tuple[Any, str], Floats] = {}
+        for one in chosen:
+            errors, persistence = one.errors[predictor], one.errors[BASELINE].count_squared
+            squared, absolute, still = (
+                part.sum(axis=1)[at] for part in (errors.count_squared, errors.count_absolute, persistence)
+            )
+            found[0, one.name] = headlines.sums(squared, absolute, still, one.windows * persistence.shape[1])
+        return found
+
+    named = any(one.object is not None for one in fresh)
+    found = []
+    for part in (True, False) if named else (None,):
+        chosen = [one for one in fresh if part is None or one.known == part]
+        names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
+        others = {name: sums(name, chosen) for name in names}
+        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part)
+        found += [one] if one else []
+    return found
 
 
 def horizons_csv(tree: Tree, rate_hz: float) -> bytes:

@@ -11,7 +11,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tacpipe import headline, origin
 from tacpipe.errors import TacpipeError
+from tacpipe.headlines import material as headlines
 from tacpipe.stage import Recording, Result
 from tacpipe.tasks.material import scorecard
 from tacpipe.tasks.material import slides as slides_of
@@ -78,6 +80,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         tree["zero_shot"] = zero
     rows = [(sensor, one, int(at)) for sensor, one in judged.items() for at in np.flatnonzero(one.counted & ~one.seen)]
     files = {
+        headline.FILE: headline.write(_headlines(judged, classifier)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
         "confusion.csv": scorecard.confusion_csv(
             [sensor for sensor, _, _ in rows],
@@ -86,9 +89,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         ),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.shards.values())
-    table = predictions_table(judged, classifier)
-    return Result({PREDICTIONS: Recording(table, {"simulated": True} if simulated else {})}, files)
+    attributes = {name: shard.attributes for name, shard in recordings.shards.items()}
+    table = predictions_table(judged, classifier, {name: one.get("session") for name, one in attributes.items()})
+    return Result({PREDICTIONS: Recording(table, origin.together(attributes.values()))}, files)
 
 
 def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
@@ -175,6 +178,23 @@ def _summary(judged: Mapping[str, Judged], classifier: Classifier, *, seen: bool
     return scorecard.summary(right, len(classifier.classes))
 
 
+def _headlines(judged: Mapping[str, Judged], classifier: Classifier) -> list[headline.Headline]:
+    """Return how the model compares with its baselines on the slides of each sensor that it has not seen."""
+    found = []
+    for sensor, one in judged.items():
+        chosen = ~one.seen & one.counted & ~one.held
+        names = np.array(one.slides.names)[chosen]
+        right = {
+            predictor: {
+                (0, str(name)): (int(told), 1) for name, told in zip(names, one.right(predictor, chosen), strict=True)
+            }
+            for predictor in one.predicted
+        }
+        told = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
+        found += [told] if told else []
+    return found
+
+
 def _zero_shot(judged: Mapping[str, Judged], classifier: Classifier) -> Tree:
     """Return how well another sensor's classifier names materials whose labels a sensor was never told."""
     every, among, chances = {}, {}, {}
@@ -193,8 +213,13 @@ def _zero_shot(judged: Mapping[str, Judged], classifier: Classifier) -> Tree:
     return tree
 
 
-def predictions_table(judged: Mapping[str, Judged], classifier: Classifier) -> pa.Table:
-    """Return one row a slide: what it is, what each predictor named, and the model's scores and latents."""
+def predictions_table(
+    judged: Mapping[str, Judged], classifier: Classifier, sessions: Mapping[str, Any] | None = None
+) -> pa.Table:
+    """Return one row a slide: what it is, what each predictor named, and the model's scores and latents.
+
+    ``sessions`` tells by slide when it was recorded, as far as somebody said so.
+    """
     label, count = {"quantity": "label"}, {sensor: len(one.slides) for sensor, one in judged.items()}
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), [name for one in judged.values() for name in one.slides.names]),
@@ -202,6 +227,8 @@ def predictions_table(judged: Mapping[str, Judged], classifier: Classifier) -> p
         (pa.field("material", pa.int32(), metadata=label), _joined(one.slides.materials for one in judged.values())),
         (pa.field("seen", pa.bool_()), _joined(one.seen for one in judged.values())),
     ]
+    told = [(sessions or {}).get(name) for one in judged.values() for name in one.slides.names]
+    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in told]))
     for name in sorted({name for one in judged.values() for name in one.predicted}):
         values = [one.predicted.get(name, np.full(len(one.slides), slides_of.UNKNOWN)) for one in judged.values()]
         columns.append((pa.field(name, pa.int32(), metadata={"quantity": "prediction"}), _joined(values)))

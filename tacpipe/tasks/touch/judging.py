@@ -12,8 +12,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
+from tacpipe import biotac_sp, headline, origin, regression
 from tacpipe.errors import TacpipeError
+from tacpipe.headlines import touch as headlines
 from tacpipe.stage import Recording, Result
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import scorecard
@@ -55,12 +56,37 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         if mask.any():
             tree[name] = _measures(grasps, told, mask, known)
     files = {
+        headline.FILE: headline.write(_headlines(predictor, grasps, told, seen, known)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "by_object.csv": _by_object_csv(tree),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     streams[GRASPS] = _about(grasps, seen, known)
-    return Result({PREDICTIONS: Recording(streams, simulated(recordings))}, files)
+    attributes = origin.together(shard.attributes for shard in recordings.shards.values())
+    return Result({PREDICTIONS: Recording(streams, attributes)}, files)
+
+
+def _headlines(
+    predictor: Predictor, grasps: Grasps, told: Mapping[str, Told], seen: Mask, known: Mask
+) -> list[headline.Headline]:
+    """Return how the model compares with its baselines on each target, on known objects and on novel ones."""
+    objects = {name: of or "unnamed" for name, of in zip(grasps.names, grasps.objects, strict=True)}
+    found = []
+    for part in (True, False):
+        rows = np.flatnonzero((known == part) & ~seen)
+        for target in predictor.targets:
+            true = biotac_sp.normalised(target, grasps.felt[target])
+            errors = {}
+            for name, one in told.items():
+                squared = regression.squared_sums(true, biotac_sp.normalised(target, one[target]))
+                errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
+            model = errors.pop(MODEL)
+            low, high = biotac_sp.RANGES[target]
+            made = headlines.headline(
+                predictor.config["architecture"], target, high - low, model, errors, part, objects
+            )
+            found += [made] if made else []
+    return found
 
 
 def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, known: Mask) -> Tree:

@@ -139,20 +139,28 @@ def test_what_else_was_made_of_a_models_forecast_is_a_row_of_its_method_and_no_b
     anchored = FakeDataset(one.shards, {**one.files, "errors.parquet": errors(ratios)}, one.manifest)
     found = comparison.rows(methods.grouped(runs(anchored, result("raw"))), STEPS, known=True)
     assert {row.name: row.score for row in found if "anchored" in row.name} == {"recurrent · PCA-20 · anchored": 0.5}
-    last = next(row for row in found if row.name == "recurrent · PCA-20")
-    above = comparison.baseline_above(found, last)
-    assert above is not None and above.name == "ridge"  # told by the method that has it
+    method, other = methods.grouped(runs(anchored, result("raw")))
+    told = comparison.headline(method, [other], STEPS, known=True)
+    assert told is not None
+    assert [one.name for one in told.baselines] == ["ridge", "persistence", "train_mean"]  # ridge of the other's runs
 
 
-def test_the_best_method_is_none_that_was_shown_a_wrong_plan_and_better_baselines_are_told() -> None:
+def test_the_best_method_is_none_that_was_shown_a_wrong_plan() -> None:
     given = [*three_methods(), *methods.grouped(runs(result("raw", ratio=0.125, params={"actions": "shuffled"})))]
     found = comparison.rows(given, STEPS, known=True)
     best = comparison.best(found)
     assert best is not None and best.name == "recurrent · AE-C1-8"
-    assert comparison.baseline_above(found, best) is None
-    last = next(row for row in found if row.name == "recurrent · PCA-20")
-    above = comparison.baseline_above(found, last)
-    assert above is not None and above.name == "ridge"
+
+
+def test_the_gain_over_the_best_baseline_is_that_of_its_errors_whatever_persistence_does() -> None:
+    (method,) = methods.grouped(runs(result(ratio=0.5)))
+    told = comparison.headline(method, [], STEPS, known=True)
+    assert told is not None and told.best is not None
+    assert (told.best.name, told.clusters, told.cluster) == ("ridge", 2, "recordings")
+    assert told.gain == pytest.approx(1 / 3)
+    assert told.model.values == pytest.approx((2 * 1 * 0.5, 2 * 3 * 0.5, 0.5))  # MAE is twice the step times the ratio
+    assert told.best.values == pytest.approx((2 * 1 * 0.75, 2 * 3 * 0.75, 0.25))
+    assert told.verdict == ""  # two recordings
 
 
 def test_a_row_of_table_1_has_mean_and_sd_over_runs_in_the_models_own_space() -> None:

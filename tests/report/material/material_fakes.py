@@ -54,6 +54,8 @@ def result(
     trials: int = TRIALS,
     first: int = 1,
     simulated: bool = False,
+    published: bool = True,
+    sessions: int = 1,
     metrics: Mapping[str, Any] | None = None,
     validation_slides: int = 0,
     **params: Any,
@@ -61,10 +63,11 @@ def result(
     """Return one result whose model names all but ``wrong`` slides of each sensor right, and ``also`` by predictor.
 
     Networks, which have ``epochs``, have latents around their material's corner; the second sensor's lie where the first
-    one's of the material lie whose ``partners`` theirs is.
+    one's of the material lie whose ``partners`` theirs is. Slides are of the published sets unless they are ``simulated`` or
+    not ``published``, and those of a material are of so many ``sessions``.
     """
     sensors = list(wrong)
-    rows: dict[str, list[Any]] = {name: [] for name in ("recording", "sensor", "material", "seen")}
+    rows: dict[str, list[Any]] = {name: [] for name in ("recording", "sensor", "material", "seen", "session")}
     told: dict[str, list[int | None]] = {}
     latents = []
     rng = np.random.default_rng(fold or 0)
@@ -74,6 +77,7 @@ def result(
         rows["sensor"] += [sensor] * (len(names) + 1)
         rows["material"] += [*truth, 1]
         rows["seen"] += [False] * len(names) + [True]
+        rows["session"] += [f"{sensor}-{material}-{at % sessions}" for at, material in enumerate([*truth, 1])]
         for predictor, mistakes in {"model": wrong, **(also or {})}.items():
             column: list[int | None] = [*said(truth, mistakes[sensor], materials), 2] if sensor in mistakes else []
             told.setdefault(predictor, []).extend(column or [None] * (len(names) + 1))
@@ -107,7 +111,9 @@ def result(
     if epochs:
         lines = [json.dumps(line) for line in history(sensors, epochs, alignment, bool(params.get("joint")))]
         files["history.jsonl"] = "\n".join([*lines, ""]).encode()
-    attributes = {"simulated": True} if simulated else {}
+    attributes: dict[str, Any] = {"simulated": True} if simulated else {}
+    if published and not simulated:
+        attributes["published"] = ",".join(sorted({"biotac": "biotac-slide"}.get(one, one) for one in sensors))
     return FakeDataset({"predictions": FakeShard("predictions", pa.table(columns), attributes)}, files, MANIFEST)
 
 
@@ -147,10 +153,16 @@ def recorded(count: int = 3, outside: int = 1) -> Any:
             }
         )
         why = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
-        attributes = {"sensor": "biotac", "force_n": 1.0 + index, "outside_protocol": index < outside, **why}
+        attributes = {
+            "published": "biotac-slide",
+            "sensor": "biotac",
+            "force_n": 1.0 + index,
+            "outside_protocol": index < outside,
+            **why,
+        }
         shards[f"biotac-m01-t{index:03d}"] = StreamShard(
             f"biotac-m01-t{index:03d}", {"slide": profile, "profile": profile}, attributes
         )
-    attributes = {"sensor": "roboskin", "outside_protocol": False}
+    attributes = {"published": "roboskin", "sensor": "roboskin", "outside_protocol": False}
     shards["roboskin-test-000"] = StreamShard("roboskin-test-000", {"slide": pa.table({"t_ns": [0]})}, attributes)
     return FakeDataset(shards)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from html import unescape
 from typing import Any
 
 import pytest
@@ -73,9 +74,36 @@ def test_the_page_tells_all_that_there_is() -> None:
 def test_every_table_of_accuracies_says_what_they_cannot_show(simulated: bool) -> None:
     text = page.render(everything(simulated), title="t").decode()
     accuracies = text.count("<h4>") - text.count("<h4>Stages")
-    assert text.count(wording.caution(simulated)) >= accuracies
-    assert wording.caution(not simulated) not in text
+    said, other = (wording.SIMULATED, wording.SESSIONS) if simulated else (wording.SESSIONS, wording.SIMULATED)
+    assert text.count(said) >= accuracies
+    assert other not in text
     assert ('<span class="badge">simulated</span>' in text) == simulated
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_labs_own_slides_get_nothing_that_the_paper_says_of_its_own(simulated: bool) -> None:
+    level = {"mean_level": {"biotac": 4, "roboskin": 8}, "swapped": BOTH}
+    how: dict[str, Any] = {"published": False, "simulated": simulated, "sessions": 2}
+    given = [
+        result("minirocket", wrong=BOTH, also=level, **how),
+        result(wrong=BOTH, also=level, joint=True, epochs=3, **how),
+        result(wrong=BOTH, also=level, joint=True, reduce="biotac", ratio=25, epochs=3, **how),
+    ]
+    slides = material_fakes.recorded()
+    for shard in slides.shards.values():
+        del shard.attributes["published"]
+    text = unescape(page.render([*given, slides], title="").decode()).partition("</style>")[2]
+    for told in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure 5", "Materials are"):
+        assert told not in text, told
+    assert "<h4>Accuracy (%)</h4>" in text and "Force on BioTac" in text
+    assert "<h1>Recognition of materials by touch</h1>" in text
+
+
+@pytest.mark.parametrize(("sessions", "told"), [(1, True), (2, False)])
+def test_that_each_material_has_one_session_is_said_where_it_is_so(sessions: int, told: bool) -> None:
+    given = result("minirocket", wrong=BOTH, published=False, sessions=sessions)
+    assert (wording.SESSIONS in page.render([given], title="t").decode()) == told
 
 
 def test_one_result_alone_is_told_without_comparisons() -> None:

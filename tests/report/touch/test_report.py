@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import unescape
 from typing import Any
 
+import pyarrow as pa
 import pytest
 
 from tacpipe.report import page
@@ -55,9 +56,38 @@ def test_all_parts_are_told_on_one_page_that_is_the_same_each_time() -> None:
 @pytest.mark.parametrize("simulated", [False, True])
 def test_the_page_says_what_its_errors_cannot_show(simulated: bool) -> None:
     text = unescape(page.render(everything(simulated), title="t").decode())
-    assert wording.caution(simulated) in text
-    assert wording.caution(not simulated) not in text
+    recorded_so = wording.RECORDED.partition("} evaluated")[2][:60]
+    assert (wording.SIMULATED in text) == simulated
+    assert (recorded_so in text) == (not simulated)
     assert ('<span class="badge">simulated</span>' in text) == simulated
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_labs_own_grasps_get_nothing_that_the_paper_says_of_its_own(simulated: bool) -> None:
+    how: dict[str, Any] = {"published": False, "simulated": simulated}
+    given = [
+        result(**how, **FULL),
+        result("pointnet", off=0.07, epochs=4, **how, **FULL),
+        *(result("pointnet", head=head, targets=("pdc_th",), epochs=4, **how, **FULL) for head in ("fc1", "fc2")),
+        *(result("pointnet", inputs=one, targets=("pdc_th",), epochs=4, **how) for one in ("xyz", "rgbpose")),
+    ]
+    text = unescape(page.render(given, title="").decode()).partition("</style>")[2]
+    for told in ("paper", "RGBPose, trained on", "recorded together", "9,000 grasps", "FC6"):
+        assert told not in text, told
+    assert "<h3>What settings change</h3>" in text and "Number of hidden layers of the head" in text
+    assert "<h1>Prediction of fingertip readings from point clouds</h1>" in text
+
+
+def test_that_an_objects_grasps_follow_one_another_is_said_where_they_do() -> None:
+    told = "of 23 evaluated grasps follow one of the same object in time"
+    assert f"21 {told}" in page.render([result(published=False)], title="t").decode()
+    turns = result(published=False)
+    tables = turns.shards["predictions"].tables
+    t_ns = pa.array([index % 8 * 3 + index // 8 for index in range(24)] + [99], pa.int64())
+    place = tables["grasps"].column_names.index("t_ns")
+    tables["grasps"] = tables["grasps"].set_column(place, "t_ns", t_ns)
+    assert told not in page.render([turns], title="t").decode()
 
 
 def test_simulated_results_beside_recorded_ones_are_marked_and_kept_apart() -> None:
@@ -65,7 +95,7 @@ def test_simulated_results_beside_recorded_ones_are_marked_and_kept_apart() -> N
     elements.check(text)
     assert text.count('<span class="badge">simulated</span>') == 1
     assert "What is marked simulated is no evidence about a real sensor." in text
-    assert text.count("PDC thumb, known objects") == 2
+    assert text.count("<h4>PDC thumb, known objects") == 2
 
 
 def test_one_result_of_one_target_is_told_without_what_it_lacks() -> None:

@@ -146,7 +146,7 @@ def test_figures_10_and_11_tell_known_beside_novel_objects_and_the_change() -> N
     assert row[6:] == ["+50", "0.05496 | 49 counts", "0.08289 | 74 counts", "+51"]
     assert cells(html, "electrodes middle finger")[-3:] == ["0.05922 | 195 counts", "0.10317 | 340 counts", "+74"]
     assert cells(html, "· nearest in time" if "· nearest in time" in html else "· mean of the nearest in time")[0]
-    assert "Judged on 24 grasps of known and 16 of novel objects." in html
+    assert "Evaluated on 24 grasps of known and 16 of novel objects." in html
     assert "The paper's columns are of RGBPose, trained on 9,000 grasps" in unescape(html)
 
 

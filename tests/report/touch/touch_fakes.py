@@ -64,6 +64,7 @@ def result(
     train: int = 100,
     first: int = 0,
     simulated: bool = False,
+    published: bool = True,
     metrics: Mapping[str, Any] | None = None,
     seed: int = 0,
     **params: Any,
@@ -92,7 +93,8 @@ def result(
         "known": [*(name in known for name in objects), True],
     }
     tables = {name: _table(touch) for name, touch in shares.items()}
-    attributes = {"simulated": True} if simulated else {}
+    marked = {"published": "vision2tactile"} if published else {}
+    attributes = {"simulated": True} if simulated else marked
     shard: Any = StreamShard("predictions", {"grasps": pa.table(grasps), **tables}, attributes)
     config = {
         "task": "touch",

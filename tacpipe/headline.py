@@ -1,0 +1,248 @@
+"""What came out of an evaluation: a model next to the best of its baselines, and how sure the difference between them is.
+
+Tasks compute headlines (`tacpipe.headlines`), ``tacpipe evaluate`` writes them to ``headline.json`` and prints them, pages
+and ``tacpipe show`` show them. This module imports neither numpy nor anything else that a cache hit must not wait for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+FILE = "headline.json"
+FEWEST = 6  # clusters for a verdict: of 5 that all favour one side, chance alone gives 1 in 16, which is more than 5 %
+BETTER, WORSE, UNCLEAR, NO_VERDICT = "better", "worse", "unclear", ""
+NONE = "–"
+
+
+@dataclass(frozen=True)
+class Row:
+    """The errors of one predictor, one value a column of the headline; NaN where one is not defined."""
+
+    name: str
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Headline:
+    """A model and its baselines on one part of the recordings, all on the same ones."""
+
+    task: str
+    method: str
+    part: str  # which recordings: "unseen objects", "BioTac"; empty: all that the model has not seen
+    target: str  # what of them is predicted, where a part has several targets; empty: all
+    columns: tuple[str, ...]  # names of the errors
+    unit: str  # of the errors
+    ranked_by: str  # the error that orders the baselines and that the gain is computed from
+    model: Row
+    baselines: tuple[Row, ...]  # the best first
+    measure: str  # what the gain is: "skill" (1 − error / error of the best baseline) or "points" (of percent)
+    gain: float  # of the model over the best baseline; NaN where it is not defined
+    low: float  # 95 % interval of the gain; NaN with fewer than two clusters
+    high: float
+    clusters: int  # that were resampled
+    cluster: str  # what was resampled: "recordings", "slides", "grasps", "objects"
+    runs: int
+    seeds: int  # resampled too where there are several
+
+    @property
+    def best(self) -> Row | None:
+        """The best baseline, None where none was evaluated."""
+        return self.baselines[0] if self.baselines else None
+
+    @property
+    def verdict(self) -> str:
+        """``better`` or ``worse`` than the best baseline where the interval excludes 0, ``unclear`` where it does not.
+
+        Empty where no baseline was evaluated, or fewer than `FEWEST` clusters, whose interval proves nothing.
+        """
+        if self.clusters < FEWEST or math.isnan(self.low) or math.isnan(self.high):
+            return NO_VERDICT
+        return BETTER if self.low > 0 else WORSE if self.high < 0 else UNCLEAR
+
+    @property
+    def where(self) -> str:
+        """Part and target in words."""
+        return ", ".join(filter(None, (self.target, self.part))) or "all recordings"
+
+    @property
+    def interval(self) -> str:
+        """How the interval was made."""
+        return (
+            f"95 % interval over {counted(self.clusters, self.cluster)}"
+            f"{f' and {self.seeds} seeds' if self.seeds > 1 else ''}"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the headline as JSON holds it: what is not defined is null; best baseline and verdict stand beside."""
+        told = asdict(self)
+        best = self.best
+        return {**_json(told), "best_baseline": best.name if best else None, "verdict": self.verdict}
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Headline:
+        """Return the headline that `to_json` wrote."""
+        fields = {name: value[name] for name in cls.__dataclass_fields__}
+        model, baselines = _row(fields.pop("model")), tuple(_row(one) for one in fields.pop("baselines"))
+        gain, low, high = (_number(fields.pop(name)) for name in ("gain", "low", "high"))
+        columns = tuple(fields.pop("columns"))
+        return cls(**fields, columns=columns, model=model, baselines=baselines, gain=gain, low=low, high=high)
+
+
+def write(headlines: Sequence[Headline]) -> bytes:
+    """Return the content of ``headline.json``."""
+    told = {"headlines": [one.to_json() for one in headlines]}
+    return (json.dumps(told, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def read(content: bytes) -> list[Headline]:
+    """Return the headlines that ``headline.json`` holds."""
+    return [Headline.from_json(one) for one in json.loads(content)["headlines"]]
+
+
+def verdict(headlines: Sequence[Headline]) -> str:
+    """Return the verdict on several headlines together: ``better`` only where each is, ``worse`` only where each is."""
+    found = {one.verdict for one in headlines}
+    return next(iter(found)) if len(found) == 1 else UNCLEAR if found else NO_VERDICT
+
+
+def sentence(one: Headline) -> str:
+    """Return how the model compares with the best baseline, no more surely than the interval allows."""
+    return f"{_capital(one.where)}: {one.method} {clause(one)}."
+
+
+def clause(one: Headline) -> str:
+    """Return what follows the method's name in a sentence: "is better than ridge, the best of 3 baselines: skill …"."""
+    best = one.best
+    if best is None:
+        return f"was evaluated without a baseline, on {counted(one.clusters, one.cluster)}"
+    name = f"{best.name}, the best of {len(one.baselines)} baselines" if len(one.baselines) > 1 else best.name
+    gain = f"{amount(one)}"
+    if one.verdict == NO_VERDICT:
+        few = f"{counted(one.clusters, one.cluster)} {'is' if one.clusters == 1 else 'are'} too few for an interval"
+        return f"has {gain} over the baseline {name}; {few}"
+    interval = f" ({bounds(one)}, {one.interval})"
+    return {
+        BETTER: f"is better than the baseline {name}: {gain}{interval}",
+        WORSE: f"is worse than the baseline {name}: {gain}{interval}",
+        UNCLEAR: f"does not differ measurably from the baseline {name}: {gain}{interval}",
+    }[one.verdict]
+
+
+def amount(one: Headline) -> str:
+    """Return the gain with its name: "skill +0.119", "+3.5 points"."""
+    told = signed(one.gain, one.measure)
+    return f"{told} points" if one.measure == "points" else f"{one.measure} {told}"
+
+
+def bounds(one: Headline) -> str:
+    """Return the interval of the gain, empty where it is not defined."""
+    if math.isnan(one.low):
+        return ""
+    return f"{signed(one.low, one.measure)} to {signed(one.high, one.measure)}"
+
+
+def signed(value: float, measure: str = "skill") -> str:
+    """Return a gain with its sign.
+
+    >>> signed(0.1234), signed(-0.0245), signed(2.5, "points"), signed(float("nan")), signed(-123.4)
+    ('+0.123', '−0.025', '+2.5', 'not defined', '−123')
+    """
+    if math.isnan(value):
+        return "not defined"
+    digits = 1 if measure == "points" else 3 if abs(value) < 10 else 0
+    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")
+
+
+def number(value: float) -> str:
+    """Return an error with four digits.
+
+    >>> number(12345.6), number(0.012345), number(float("nan")), number(-0.25)
+    ('12,346', '0.01235', '–', '−0.25')
+    """
+    if math.isnan(value):
+        return NONE
+    return (f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}").replace("-", "−")
+
+
+def counted(count: int, plural: str) -> str:
+    """Return how many there are of a noun.
+
+    >>> counted(1, "recordings"), counted(1200, "slides")
+    ('1 recording', '1,200 slides')
+    """
+    return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
+
+
+def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
+    """Return heads and rows of a table of headlines with the same columns: a row the model, one its best baseline."""
+    if not headlines:
+        return [], []
+    first = headlines[0]
+    heads = ["", "", *first.columns, first.measure, "95 % interval", "n"]
+    rows = []
+    for one in headlines:
+        best = one.best
+        gain = [signed(one.gain, one.measure) if best else NONE, bounds(one) or NONE]
+        n = counted(one.clusters, one.cluster) + (f", {one.seeds} seeds" if one.seeds > 1 else "")
+        rows.append([one.where, one.method, *map(number, one.model.values), *gain, n])
+        if best:
+            told = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
+            said = told.get(one.verdict, "too few for a verdict")
+            rows.append(["", f"best baseline: {best.name}", *map(number, best.values), "", said, ""])
+    return heads, rows
+
+
+def caption(headlines: Sequence[Headline]) -> str:
+    """Return what the columns of `table` mean, in a sentence or two."""
+    first = headlines[0]
+    skill = f" Skill is 1 − error / error of the best baseline; the error is {first.ranked_by}."
+    points = f" Points are percentage points of {first.ranked_by} above the best baseline."
+    resampled = {f"{one.cluster}{' and seeds' if one.seeds > 1 else ''}" for one in headlines}
+    return (
+        f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: bootstrap over "
+        f"{' or '.join(sorted(resampled))}, model and baseline on the same ones, 2,000 resamples."
+    )
+
+
+def text(headlines: Sequence[Headline]) -> str:
+    """Return headlines as lines of text: a table with its caption, or a sentence where there is none."""
+    if not headlines:
+        return "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
+    heads, rows = table(headlines)
+    widths = [max(len(row[at]) for row in (heads, *rows)) for at in range(len(heads))]
+    lines = []
+    for row in (heads, *rows):
+        cells = [
+            cell.ljust(width) if at < 2 else cell.rjust(width)
+            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join([*lines, *textwrap.wrap(caption(headlines), max(map(len, lines)))])
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def _json(value: Any) -> Any:
+    """Return a value with null in place of what is no number, floats to 9 digits: more would differ between machines."""
+    if isinstance(value, dict):
+        return {name: _json(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json(one) for one in value]
+    if isinstance(value, float):
+        return float(f"{value:.9g}") if math.isfinite(value) else None
+    return value
+
+
+def _row(value: Mapping[str, Any]) -> Row:
+    return Row(value["name"], tuple(_number(one) for one in value["values"]))
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)

@@ -1,0 +1,158 @@
+"""Pages as a browser shows them: the text that readers see, and whether it is whole, in a wide and a narrow window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tacpipe.report import page
+from tests.report import browser
+from tests.report.browser import Browser
+from tests.report.forward import result_fakes
+from tests.report.material import material_fakes
+from tests.report.test_page import other
+from tests.report.touch import touch_fakes
+from tests.stages.learning_fakes import FakeDataset, FakeShard
+
+INSPECTION = (Path(__file__).parent / "inspection.js").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+WIDTHS = (1280, 400)
+LONG = "2026-11-22T10-32-33_gripper-left_carpet-with-long-pile_operator-two_trial"  # how a lab names a recording
+BOTH = {"biotac": 1, "roboskin": 2}
+LEVEL = {"mean_level": {"biotac": 4, "roboskin": 8}}
+PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
+
+pytestmark = pytest.mark.skipif(
+    browser.PROGRAM is None, reason="Chromium is missing; `make test` installs Debian's package chromium"
+)
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser.browser(tmp_path_factory.mktemp("chromium")) as opened:
+        yield opened
+
+
+def forward_single() -> list[Any]:
+    one = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}, attributes={"simulated": True})
+    lines = [
+        f'{{"epoch": {epoch}, "train_loss": {0.4 / epoch**0.5}, "val_loss": {0.42 / epoch**0.5}}}'
+        for epoch in range(1, 9)
+    ]
+    return [FakeDataset(one.shards, {**one.files, "history.jsonl": "\n".join(lines).encode()}, one.manifest)]
+
+
+def forward_of_long_names() -> list[Any]:
+    one = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5})
+    trials = one.files["trials.csv"].decode().replace("\nr", f"\n{LONG}-r").encode()
+    shards = {f"{LONG}-{name}": FakeShard(f"{LONG}-{name}", shard.content) for name, shard in one.shards.items()}
+    return [FakeDataset(shards, {**one.files, "trials.csv": trials}, one.manifest)]
+
+
+def forward_many() -> list[Any]:
+    ratios = (("PCA-20", 1.5), ("AE-C1-8", 1.2), ("raw", 0.5))
+    several = [result_fakes.result(name, seed, ratio=ratio) for name, ratio in ratios for seed in range(2)]
+    return [*several, result_fakes.codec(2, loss=0.75), result_fakes.codec(4, loss=0.5)]
+
+
+def forward_with_codecs() -> list[Any]:
+    return [*forward_single(), result_fakes.codec(8), result_fakes.codec(20)]
+
+
+def material_single() -> list[Any]:
+    return [material_fakes.result("minirocket", wrong={"plush": 2}, also={"mean_level": {"plush": 6}})]
+
+
+def material_many() -> list[Any]:
+    joint: dict[str, Any] = {"joint": True, "epochs": 6, "also": {**LEVEL, "swapped": BOTH}}
+    return [
+        material_fakes.result("minirocket", wrong=BOTH, also=LEVEL),
+        material_fakes.result("raec", wrong=BOTH, **joint),
+        material_fakes.result("raec", wrong=BOTH, **joint, pairing="permuted", partners=PARTNERS),
+        *(material_fakes.result("raec", wrong={name: 3}, epochs=6) for name in BOTH),
+        material_fakes.recorded(),
+    ]
+
+
+def touch_single() -> list[Any]:
+    return [touch_fakes.result(novel=touch_fakes.NOVEL, baselines={"object_mean": 0.06}), touch_fakes.recorded()]
+
+
+def touch_many() -> list[Any]:
+    heads = [touch_fakes.result("pointnet", head=head, epochs=12, off=0.06) for head in ("fc1", "fc2")]
+    inputs = [touch_fakes.result("pointnet", inputs=one, epochs=12) for one in ("xyz", "rgbpose")]
+    return [touch_fakes.result(), touch_fakes.result(seed=1), touch_fakes.result("trees", off=0.02), *heads, *inputs]
+
+
+def mixed() -> list[Any]:
+    return [*forward_single(), *material_single(), *touch_single(), other("graph")]
+
+
+PAGES: dict[str, Callable[[], list[Any]]] = {
+    one.__name__: one
+    for one in (
+        forward_single,
+        forward_of_long_names,
+        forward_many,
+        forward_with_codecs,
+        material_single,
+        material_many,
+        touch_single,
+        touch_many,
+        mixed,
+    )
+}
+
+
+@pytest.fixture(scope="module", params=sorted(PAGES))
+def rendered(request: pytest.FixtureRequest) -> bytes:
+    return page.render(PAGES[request.param](), title="")
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_what_a_reader_sees_of_a_page_is_whole_text(chromium: Browser, rendered: bytes, width: int) -> None:
+    chromium.show(rendered, width)
+    assert chromium.run(INSPECTION) == []
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", ["forward", "material", "touch"])
+def test_the_published_pages_are_whole_text_too(chromium: Browser, name: str, width: int) -> None:
+    chromium.show((DOCS / f"{name}.html").read_bytes(), width)
+    assert chromium.run(INSPECTION) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("<p>$\\mathdefault{10^{-1}}$</p>", "raw mathtext"),
+        ("<svg width=80 height=20><text y=15>$\\times$</text></svg>", "raw mathtext"),
+        ("<p>a &amp;lt;b&amp;gt; c</p>", "raw HTML"),
+        ("<p>&lt;b&gt;bold&lt;/b&gt;</p>", "raw HTML"),
+        ("<p>error None</p>", "None"),
+        ("<p>mean {value:.3f}</p>", "a format leftover"),
+        ("<table><tr><td>nan</td></tr></table>", "a number that is none"),
+        ("<p>skill −inf</p>", "a number that is none"),
+        ("<details><summary>more</summary><p>NaN</p></details>", "a number that is none"),
+        ("<p style='width: 3000px'>wide</p>", "wider than"),
+        (f"<p>{'x' * 900}</p>", "wider than"),
+        ("<div style='width: 40px; overflow: hidden; white-space: nowrap'>cut off text</div>", "cut by its box"),
+        ("<svg width=80 height=20><text x=60 y=15>outside</text></svg>", "outside its figure"),
+        ("<svg width=80 height=20><text x=5 y=15>one</text><text x=9 y=15>two</text></svg>", "over each other"),
+    ],
+)
+def test_the_inspection_finds_what_is_wrong(chromium: Browser, content: str, told: str) -> None:
+    chromium.show(f"<!doctype html><meta charset=utf-8><body>{content}".encode(), 400)
+    assert any(one.startswith(told) for one in chromium.run(INSPECTION))
+
+
+def test_the_inspection_finds_nothing_in_a_sound_page(chromium: Browser) -> None:
+    content = (
+        "<p>Infinite, financial, nanometre; no one.</p>"
+        "<div style='overflow-x: auto'><p style='width: 900px'>wide, but it scrolls</p></div>"
+    )
+    chromium.show(f"<!doctype html><meta charset=utf-8><body>{content}".encode(), 400)
+    assert chromium.run(INSPECTION) == []

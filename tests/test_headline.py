@@ -1,0 +1,112 @@
+"""What a headline claims, and how it is told."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+
+from tacpipe import headline
+from tacpipe.headline import Headline, Row
+
+ONE = Headline(
+    "forward",
+    "net",
+    "unseen objects",
+    "",
+    ("MAE t+1",),
+    "counts",
+    "the squared error",
+    Row("net", (7.5,)),
+    (Row("ridge", (8.25,)), Row("persistence", (9.0,))),
+    "skill",
+    0.1,
+    0.02,
+    0.2,
+    12,
+    "recordings",
+    3,
+    1,
+)
+
+
+def of(**changes: object) -> Headline:
+    return dataclasses.replace(ONE, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict", "told"),
+    [
+        (
+            0.02,
+            0.2,
+            "better",
+            "is better than the baseline ridge, the best of 2 baselines: skill +0.100 (+0.020 to +0.200, ",
+        ),
+        (-0.2, -0.1, "worse", "is worse than the baseline ridge"),
+        (-0.1, 0.2, "unclear", "does not differ measurably from the baseline ridge"),
+        (0.0, 0.2, "unclear", "does not differ measurably"),
+    ],
+)
+def test_a_verdict_needs_an_interval_that_excludes_zero(low: float, high: float, verdict: str, told: str) -> None:
+    found = of(low=low, high=high)
+    assert found.verdict == verdict
+    assert headline.sentence(found).startswith(f"Unseen objects: net {told}")
+    assert "95 % interval over 12 recordings" in headline.sentence(found)
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 5])
+def test_few_recordings_give_no_verdict_whatever_their_interval(clusters: int) -> None:
+    found = of(clusters=clusters)
+    assert found.verdict == ""
+    assert "too few for an interval" in headline.sentence(found)
+    assert of(clusters=headline.FEWEST).verdict == "better"
+
+
+def test_without_a_baseline_nothing_is_claimed() -> None:
+    nan = float("nan")
+    found = of(baselines=(), gain=nan, low=nan, high=nan)
+    assert found.verdict == "" and found.best is None
+    assert headline.sentence(found) == "Unseen objects: net was evaluated without a baseline, on 12 recordings."
+
+
+def test_several_are_better_together_only_where_each_is() -> None:
+    better, unclear, worse = of(), of(low=-0.1), of(low=-0.2, high=-0.1)
+    assert headline.verdict([better, better]) == "better"
+    assert headline.verdict([worse, worse]) == "worse"
+    assert headline.verdict([better, unclear]) == headline.verdict([better, worse]) == "unclear"
+    assert headline.verdict([better, of(clusters=2)]) == "unclear"
+    assert headline.verdict([]) == ""
+
+
+def test_headlines_are_read_as_they_were_written() -> None:
+    undefined = of(gain=float("nan"), model=Row("net", (float("nan"),)))
+    (first, second) = headline.read(headline.write([ONE, undefined]))
+    assert first == ONE
+    assert math.isnan(second.gain) and math.isnan(second.model.values[0])
+    assert b"NaN" not in headline.write([undefined])
+    assert ONE.to_json()["best_baseline"] == "ridge" and ONE.to_json()["verdict"] == "better"
+
+
+def test_the_table_has_the_model_above_its_best_baseline_and_how_the_interval_was_made() -> None:
+    lines = headline.text([ONE, of(part="known objects", seeds=3)]).splitlines()
+    assert lines[0].split() == ["MAE", "t+1", "skill", "95", "%", "interval", "n"]
+    assert lines[1].split() == [
+        "unseen",
+        "objects",
+        "net",
+        "7.5",
+        "+0.100",
+        "+0.020",
+        "to",
+        "+0.200",
+        "12",
+        "recordings",
+    ]
+    assert lines[2].split() == ["best", "baseline:", "ridge", "8.25", "model", "is", "better"]
+    assert lines[3].endswith("12 recordings, 3 seeds")
+    told = " ".join(lines[5:])
+    assert "1 − error / error of the best baseline; the error is the squared error" in told
+    assert "bootstrap over recordings or recordings and seeds" in told
+    assert "No recording was left" in headline.text([])
