@@ -201,7 +201,15 @@ def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]
     assert set(metrics["model"]) == {"mse_counts", "mae_counts", "mse_standard", "mse_latent", "mse_feature"}
     assert set(metrics["ridge"]) == {"mse_counts", "mae_counts", "mse_standard"}
     assert set(result.files) == {
-        *("metrics.json", "horizons.csv", "trials.csv", "errors.parquet", "config.json", "history.jsonl"),
+        *(
+            "metrics.json",
+            "horizons.csv",
+            "trials.csv",
+            "errors.parquet",
+            "config.json",
+            "history.jsonl",
+            "headline.json",
+        ),
     }
 
 

@@ -216,7 +216,7 @@ def test_results_on_simulated_grasps_say_so(model: dict[str, bytes]) -> None:
 def test_the_model_and_its_history_come_along(tmp_path: Path) -> None:
     files = trained(tmp_path, architecture="patches", inputs="xyz")
     result = judged(files, recordings(6, 1))[1]
-    assert set(result.files) == {"metrics.json", "by_object.csv", "config.json", "history.jsonl"}
+    assert set(result.files) == {"metrics.json", "by_object.csv", "headline.json", "config.json", "history.jsonl"}
     assert all(result.files[name] == files[name] for name in ("config.json", "history.jsonl"))
 
 
