@@ -55,7 +55,10 @@ def bare(wanted: Any) -> Any:
 
 
 def constraints(wanted: Any) -> list[Constraint]:
-    """Return the constraints of an annotation."""
+    """Return the constraints of an annotation, also of one that None is the only alternative to."""
+    kinds = [kind for kind in get_args(wanted) if kind is not types.NoneType] if get_origin(wanted) in _UNIONS else []
+    if len(kinds) == 1:
+        return constraints(kinds[0])
     found = get_args(wanted)[1:] if get_origin(wanted) is Annotated else ()
     return [one for one in found if isinstance(one, Constraint)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from tacpipe import directory, replacing
-from tacpipe.errors import UsageError, WouldChangeError
+from tacpipe.errors import DamagedError, UsageError, WouldChangeError
 from tacpipe.hashing import bytes_digest, file_digest
 from tacpipe.manifest import Manifest
 from tacpipe.request import Request
@@ -52,7 +52,7 @@ def _labelled(made: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> 
 def check(store: Store, request: Request, made: Manifest) -> None:
     """Raise `WouldChangeError` where the output was made from anything else, `UsageError` where it would be refused."""
     if not (request.single_file or request.replace):
-        replacing.refuse_losses(replacing.occupant(store, request.output), request.output, made)
+        replacing.refuse_losses(_occupant(store, request), request.output, made)
     root = store.roots.get(request.output.absolute())
     if root is None or root["manifest"] != bytes_digest(made.content):
         raise WouldChangeError(f"{request.output} would change: it was made from other inputs or params.")
@@ -69,7 +69,7 @@ def publish(store: Store, request: Request, made: Manifest) -> Manifest:
     with directory.changing(store, request.output):  # somebody may be about to label what is there
         made = settled(store, request, made)
         if not request.replace:
-            replacing.refuse_losses(replacing.occupant(store, request.output), request.output, made)
+            replacing.refuse_losses(_occupant(store, request), request.output, made)
         if made.recorded:
             store.put(made.content, durable=True)
         directory.publish_alone(store, made, request.output)
@@ -83,7 +83,18 @@ def refuse(store: Store, request: Request, plan: replacing.Plan) -> None:
         return
     directory.check_output(store, request.output)
     if not request.replace:
-        replacing.refuse_plan(replacing.occupant(store, request.output), request.output, plan)
+        replacing.refuse_plan(_occupant(store, request), request.output, plan)
+
+
+def _occupant(store: Store, request: Request) -> Manifest | None:
+    """Return the manifest at the output; None also where both it and its root are damaged.
+
+    Recordings are not written there then, as `settled` says; what is computed from others is computed again.
+    """
+    try:
+        return replacing.occupant(store, request.output)
+    except DamagedError:
+        return None
 
 
 def _refuse_file(store: Store, request: Request) -> None:

@@ -86,15 +86,15 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -
 def test_folds_without_validation_recordings_are_noted_with_a_share_that_gives_them_some(
     params: dict[str, Any], count: int, wanted: str, shard: Shard
 ) -> None:
-    (note,) = split(split.params(**params), dataset(shard, count)).notes
+    (note,) = split(asked("split", **params), dataset(shard, count)).notes
     assert wanted in note
     if "Give --val " in note:
         enough = float(note.split("Give --val ")[1].split(",")[0])
-        assert split(split.params(**{**params, "val": enough}), dataset(shard, count)).notes == []
+        assert split(asked("split", **{**params, "val": enough}), dataset(shard, count)).notes == []
 
 
 @pytest.mark.parametrize(("params", "count"), [({"val": 0.0}, 3), ({}, 12), ({"scheme": "kfold", "val": 0.0}, 5)])
 def test_a_split_with_validation_recordings_or_asked_for_without_has_no_note(
     params: dict[str, Any], count: int, shard: Shard
 ) -> None:
-    assert split(split.params(**params), dataset(shard, count)).notes == []
+    assert split(asked("split", **params), dataset(shard, count)).notes == []
