@@ -113,7 +113,11 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
         value = json.loads(content)
         found, stored = value.pop("format"), value.pop("digest")
         if found != FORMAT:
-            raise UsageError(f"{where} has manifest format {excerpt(found)}; this tacpipe reads format {FORMAT}.")
+            if type(found) is not int or found < FORMAT:
+                raise ValueError(f"its format is {excerpt(found)}")
+            raise UsageError(
+                f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}. Install a newer tacpipe."
+            )
         manifest = Manifest(**value)
         manifest.__dict__["content"] = content  # primes the cached property: the bytes are at hand
         computed = stored if verified else manifest.digest

@@ -110,7 +110,8 @@ class Specimen:
             found = held(self.folder / "data" / dataset)
         except TacpipeError as error:
             sentence = str(error)
-            assert error.exit_code == DAMAGED or (isinstance(error, UsageError) and "no manifest.json" in sentence)
+            usage = isinstance(error, UsageError) and ("no manifest.json" in sentence or "manifest format" in sentence)
+            assert error.exit_code == DAMAGED or usage
             assert sentence.endswith(".") and "\n" not in sentence, sentence
             return False
         assert found == self.expected(dataset), f"{dataset} holds what nobody put there"
