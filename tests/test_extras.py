@@ -163,12 +163,14 @@ def test_every_command_is_walked() -> None:
     assert words(WORK) | words(LACK) == every
 
 
+@pytest.mark.long
 def test_what_needs_no_extra_works_without_any(bare: Callable[[str], tuple[int, str]]) -> None:
     failed = {command: told for command in WORK for code, told in [bare(command)] if code}
 
     assert failed == {}
 
 
+@pytest.mark.long
 def test_what_needs_an_extra_ends_in_one_sentence_that_names_it(bare: Callable[[str], tuple[int, str]]) -> None:
     other = {}
     for command, extra in LACK.items():

@@ -11,7 +11,7 @@ from tacpipe.manifest import Manifest
 from tacpipe.store import Store
 from tests.conftest import tacpipe as command
 
-MANY = [100, pytest.param(1000, marks=pytest.mark.faults)]
+MANY = [pytest.param(100, marks=pytest.mark.long), pytest.param(1000, marks=pytest.mark.faults)]
 STAGES = {
     "synchronize": "synchronize data/recordings -o data/synced --rate-hz 25",
     "segment": "segment contacts data/synced -o data/segments",

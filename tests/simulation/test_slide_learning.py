@@ -107,6 +107,7 @@ def test_pairs_of_other_materials_align_and_swap_as_well_so_that_sharing_is_driv
         assert accuracy(permuted)[sensor] - accuracy(permuted, "swapped")[sensor] <= 0.1, sensor
 
 
+@pytest.mark.long
 def test_labels_dealt_out_anew_are_named_by_chance(tmp_path: Path) -> None:
     training, watched, tested = whole()
     metrics, _ = judged(trained(tmp_path, training, watched, **STRONG, labels="permuted"), tested)
