@@ -25,6 +25,7 @@ MODULES = (
     "verified_reads",
     "synchronization",
     "decode",
+    "encoding",
     "forward_training",
     "material_training",
     "touch_training",

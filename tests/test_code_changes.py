@@ -2,12 +2,13 @@
 
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import Lab, tacpipe
+from tests.conftest import Lab, made_once, tacpipe
 
 STAGES = '''
 """Stages of a lab."""
@@ -53,18 +54,23 @@ NOTES = ()
 POINTS = "[tacpipe.stages]\nsimulate.numbers = lab_stages:made\ntimes = lab_stages:times\nsums = lab_stages:sums\n"
 
 
-@pytest.fixture
-def own(tmp_path: Path) -> Path:
-    """A project with a plug-in of its own, whose recordings are made and multiplied."""
-    (tmp_path / ".tacpipe").mkdir()
-    package = tmp_path / "package"
+def prepared(folder: Path) -> None:
+    """Make a project with a plug-in of its own, whose recordings are made, multiplied and added up."""
+    (folder / ".tacpipe").mkdir()
+    package = folder / "package"
     (package / "lab.egg-info").mkdir(parents=True)
     (package / "lab.egg-info/entry_points.txt").write_text(POINTS)
     (package / "lab_stages.py").write_text(STAGES)
-    ran(tmp_path, "simulate numbers -o data/r")
-    ran(tmp_path, "times data/r -o data/t")
-    ran(tmp_path, "sums data/t -o data/s")
-    return tmp_path
+    ran(folder, "simulate numbers -o data/r")
+    ran(folder, "times data/r -o data/t")
+    ran(folder, "sums data/t -o data/s")
+
+
+@pytest.fixture
+def own(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project that `prepared` makes."""
+    folder = tmp_path / "own"
+    return shutil.copytree(made_once(tmp_path_factory, "own", prepared), folder, symlinks=True)
 
 
 def call(folder: Path, command: str) -> tuple[int, str, str]:

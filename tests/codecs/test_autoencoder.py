@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import itertools
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -184,24 +182,7 @@ def test_a_search_that_was_interrupted_goes_on_to_the_same_codec(
     assert fit(tmp_path / "torn", hidden="", search=3).to_files() == whole.to_files()
 
 
-def test_ten_rows_are_encoded_in_less_than_a_millisecond(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    widths = (288, 192, 96, 8)
-    encoder = tuple(
-        (rng.normal(size=(after, before)).astype(np.float32) / 20, np.zeros(after, dtype=np.float32))
-        for before, after in itertools.pairwise(widths)
-    )
-    channels = tuple(f"c{index}" for index in range(96))
-    fitted = Autoencoder(channels, (), np.zeros(96), np.ones(96), encoder, (), frames=3)
-    window, begins = rng.normal(size=(10, 96)), np.arange(10) == 0
-    seconds = []
-    for _ in range(50):
-        started = time.perf_counter()
-        fitted.encode(window, channels, begins)
-        seconds.append(time.perf_counter() - started)
-    assert min(seconds) < 1e-3
-
-
+@pytest.mark.long
 def test_as_many_latents_as_the_data_have_dimensions_lose_no_more_than_principal_components(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     mixing = rng.normal(size=(6, 96)) * 200

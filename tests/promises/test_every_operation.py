@@ -60,6 +60,7 @@ def test_whatever_fails_nothing_is_torn_and_the_rerun_equals_a_clean_run(
     assert one["problems"] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cases", QUICK, ids=lambda cases: cases[0].name)
 def test_whatever_fails_of_small_commands_nothing_is_torn(cases: Any, plugin: Path, tmp_path: Path) -> None:
     found = tried(plugin, tmp_path, *(case.name for case in cases), "--every", "29")

@@ -79,6 +79,7 @@ def xela(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return Recorded("xela", tmp_path_factory.mktemp("spool"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensor", STREAMS)
 def test_offset_is_found_to_half_a_sample_and_drift_to_two_ppm(sensor: str, tmp_path: Path) -> None:
     recorded = Recorded(sensor, tmp_path)

@@ -295,6 +295,7 @@ def test_plans_of_other_windows_help_no_more_than_none(forecasters: dict[str, Fo
     assert skill_at_the_end(forecasters["planned"]) >= without + 0.2
 
 
+@pytest.mark.long
 def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
     noise = (np.square(taxels.NOISE_COUNT) + 1 / 12).mean()
     forecaster = trained(tmp_path, [loaded(index) for index in range(8)], [loaded(8)], epochs=6, hidden=32)

@@ -252,6 +252,7 @@ def test_the_trials_of_a_session_have_a_fingerprint_in_common_and_those_of_anoth
         assert np.abs(drift[1] - drift[0]).max() < np.abs(drift[2] - drift[0]).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_a_session_tells_the_class_of_identical_materials_and_another_session_does_not(sensor: str) -> None:
     rig, classes, numbers = replace(PLAIN, identical_materials=True, sessions=2, materials=10), 10, 30

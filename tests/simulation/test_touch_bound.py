@@ -57,6 +57,7 @@ def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_t
     np.testing.assert_allclose(np.sqrt(spread), np.sqrt(variance), rtol=0.15)
 
 
+@pytest.mark.long
 def test_no_constant_comes_near_the_bound_and_the_readings_keep_to_it() -> None:
     made = grasps(RIG, TRIALS)
     for target in ("pdc_th", "pdc_mf", "e_th", "e_mf"):
