@@ -62,8 +62,8 @@ def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_ar
 def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_show_it(tmp_path: Path) -> None:
     rig = Rig(spheres=True, effort_spread=0.05, drift_count_day=0.0)
     training, tested = grasps(rig, range(160)), grasps(rig, range(160, 240))
-    pressures = {"targets": "pdc_th,pdc_mf", "together": True}
-    scaled = {**POINTNET, **pressures, "normalisation": "minmax", "inputs": "xyzpose", "epochs": 15}
+    pressures = {"targets": "pdc_th,pdc_mf"}
+    scaled = {**POINTNET, **pressures, "together": True, "normalisation": "minmax", "inputs": "xyzpose", "epochs": 15}
     boxed = judged(training, tested, tmp_path / "boxed", **scaled)
     metric = judged(training, tested, tmp_path / "metric", **pressures)
     for target in ("pdc_th", "pdc_mf"):
