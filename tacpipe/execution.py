@@ -164,17 +164,22 @@ def reader(store: Store, beside: tuple[str, ...] = ()) -> Callable[[str, str], b
     return read
 
 
-def _adopt(store: Store, name: str, path: str, beside: tuple[str, ...]) -> bytes | None:
-    for directory in beside:
-        try:
+def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...]) -> bytes | None:
+    content = beside(name, path, beside_of)
+    if content is not None:
+        with contextlib.suppress(TacpipeError):  # of a store that may only be read the sound copy is as good
+            store.prepare()
+            store.put(content, durable=True)
+    return content
+
+
+def beside(name: str, path: str, directories: tuple[str, ...]) -> bytes | None:
+    """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it."""
+    for directory in directories:
+        with contextlib.suppress(OSError):
             content = (Path(directory) / path).read_bytes()
-        except OSError:
-            continue
-        if bytes_digest(content) == name:
-            with contextlib.suppress(TacpipeError):  # of a store that may only be read the sound copy is as good
-                store.prepare()
-                store.put(content, durable=True)
-            return content
+            if bytes_digest(content) == name:
+                return content
     return None
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.excerpt import listed
 from tacpipe.manifest import Manifest
 from tacpipe.store import Store, locate
 
@@ -123,12 +124,7 @@ def _compared(what: str, before: dict[str, Any], now: dict[str, Any], *, quiet_n
         "gone": [] if quiet_names else sorted(set(before) - set(now)),
         "other": sorted(name for name in set(before) & set(now) if before[name] != now[name]),
     }
-    return [f"{what}: {len(names)} {kind} ({_few(names)})" for kind, names in groups.items() if names]
-
-
-def _few(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+    return [f"{what}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
 
 
 def to_text(tree: dict[str, Any]) -> str:
@@ -170,9 +166,9 @@ def _lines(node: dict[str, Any], depth: int, told: set[str], argument: str = "")
             f"{pad}  from {len(files)} raw files of {len(node['sources'])} recordings, as {first}/{name}  [{digest[:12]}]"
         )
     if node["labels"]:
-        lines.append(f"{pad}  labelled by hand: {_few(sorted(node['labels']))}")
+        lines.append(f"{pad}  labelled by hand: {listed(sorted(node['labels']), _SHOWN)}")
     if node["skipped"]:
-        lines.append(f"{pad}  left out: {_few(sorted(node['skipped']))}")
+        lines.append(f"{pad}  left out: {listed(sorted(node['skipped']), _SHOWN)}")
     for name, several in node["inputs"].items():
         for given in several:
             lines += _lines(given, depth + 1, told, name)

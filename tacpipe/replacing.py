@@ -11,16 +11,15 @@ What was replaced stays in the store and is listed by `tacpipe store list`.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import execution, places
 from tacpipe import manifest as manifest_of
-from tacpipe import places
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.hashing import bytes_digest
+from tacpipe.excerpt import listed
 from tacpipe.manifest import ACQUIRE, Manifest
 from tacpipe.store import Store
 
@@ -144,19 +143,18 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
     if before.stage != plan.stage:
         raise UsageError(f"{output} holds {_described(before)}; {plan.stage} would replace it. {_KEEP}")
     changed = [name for name in plan.sources if before.sources.get(name, plan.sources[name]) != plan.sources[name]]
+    alone = f"or --replace, after which {output} holds the recordings of this source alone. {_BACK}"
     if changed:
         raise UsageError(
-            f"{output} holds recordings of the same name that came from other files: {_few(changed)}. Rename the new ones, "
-            f"or give -o another directory, or --replace, after which {output} holds the recordings of this source alone. "
-            f"{_BACK}"
+            f"{output} holds recordings of the same name that came from other files: {listed(sorted(changed), _SHOWN)}. "
+            f"Rename the new ones, or give -o another directory, {alone}"
         )
     others = sorted(set(before.recordings) - set(plan.sources))
     if plan.sources and others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
         raise UsageError(
-            f"{output} holds {len(others)} recordings that this source does not have ({_few(others)}), and they were made "
-            f"by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them together, or "
-            f"give -o another directory, or --replace, after which {output} holds the recordings of this source alone. "
-            f"{_BACK}"
+            f"{output} holds {len(others)} recordings that this source does not have ({listed(others, _SHOWN)}), and they "
+            f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
+            f"together, or give -o another directory, {alone}"
         )
 
 
@@ -167,12 +165,13 @@ def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> Non
     if lost.recordings:
         count = len(lost.recordings)
         raise UsageError(
-            f"{output} holds {count} recordings that the new dataset does not have ({_few(lost.recordings)}). {_KEEP}"
+            f"{output} holds {count} recordings that the new dataset does not have ({listed(lost.recordings, _SHOWN)}). "
+            f"{_KEEP}"
         )
     if lost.labels:
         raise UsageError(
             f"{output} holds labels that were set by hand on recordings that the new dataset does not have or labels "
-            f"differently ({_few(lost.labels)}). {_KEEP}"
+            f"differently ({listed(lost.labels, _SHOWN)}). {_KEEP}"
         )
 
 
@@ -201,14 +200,14 @@ def outgoing(store: Store, directory: Path) -> Manifest | None:
 
     It is known to the store afterwards, so that it can be checked out: one that git brought, or a copy, is stored.
     """
-    known = former(store, directory)
     try:
         found = manifest_of.find(directory)
         here = found.manifest
     except TacpipeError:
-        return known
+        return former(store, directory)
     root = store.roots.get(directory)
     if root is None or root["manifest"] != found.digest:
+        known = former(store, directory)
         store.put(found.content, durable=here.recorded)
         store.roots.set(directory, found.digest, lasting=known is not None and bool(losses(known, here)))
     return here
@@ -217,12 +216,9 @@ def outgoing(store: Store, directory: Path) -> Manifest | None:
 def adopt(store: Store, directory: Path, manifest: Manifest) -> None:
     """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
     for path, name in manifest.objects():
-        if store.has(name):
-            continue
-        with contextlib.suppress(OSError):
-            content = (directory / path).read_bytes()
-            if bytes_digest(content) == name:
-                store.put(content, durable=True)
+        content = None if store.has(name) else execution.beside(name, path, (str(directory),))
+        if content is not None:
+            store.put(content, durable=True)
 
 
 def _described(manifest: Manifest) -> str:
@@ -234,9 +230,3 @@ def _described(manifest: Manifest) -> str:
 
 def _params(params: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in params.items()) or "no params"
-
-
-def _few(names: Iterable[str]) -> str:
-    listed = sorted(names)
-    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
-    return ", ".join(listed[:_SHOWN]) + more
