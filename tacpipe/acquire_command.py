@@ -92,9 +92,13 @@ def add(program: typer.Typer, summary: str) -> None:
             _attributes(label or [], note),
         )
         recorded, lost = _record(found, store, plan, quiet=quiet)
-        _tell(output, recorded, began_s, as_json=as_json)
+        failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
+        _tell(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
+        if lost and as_json:  # the object on stdout holds the error already
+            print(f"tacpipe: {failed}", file=sys.stderr)
+            raise typer.Exit(failed.exit_code)
         if lost:
-            raise DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
+            raise failed
 
 
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
@@ -185,7 +189,14 @@ def _attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
     return {**attributes, **({"note": note} if note else {})}
 
 
-def _tell(output: Path | None, recorded: list[Recorded], began_s: float, *, as_json: bool) -> None:
+def _tell(
+    output: Path | None,
+    recorded: list[Recorded],
+    began_s: float,
+    *,
+    as_json: bool,
+    failed: TacpipeError | None = None,
+) -> None:
     from dataclasses import asdict
 
     if as_json:
@@ -200,7 +211,8 @@ def _tell(output: Path | None, recorded: list[Recorded], began_s: float, *, as_j
             "rows": rows,
             "seconds": seconds,
         }
-        print(json.dumps(value))
+        error = {} if failed is None else {"error": str(failed), "exit_code": failed.exit_code}
+        print(json.dumps({**value, **error}))
         return
     if output is not None:
         print(output)

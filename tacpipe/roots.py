@@ -17,9 +17,8 @@ if TYPE_CHECKING:
 
 BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
-Root = dict[
-    str, Any
-]  # {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach
+# {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach
+Root = dict[str, Any]
 HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
 
 

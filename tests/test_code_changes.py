@@ -214,6 +214,17 @@ def test_json_prints_one_object_on_errors_too(lab: Lab, command: str, code: int)
     assert value["error"] in failed.err
 
 
+def test_a_recording_that_lost_a_stream_is_one_object_with_the_error_in_it(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("rig.toml").write_text('[[stream]]\nname = "f"\nsensor = "pulse"\ntransport = "serial:/dev/ttyACM0"\n')
+    monkeypatch.setattr("tacpipe.acquire_command._record", lambda *given, **more: ([], ["f was lost."]))
+    failed = lab.call("acquire rig.toml -o rec --json")
+    value = json.loads(failed.out)
+    assert failed.code == value["exit_code"] == 5 and value["error"].endswith("f was lost.")
+    assert (value["output"], value["recordings"]) == ("rec", []) and value["error"] in failed.err
+
+
 def test_label_prints_what_it_changed_as_json(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     value = json.loads(lab.run("label data/r trial-00[12] --set material=foam --json").out)
