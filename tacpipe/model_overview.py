@@ -202,9 +202,9 @@ def _history(opened: Dataset) -> list[dict[str, Any]]:
 
 
 def _best(history: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the epoch of least validation loss, as far as the history tells one."""
-    told = [line for line in history if isinstance(line.get("val_loss"), int | float)]
-    best = min(told, key=lambda line: line["val_loss"], default=None)
+    """Return the epoch of least validation loss, None where the history has none."""
+    validated = [line for line in history if isinstance(line.get("val_loss"), int | float)]
+    best = min(validated, key=lambda line: line["val_loss"], default=None)
     return {"epoch": best.get("epoch"), "loss": best["val_loss"]} if best else None
 
 

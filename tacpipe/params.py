@@ -2,7 +2,7 @@
 
 A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
 same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
-one by default; a field that the chosen class does not have is refused, and is no part of a key. A method ``check`` may
+one by default; a field that the chosen class does not have is refused, and is not part of a key. A method ``check`` may
 refuse values that do not go together; stored params are read back without it.
 """
 

@@ -241,7 +241,7 @@ class _Run:
         known = record is not None and execution.complete(self.store, record)
         if record is not None and known and not self.request.compare and not self.request.rerun:
             self.outcome.reused += counted
-            self._heed(name, "", record)
+            self._add_record(name, "", record)
             result: Mapping[str, Any] = record["result"]
             return result
         if self.request.check:
@@ -259,7 +259,7 @@ class _Run:
         done = execution.compute(task)
         if done.record is None:
             raise _error(done.exit_code, done.error)
-        self._heed(name, "", done.record)
+        self._add_record(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:
             self.outcome.differs += execution.differences(record["result"], made, name)
@@ -270,7 +270,7 @@ class _Run:
         self.outcome.reused += counted and not done.made
         return made
 
-    def _heed(self, name: str, recording: str, record: Mapping[str, Any]) -> None:
+    def _add_record(self, name: str, recording: str, record: Mapping[str, Any]) -> None:
         """Add to the outcome what the record of a result says of it: notes, and the code that it was computed by."""
         made = record["provenance"]
         for note in made.get("notes") or ():
@@ -307,7 +307,7 @@ class _Run:
             record = self.store.record(digest(task.identity))
             if record is not None and not self._again(name) and execution.complete(self.store, record):
                 results[task.recording] = record["result"]
-                self._heed(name, task.recording, record)
+                self._add_record(name, task.recording, record)
             else:
                 rerun = self._again(name)
                 missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
@@ -342,7 +342,7 @@ class _Run:
                     continue
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
-                self._heed(name, done.recording, done.record)
+                self._add_record(name, done.recording, done.record)
                 result = results[done.recording] = done.record["result"]
                 if self.request.compare and done.recording in stored:
                     self.outcome.differs += execution.differences(stored[done.recording], result, done.recording)

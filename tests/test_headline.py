@@ -1,4 +1,4 @@
-"""What a headline claims, and how it is told."""
+"""What a headline states, and how it is printed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which recordings are those of a published set, and not a lab's own in the same layout: told by when they were recorded.
+"""Which recordings are those of a published set, and not a lab's own in the same layout: known by when they were recorded.
 
 What a set's paper printed, and what is known of how it was recorded, holds for its recordings alone.
 """
@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from tacpipe.origin import PUBLISHED
 from tacpipe.stage import Attribute
 
-MONTHS = {  # first and last month (UTC) in which a set was recorded, by format; one without stamps is told by its layout
+MONTHS = {  # first and last month (UTC) in which a set was recorded, by format; one without stamps is known by its layout
     "biotac-slide": ("2020-02", "2020-02"),
     "vision2tactile": ("2019-05", "2019-07"),
     "xela-flat": ("2021-11", "2021-11"),

@@ -30,7 +30,7 @@ def headline(
 ) -> Headline | None:
     """Return how a method compares with its baselines on the slides of a sensor.
 
-    ``right`` tells by predictor, then by seed and slide, how often it named the slide right and how often it was asked.
+    ``right`` holds, by predictor, then by seed and slide, how often the slide was classified right and how often at all.
     Guessing among ``classes`` counts as a baseline too.
     """
     own = _sums(right.get(model, {}))

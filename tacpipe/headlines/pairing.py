@@ -51,7 +51,8 @@ def headline(
     """Return how a model compares with the best of its baselines; None without a recording.
 
     A baseline is compared on the recordings that it shares with the model; where it was not evaluated with a seed of the
-    model, its mean over its own seeds counts. ``clusters`` tells by recording what is drawn together; else it is itself.
+    model, its mean over its own seeds counts. ``clusters`` maps a recording to the cluster it is drawn with, by default
+    itself.
     """
     if not model:
         return None

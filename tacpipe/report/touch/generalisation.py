@@ -65,8 +65,8 @@ def _table(known: Method, novel: Method) -> str:
     simulated = known.simulated or novel.simulated
     chosen = [known] if known is novel else [known, novel]
     counted = [max(one.grasps for one in told if one) for told in zip(*pairs, strict=True)]
-    judged = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
-    note = f"{wording.basis(chosen)} {judged} {printed.FOUND_ON if published else ''} {wording.caution(chosen)}"
+    evaluated = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
+    note = f"{wording.basis(chosen)} {evaluated} {printed.FOUND_ON if published else ''} {wording.caution(chosen)}"
     title = f"{wording.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known.name}"
     return f"{markup.table(title, heads, rows, kinds)}{markup.note(note)}"
 

@@ -218,7 +218,7 @@ def predictions_table(
 ) -> pa.Table:
     """Return one row a slide: what it is, what each predictor named, and the model's scores and latents.
 
-    ``sessions`` tells by slide when it was recorded, as far as somebody said so.
+    ``sessions`` maps a slide to its session, where one is recorded.
     """
     label, count = {"quantity": "label"}, {sensor: len(one.slides) for sensor, one in judged.items()}
     columns: list[tuple[pa.Field, Any]] = [
