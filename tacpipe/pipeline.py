@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,28 +26,10 @@ from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError
 from tacpipe.execution import Done, Task
 from tacpipe.hashing import digest
 from tacpipe.manifest import Entry, Manifest
+from tacpipe.outcome import Outcome
 from tacpipe.request import Inputs, Request
 from tacpipe.stage import ROLES
 from tacpipe.store import MissingError, Store, locate
-
-_NAMED = 5  # recordings that a note names
-
-
-@dataclass
-class Outcome:
-    """What a command did."""
-
-    output: Path
-    key: str = ""
-    ran: int = 0
-    reused: int = 0
-    rows: int = 0
-    seconds: float = 0.0
-    bad: dict[str, str] = field(default_factory=dict)
-    differs: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    said: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
-    code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
 
 
 def open_dataset(path: Path | str) -> Dataset:
@@ -77,7 +59,7 @@ def run(request: Request) -> Outcome:
     else:
         with store.at_work([found.digest for found in inputs.used]):
             made = _make(request, store, inputs, identity, outcome)
-    outcome.notes = [*sorted(set(inputs.notes)), *_notes(outcome)]
+    outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results()]
     outcome.rows = made.rows
     if request.check:
         output.check(store, request, made)
@@ -100,7 +82,7 @@ def _make(request: Request, store: Store, inputs: Inputs, identity: Mapping[str,
             if not first:
                 raise
             outcome.ran = outcome.reused = 0
-            outcome.said, outcome.code = {}, {}
+            outcome.restore({})
     raise AssertionError
 
 
@@ -119,31 +101,7 @@ def _answer(store: Store, outcome: Outcome) -> Manifest | None:
     store.announce(wanted for _, wanted in found.objects())
     if not all(store.has(name, size) for name, size in found.sizes()):
         return None
-    outcome.code = record["provenance"].get("code") or {}
-    outcome.said = record["provenance"].get("notes") or {}
-    return found
-
-
-def _notes(outcome: Outcome) -> list[str]:
-    """Return what the user should know of the results: what stages noted, and which were computed by other code."""
-    count = outcome.ran + outcome.reused
-    found = []
-    for text, names in outcome.said.items():
-        named = ", ".join(sorted(names)[:_NAMED]) + (" …" if len(names) > _NAMED else "")
-        some = f"all {count} recordings" if len(names) == count else f"{len(names)} recordings ({named})"
-        found.append(f"{some}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
-    for name, counts in outcome.code.items():
-        try:
-            stage = execution.stage_of(name)
-        except TacpipeError:  # of a plug-in that is gone: its results stay valid
-            continue
-        others = sum(number for code, number in counts.items() if code != provenance.code(stage))
-        if others and provenance.code(stage) is not None:
-            found.append(
-                f"{others} of these results were computed by other code of {name} than there is now in "
-                f"{stage.function.__module__}, under the same version {stage.version}. Raise its version if they differ, "
-                f"or compute them again with --rerun."
-            )
+    outcome.restore(record["provenance"])
     return found
 
 
@@ -241,7 +199,7 @@ class _Run:
         known = record is not None and execution.complete(self.store, record)
         if record is not None and known and not self.request.compare and not self.request.rerun:
             self.outcome.reused += counted
-            self._add_record(name, "", record)
+            self.outcome.add_record(name, "", record)
             result: Mapping[str, Any] = record["result"]
             return result
         if self.request.check:
@@ -259,7 +217,7 @@ class _Run:
         done = execution.compute(task)
         if done.record is None:
             raise _error(done.exit_code, done.error)
-        self._add_record(name, "", done.record)
+        self.outcome.add_record(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:
             self.outcome.differs += execution.differences(record["result"], made, name)
@@ -269,15 +227,6 @@ class _Run:
         self.outcome.ran += done.made and counted
         self.outcome.reused += counted and not done.made
         return made
-
-    def _add_record(self, name: str, recording: str, record: Mapping[str, Any]) -> None:
-        """Add to the outcome what the record of a result says of it: notes, and the code that it was computed by."""
-        made = record["provenance"]
-        for note in made.get("notes") or ():
-            self.outcome.said.setdefault(note, []).append(recording)
-        if made.get("code"):
-            counts = self.outcome.code.setdefault(name, {})
-            counts[made["code"]] = counts.get(made["code"], 0) + 1
 
     def _fit(self) -> dict[str, Any]:
         """Return the files that the stage's fit made of the training recordings, or those of ``--codec``."""
@@ -307,7 +256,7 @@ class _Run:
             record = self.store.record(digest(task.identity))
             if record is not None and not self._again(name) and execution.complete(self.store, record):
                 results[task.recording] = record["result"]
-                self._add_record(name, task.recording, record)
+                self.outcome.add_record(name, task.recording, record)
             else:
                 rerun = self._again(name)
                 missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
@@ -342,7 +291,7 @@ class _Run:
                     continue
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
-                self._add_record(name, done.recording, done.record)
+                self.outcome.add_record(name, done.recording, done.record)
                 result = results[done.recording] = done.record["result"]
                 if self.request.compare and done.recording in stored:
                     self.outcome.differs += execution.differences(stored[done.recording], result, done.recording)
@@ -410,5 +359,4 @@ def _remember(store: Store, identity: Mapping[str, Any], made: Manifest, outcome
     stored = vars(store.put(made.content, durable=made.recorded))
     if not outcome.bad:
         result = {"recordings": {}, "files": {manifest.NAME: stored}}
-        made_by = {**provenance.of(0.0), "code": outcome.code, "notes": outcome.said}
-        store.commit(identity, result, made_by, replace=True)
+        store.commit(identity, result, {**provenance.of(0.0), **outcome.of_results()}, replace=True)

@@ -16,6 +16,7 @@ from tacpipe import params as params_of
 from tacpipe import pipeline, progress, registry
 from tacpipe.constraints import NonNegativeInt
 from tacpipe.errors import FAILED
+from tacpipe.outcome import Outcome
 from tacpipe.request import Request
 from tacpipe.stage import Stage
 
@@ -99,7 +100,7 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
     _report(pipeline.run(request), shown, as_json=given["json_"], quiet=given["quiet"])
 
 
-def _report(outcome: pipeline.Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
+def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
     for note in outcome.notes:
         print(f"tacpipe: {note}", file=sys.stderr)
     for name, why in outcome.bad.items():
@@ -115,9 +116,7 @@ def _report(outcome: pipeline.Outcome, headline: str | None, *, as_json: bool, q
         if not quiet:
             headline_table.show(found)
     if as_json:
-        value = {"schema_version": 1, **vars(outcome), "output": str(outcome.output), **told}
-        del value["said"], value["code"]  # which the notes hold in words
-        print(json.dumps(value))
+        print(json.dumps({"schema_version": 1, **outcome.to_json(), **told}))
     else:
         print(outcome.output)
     if outcome.differs:
