@@ -65,7 +65,8 @@ class Arrays:
                     f"The channel {name} ({array.dtype}) holds integers beyond 2^53, which {common} would round, so "
                     f"there is no one matrix of these channels. Read it alone: arrays[{name!r}] has its own type."
                 )
-            values[:, index] = np.ma.getdata(array)
+            with np.errstate(invalid="ignore"):  # of a signalling NaN, which is NaN in any type
+                values[:, index] = np.ma.getdata(array)
             if np.ma.isMaskedArray(array):
                 values[np.ma.getmaskarray(array), index] = np.nan
         return values

@@ -213,6 +213,7 @@ def test_duckdb_reads_the_shards_that_lie_beside_the_manifest(lab: Lab) -> None:
     )
 
 
+@pytest.mark.long
 def test_training_that_was_killed_resumes_and_ends_with_the_same_weights(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -240,6 +241,7 @@ def test_training_that_was_killed_resumes_and_ends_with_the_same_weights(
     assert not list(store.root.glob("checkpoints/*"))
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (sample_data() / "xela_flat_pick_move").exists(), reason="published recordings are not here")
 def test_the_chain_runs_on_published_recordings(

@@ -161,6 +161,14 @@ def test_no_value_that_is_read_differs_from_that_of_the_file(table: pa.Table) ->
         }
 
 
+def test_a_signalling_nan_is_nan_in_the_type_that_all_channels_share() -> None:
+    signalling = np.array([0x7F800001], "<u4").view(np.float32)
+    table = pa.table({"x": pa.array([7], pa.int32()), "y": pa.array(signalling)})
+    with published({"trial-000": {"": table}}) as path:
+        values = tacpipe.open(path).to_numpy()["trial-000"].values
+    assert values.dtype == np.float64 and values[0, 0] == 7 and np.isnan(values[0, 1])
+
+
 def test_times_stay_whole_nanoseconds_beside_channels_of_floats() -> None:
     t_ns = 1_763_782_179_000_000_000 + 20_000_001 * np.arange(5)  # (time,)
     table = pa.table(

@@ -374,7 +374,7 @@ def output_of(words: list[str]) -> str:
     return output if output.endswith(".html") else f"{output}/manifest.json"
 
 
-@pytest.mark.parametrize("preset", ["quick", "paper"])
+@pytest.mark.parametrize("preset", ["quick", pytest.param("paper", marks=pytest.mark.long)])
 def test_every_command_of_the_chain_is_a_stage_whose_block_of_params_fits(preset: str, lab: Lab) -> None:
     known, seen = registry.stages(), set()
     shutil.copy(HERE / "params.yaml", lab.folder)

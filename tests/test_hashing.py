@@ -13,11 +13,12 @@ from tacpipe.hashing import bytes_digest, canonical, digest, file_digest, rememb
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=5), inner, max_size=5),
+    max_leaves=10,
 )
 
 
-@given(st.dictionaries(st.text(), values))
+@given(st.dictionaries(st.text(max_size=5), values, max_size=5))
 def test_the_order_of_keys_does_not_change_a_digest(value: dict[str, object]) -> None:
     assert digest(dict(reversed(value.items()))) == digest(value)
 
