@@ -55,7 +55,7 @@ def compute(task: Task) -> Done:
     try:
         if task.dry:
             result, _ = execute(task, store, _Scratch())
-            return Done(task.recording, {"result": result, "provenance": {}})
+            return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
         with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
             record = store.record(key)
             if record is not None and not task.rerun and complete(store, record):
@@ -185,7 +185,7 @@ def beside(name: str, path: str, directories: tuple[str, ...]) -> bytes | None:
 
 def _remake(store: Store, name: str, path: str, why: str) -> bytes:
     other = ""
-    for identity in _makers(store, name):
+    for identity, made_by in _makers(store, name):
         acquired = identity["stage"] == ACQUIRE
         if acquired or stage_of(identity["stage"]).source:
             raise DamagedError(
@@ -206,25 +206,26 @@ def _remake(store: Store, name: str, path: str, why: str) -> bytes:
             raise DamagedError(f"{why} It cannot be made again here: {error}") from error
         if store.has(name):
             return store.read(name)
-        other = f"{identity['stage']} gave something else when it was run again: other libraries, or chance"
+        unlike = "; ".join(provenance.unlike(made_by, provenance.of(0.0)))
+        other = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
     reason = other or f"nothing in the store says how {path} was made"
     raise DamagedError(
         f"{why} It cannot be made again: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
     )
 
 
-_known: dict[str, dict[str, list[Any]]] = {}  # store, digest, identities of what gave it
+_known: dict[str, dict[str, list[tuple[Any, Any]]]] = {}  # store, digest, identities of what gave it and provenance
 
 
-def _makers(store: Store, name: str) -> list[Any]:
-    """Return the identities of the keys that gave an object; all records are read once for many lost objects."""
+def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
+    """Return identity and provenance of the keys that gave an object; all records are read once for many lost objects."""
     root = str(store.root)
     if name not in _known.get(root, {}):
         _known[root] = {}
         for _, record in store.records():
             if "stage" in record["identity"]:
                 for found in set(named(record["result"])):
-                    _known[root].setdefault(found, []).append(record["identity"])
+                    _known[root].setdefault(found, []).append((record["identity"], record["provenance"]))
     return _known[root].get(name, [])
 
 

@@ -12,7 +12,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import listed
 
 _NAMED = 5  # recordings that a note names
-_FROM_RECORDS = ("said", "code")  # fields that `describe_results` puts into words
+_FROM_RECORDS = ("said", "code", "unlike")  # fields that `describe_results` puts into words
 
 
 @dataclass
@@ -30,6 +30,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     said: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
+    unlike: list[str] = field(default_factory=list)  # in what the computers of results that differ are not the same
 
     def add_record(self, stage: str, recording: str, record: Mapping[str, Any]) -> None:
         """Add what the record of one result holds besides it: notes, and the code that it was computed by."""
@@ -40,6 +41,13 @@ class Outcome:
             counts = self.code.setdefault(stage, {})
             counts[made["code"]] = counts.get(made["code"], 0) + 1
 
+    def compare(self, stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> None:
+        """Add what differs between two records of one result; ``name`` is that of the stage or of the recording."""
+        differs = execution.differences(stored["result"], made["result"], name)
+        self.differs += differs
+        unlike = provenance.unlike(stored["provenance"], made["provenance"]) if differs else []
+        self.unlike += [one for one in unlike if one not in self.unlike]
+
     def of_results(self) -> dict[str, Any]:
         """Return what `add_record` added, as the record of a whole run keeps it."""
         return {"code": self.code, "notes": self.said}
@@ -47,6 +55,11 @@ class Outcome:
     def restore(self, kept: Mapping[str, Any]) -> None:
         """Take over what `of_results` returned; nothing of an older record, which has none."""
         self.code, self.said = kept.get("code") or {}, kept.get("notes") or {}
+
+    def describe_differences(self) -> str:
+        """Return what differs from what is stored, and whether another computer's rounding may be why."""
+        why = f" (computed with other {'; '.join(self.unlike)}, which rounds differently)" if self.unlike else ""
+        return f"these differ from what is stored: {'; '.join(self.differs)}{why}"
 
     def describe_results(self) -> list[str]:
         """Return the notes of stages, and how many results were computed by other code than their stage has now."""

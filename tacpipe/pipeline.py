@@ -220,7 +220,7 @@ class _Run:
         self.outcome.add_record(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:
-            self.outcome.differs += execution.differences(record["result"], made, name)
+            self.outcome.compare(record, done.record, name)
             made = record["result"]  # what else was made rests on what is stored
         elif self.request.compare and not counted:
             raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
@@ -251,11 +251,12 @@ class _Run:
     def _map(self, name: str, tasks: Sequence[Task], entries: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return what each task gives, from the store or by running it, with the attributes of ``entries`` before."""
         results: dict[str, Mapping[str, Any]] = {}
+        stored: dict[str, Mapping[str, Any]] = {}  # records
         missing: list[Task] = []
         for task in tasks:
             record = self.store.record(digest(task.identity))
             if record is not None and not self._again(name) and execution.complete(self.store, record):
-                results[task.recording] = record["result"]
+                stored[task.recording], results[task.recording] = record, record["result"]
                 self.outcome.add_record(name, task.recording, record)
             else:
                 rerun = self._again(name)
@@ -265,7 +266,7 @@ class _Run:
         if self.request.compare:
             missing = [replace(task, dry=True) for task in tasks]
         self.outcome.reused += len(tasks) - len(missing)
-        results.update(self._compute(name, missing, results))
+        results.update(self._compute(name, missing, stored))
         if not results:
             raise _error(
                 FAILED, f"{name} could not read any of the {len(tasks)} recordings:\n{_lines(self.outcome.bad)}"
@@ -292,9 +293,9 @@ class _Run:
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
                 self.outcome.add_record(name, done.recording, done.record)
-                result = results[done.recording] = done.record["result"]
+                results[done.recording] = done.record["result"]
                 if self.request.compare and done.recording in stored:
-                    self.outcome.differs += execution.differences(stored[done.recording], result, done.recording)
+                    self.outcome.compare(stored[done.recording], done.record, done.recording)
         self._refuse(name, bad)
         return results
 

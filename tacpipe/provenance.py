@@ -5,10 +5,11 @@ from __future__ import annotations
 import functools
 import platform
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tacpipe.executors import usable_cores
+from tacpipe import processor
 from tacpipe.hashing import remembered_file_digest
 from tacpipe.stage import Stage
 
@@ -36,15 +37,37 @@ def _here() -> dict[str, Any]:
         "git_commit": commit or None,
         "host": platform.node(),
         "python": sys.version.split()[0],
-        "threads": usable_cores(),
     }
 
 
 def of(seconds: float) -> dict[str, Any]:
-    """Return libraries, git commit, host, device and threads of this process, and the ``seconds`` that something took."""
+    """Return libraries, git commit, host, device and processor of this process, and the ``seconds`` that something took."""
     torch = sys.modules.get("torch")
     device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
-    return {**_here(), "device": device, "seconds": seconds}
+    return {**_here(), "device": device, "processor": processor.here(), "seconds": seconds}
+
+
+def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return in what two computers differ that changes how numbers round; nothing where ``stored`` does not say.
+
+    >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
+    ['threads: 1, now 2']
+    """
+    found = []
+    for name in ("device", "processor", "libraries"):
+        before, after = stored.get(name), now.get(name)
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            there = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]
+        else:
+            there = [(name, before, after)] if before and after else []
+        found += [f"{part}: {_text(one)}, now {_text(other)}" for part, one, other in there if one != other]
+    return found
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        value = [f"{name}={value[name]}" for name in sorted(value)]
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value if value is not None else "none")
 
 
 def code(stage: Stage) -> str | None:

@@ -120,7 +120,7 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
     else:
         print(outcome.output)
     if outcome.differs:
-        print("tacpipe: these differ from what is stored: " + "; ".join(outcome.differs), file=sys.stderr)
+        print(f"tacpipe: {outcome.describe_differences()}", file=sys.stderr)
         raise typer.Exit(FAILED)
 
 

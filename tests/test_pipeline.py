@@ -1,4 +1,5 @@
 import json
+import re
 import time
 from pathlib import Path
 
@@ -6,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 import tacpipe
-from tacpipe import directory
+from tacpipe import directory, processor
 from tacpipe.dataset import Shard
 from tacpipe.execution import named
 from tacpipe.hashing import digest, file_digest
@@ -297,6 +298,27 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
     failed = lab.call("scale data/r -o data/s --recompute-and-compare")
     assert failed.code == 1 and "trial-003.parquet" in failed.err
     assert lab.manifest("data/s") == before
+
+
+def test_a_difference_to_what_another_processor_or_number_of_threads_computed_names_them(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import toy_stages
+
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    monkeypatch.setattr(processor, "threads", lambda: 977)
+    same = lab.call("scale data/r -o data/s --jobs 1 --recompute-and-compare")
+    assert same.code == 0 and "977" not in same.err
+    honest = toy_stages.scale.function
+
+    def changed(params: toy_stages.Scale, recording: "Shard") -> pa.Table:
+        return honest(toy_stages.Scale(3), recording)
+
+    monkeypatch.setitem(toy_stages.scale.__dict__, "function", changed)
+    failed = lab.call("scale data/r -o data/s --jobs 1 --recompute-and-compare")
+    assert failed.code == 1
+    assert re.search(r"\(computed with other threads: \d+, now 977, which rounds differently\)$", failed.err.strip())
 
 
 def test_shards_are_linked_and_recordings_copied(lab: Lab) -> None:

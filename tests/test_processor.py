@@ -1,0 +1,62 @@
+"""What a record says of the processor and the threads that computed it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tacpipe import processor, provenance
+
+CPUINFO = """processor\t: 0
+model name\t: Zen 4
+flags\t\t: fpu avx avx2 fma avx512f rdpid
+
+processor\t: 1
+model name\t: another
+"""
+
+
+@pytest.fixture(autouse=True)
+def _forget() -> None:
+    processor._processor.cache_clear()
+
+
+def test_the_first_core_says_model_and_instructions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cpuinfo").write_text(CPUINFO)
+    monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
+    found = processor.here()
+    assert found["model"] == "Zen 4" and found["instructions"] == ["avx", "avx2", "fma", "avx512f"]
+    assert found["chosen"] == {"OPENBLAS_CORETYPE": "Haswell"}
+
+
+def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "none")
+    assert processor.here()["model"] and processor.here()["instructions"] == []
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
+    program = (
+        "from tacpipe import processor; before = processor.threads(); import torch; print(before, processor.threads())"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == [str(threads)] * 2
+
+
+def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
+    stored = provenance.of(1.0)
+    assert provenance.unlike(stored, provenance.of(2.0)) == []
+    other = {**stored, "device": "cuda", "processor": {**stored["processor"], "instructions": ["sve"], "threads": 977}}
+    found = provenance.unlike(other, stored)
+    assert [one.partition(":")[0] for one in found] == ["device", "instructions", "threads"]
+    assert found[0] == f"device: cuda, now {stored['device']}"
+
+
+def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
+    assert provenance.unlike({"threads": 2}, provenance.of(0.0)) == []
