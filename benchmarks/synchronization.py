@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tacpipe.registry import load
 from tacpipe.signals import holds, resampling
+from tacpipe.signals.clocks import fit_clock
 
 RATE_HZ, GAP_NS = 50.0, 50_000_000
 START_NS = 1_600_000_000_000_000_000
@@ -44,7 +45,7 @@ class Memory:
     def streams(self) -> tuple[str, ...]:
         return tuple(self.tables)
 
-    def table(self, stream: str) -> pa.Table:
+    def columns(self, stream: str) -> pa.Table:
         return self.tables[stream]
 
 
@@ -65,7 +66,20 @@ def streams(seconds: int, seed: int = 0) -> dict[str, Stream]:
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
     """Return how many times as long pandas takes, on a usual recording and on a long one."""
-    return [line for seconds in (60, 600) for line in _measure(seconds, rounds)]
+    return [*(line for seconds in (60, 600) for line in _measure(seconds, rounds)), _clock(rounds)]
+
+
+def _clock(rounds: int) -> timing.Line:
+    """Return how long the fit of a device's clock takes beside least squares, which late arrivals bend."""
+    rng = np.random.default_rng(0)
+    device_ns = np.arange(600_000) * 1_000_000  # ten minutes at 1 kHz
+    arrival_ns = START_NS + np.maximum.accumulate(device_ns + rng.exponential(5e5, len(device_ns)).astype(np.int64))
+    elapsed_ns = arrival_ns - START_NS
+    times = timing.interleaved(
+        {"fit": lambda: fit_clock(device_ns, arrival_ns), "polyfit": lambda: np.polyfit(device_ns, elapsed_ns, 1)},
+        rounds,
+    )
+    return timing.at_most("the clock of a device, 600,000 samples (numpy.polyfit)", times, "fit", "polyfit")
 
 
 def _measure(seconds: int, rounds: int) -> list[timing.Line]:

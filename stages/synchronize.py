@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from tacpipe.columns import Columns
     from tacpipe.dataset import Shard
 
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
@@ -24,6 +25,7 @@ AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples the
 MEDIAN_NS = (
     10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
 )
+BLOCK_BYTES = 1 << 26  # about as much of a stream's channels is interpolated at once
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,34 @@ class _Stream:
     """One stream of a recording, and when its samples were taken on the host's clock."""
 
     name: str
-    table: pa.Table
+    columns: Columns
     t_ns: NDArray[np.int64]  # (time,)
     held: NDArray[np.bool_]  # (time,)
     attributes: dict[str, Attribute] = field(default_factory=dict)  # what the fit of its clock gave
+    unwrapped: Mapping[str, NDArray[np.int32]] = field(default_factory=dict)  # channels whose counts had wrapped around
 
     @property
     def channels(self) -> list[str]:
-        return _channel_names(self.table)
+        return _channel_names(self.columns)
+
+    def field(self, name: str) -> pa.Field:
+        """The field of a channel: of one that was unwrapped as it is then."""
+        import pyarrow as pa
+
+        found = self.columns.schema.field(name)
+        return found.with_type(pa.int32()) if name in self.unwrapped else found
+
+    def values(self, name: str) -> NDArray[Any]:
+        """A channel of numbers (time,)."""
+        found = self.unwrapped.get(name)
+        return self.columns.column(name).to_numpy() if found is None else found
+
+    def at(self, name: str, rows: pa.Array) -> pa.Array:
+        """A channel of any type at some rows."""
+        import pyarrow as pa
+
+        found = self.unwrapped.get(name)
+        return self.columns.column(name).take(rows).combine_chunks() if found is None else pa.array(found).take(rows)
 
     @property
     def truth(self) -> bool:
@@ -67,12 +89,12 @@ def synchronize(params: Params, recording: Shard) -> Recording:
 
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
 
-    tables = {name: recording.table(name) for name in sorted(recording.streams) if name != EVENTS}
-    streams = {name: _stream(recording.name, name, table, params.clock) for name, table in tables.items()}
+    found = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
+    streams = {name: _stream(recording.name, name, columns, params.clock) for name, columns in found.items()}
     wanted = params.master or str(recording.attributes.get("master", ""))
-    master = streams[_master(recording.name, wanted, tables)]
+    master = streams[_master(recording.name, wanted, found)]
     grid_ns, rows = _grid(recording.name, params, streams, master)
-    columns: list[tuple[pa.Field, Any]] = [(master.table.schema.field("t_ns"), grid_ns)]
+    columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {"grid": params.grid, "grid_master": master.name}
     attributes["grid_rate_hz"] = params.rate_hz if params.grid == "uniform" else round(mean_rate_hz(grid_ns), 3)
     for name, stream in streams.items():
@@ -80,7 +102,7 @@ def synchronize(params: Params, recording: Shard) -> Recording:
         if params.unwrap:
             stream, wrapped = _unwrapped(stream)
             attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
-        columns += _channels(stream, tables[name].schema, grid_ns, exact)
+        columns += _channels(stream, grid_ns, exact)
         if not stream.truth:
             columns += _masks(stream, grid_ns, exact, round(params.gap_ms * 1e6))
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
@@ -90,31 +112,31 @@ def synchronize(params: Params, recording: Shard) -> Recording:
     return Recording(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
 
 
-def _stream(recording: str, name: str, table: pa.Table, clock: str) -> _Stream:
+def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:
     """Return a stream with its samples on the host's clock; ``clock`` says by which stamps."""
-    stream = _Stream(name, table, _stamps(recording, name, table), _held(table))
+    stream = _Stream(name, columns, _stamps(recording, name, columns), _held(columns))
     if clock == "arrival" or stream.truth:
         return stream
-    if DEVICE not in table.column_names:
+    if DEVICE not in columns.column_names:
         if clock == "device":
             raise TacpipeError(
                 f"Recording {recording}: stream {name!r} has no column {DEVICE}, and so no clock of a device. "
                 f"Take `--clock auto`, which uses the device's clock where there is one, or `--clock arrival`."
             )
         return stream
-    t_ns, attributes = _on_host_clock(recording, name, table, stream.t_ns)
+    t_ns, attributes = _on_host_clock(recording, name, columns, stream.t_ns)
     return replace(stream, t_ns=t_ns, attributes=attributes)
 
 
 def _on_host_clock(
-    recording: str, stream: str, table: pa.Table, arrival_ns: NDArray[np.int64]
+    recording: str, stream: str, columns: Columns, arrival_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], dict[str, Attribute]]:
     """Return when samples were taken by their device's clock, mapped to the host's, and what the fit gave."""
     import pyarrow as pa
 
     from tacpipe.signals.clocks import fit_clock, host_times
 
-    column = table.column(DEVICE)
+    column = columns.column(DEVICE)
     if column.null_count or not pa.types.is_integer(column.type):
         raise TacpipeError(
             f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
@@ -132,16 +154,16 @@ def _on_host_clock(
     }
 
 
-def _stamps(recording: str, stream: str, table: pa.Table) -> NDArray[np.int64]:
+def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
     """Return the stamps of a stream. Raises `TacpipeError` if there are none or where they run backwards."""
     import numpy as np
 
-    if "t_ns" not in table.column_names or not table.num_rows:
+    if "t_ns" not in columns.column_names or not columns.num_rows:
         raise TacpipeError(
             f"Recording {recording}: stream {stream!r} has no rows with t_ns; nothing can be brought onto a clock. "
             f"Exclude the recording with `tacpipe label --exclude`, or record it again."
         )
-    t_ns: NDArray[np.int64] = table.column("t_ns").to_numpy()
+    t_ns: NDArray[np.int64] = columns.column("t_ns").to_numpy()
     back = np.diff(t_ns) < 0
     if back.any():
         row = int(back.argmax()) + 1
@@ -152,16 +174,16 @@ def _stamps(recording: str, stream: str, table: pa.Table) -> NDArray[np.int64]:
     return t_ns
 
 
-def _master(recording: str, wanted: str, tables: Mapping[str, pa.Table]) -> str:
+def _master(recording: str, wanted: str, streams: Mapping[str, Columns]) -> str:
     """Return the name of the stream that sets the grid."""
     if wanted:
-        if wanted not in tables:
-            raise TacpipeError(f"Recording {recording} has no stream {wanted!r} to be master; it has {_list(tables)}.")
+        if wanted not in streams:
+            raise TacpipeError(f"Recording {recording} has no stream {wanted!r} to be master; it has {_list(streams)}.")
         return wanted
-    for name, table in tables.items():
-        if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in table.schema):
+    for name, columns in streams.items():
+        if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in columns.schema):
             return name
-    raise TacpipeError(f"Recording {recording} has no tactile stream; name the master among {_list(tables)}.")
+    raise TacpipeError(f"Recording {recording} has no tactile stream; name the master among {_list(streams)}.")
 
 
 def _grid(
@@ -196,48 +218,54 @@ def _unwrapped(stream: _Stream) -> tuple[_Stream, int]:
 
     from tacpipe.signals.wraps import unwrapped
 
-    table, wrapped = stream.table, 0
-    for position, kind in enumerate(table.schema):
+    changed: dict[str, NDArray[np.int32]] = {}
+    for kind in stream.columns.schema:
         tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
         if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
-            values = table.column(kind.name).to_numpy()
+            values = stream.columns.column(kind.name).to_numpy()
             found = unwrapped(values)
             if found is not values:
-                table = table.set_column(position, kind.with_type(pa.int32()), pa.array(found))
-                wrapped += 1
-    return replace(stream, table=table), wrapped
+                changed[kind.name] = found
+    return replace(stream, unwrapped=changed), len(changed)
 
 
 def _channels(
-    stream: _Stream, schema: pa.Schema, grid_ns: NDArray[np.int64], exact: NDArray[np.int64] | None
+    stream: _Stream, grid_ns: NDArray[np.int64], exact: NDArray[np.int64] | None
 ) -> list[tuple[pa.Field, Any]]:
-    """Return field and values of each channel on the grid, in the order of the table; ``schema`` is that recorded."""
+    """Return field and values of each channel on the grid, in the order of the stream."""
     import pyarrow as pa
 
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
-    table = stream.table
     if exact is not None:
         rows = pa.array(exact)
-        return [
-            (_field(stream, name, "none"), table.column(name).take(rows).combine_chunks()) for name in stream.channels
-        ]
+        return [(_field(stream, name, "none"), stream.at(name, rows)) for name in stream.channels]
     groups: dict[str, list[str]] = {}
     for name in stream.channels:
-        groups.setdefault(_method(table, name), []).append(name)
+        groups.setdefault(_method(stream.columns.schema, name), []).append(name)
     found: dict[str, tuple[pa.Field, Any]] = {}
     if "nearest" in groups:
         rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
         for name in groups.pop("nearest"):
-            found[name] = (_field(stream, name, "nearest"), table.column(name).take(rows).combine_chunks())
+            found[name] = (_field(stream, name, "nearest"), stream.at(name, rows))
     used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
         how = method.partition(" ")[0]
-        ordered = [members[i] for i in _order(stream.name, table, members)] if how == "slerp" else members
-        moved = _between_samples(stream, ordered, how, grid_ns, slice(None) if how == "median" else used)
-        for name, column in zip(ordered, moved.T, strict=True):
-            found[name] = _as_stored(_field(stream, name, how, _between(schema.field(name).type)), column)
+        rows = slice(None) if how == "median" else used
+        for some in _blocks(stream, members, how, len(grid_ns)):
+            for name, column in zip(some, _between_samples(stream, some, how, grid_ns, rows).T, strict=True):
+                kind = _between(stream.columns.schema.field(name).type)
+                found[name] = _as_stored(_field(stream, name, how, kind), column)
     return [found[name] for name in stream.channels]
+
+
+def _blocks(stream: _Stream, members: list[str], how: str, points: int) -> list[list[str]]:
+    """Return the channels that are interpolated at once: the four of a quaternion, else as many as fit a block."""
+    if how == "slerp":
+        return [[members[i] for i in _order(stream, members)]]
+    rows = len(stream.t_ns) if how == "median" else points
+    size = max(1, BLOCK_BYTES // (8 * max(1, rows)))
+    return [members[first : first + size] for first in range(0, len(members), size)]
 
 
 def _between_samples(
@@ -249,7 +277,7 @@ def _between_samples(
     from tacpipe.signals.resampling import linear, median_around, slerp
 
     t_ns = stream.t_ns[used]
-    values = np.stack([stream.table.column(name).to_numpy()[used] for name in names], axis=1)  # (time, channel)
+    values = np.stack([stream.values(name)[used] for name in names], axis=1)  # (time, channel)
     if how == "slerp":
         return slerp(t_ns, values.astype(np.float64), grid_ns)
     if how == "median":
@@ -301,27 +329,27 @@ def _rows_at(
     return rows if found else None
 
 
-def _held(table: pa.Table) -> NDArray[np.bool_]:
+def _held(columns: Columns) -> NDArray[np.bool_]:
     """Return which rows repeat the one before in all channels but labels, which are meant to stay."""
     import numpy as np
 
     from tacpipe.signals.holds import held_columns
 
-    names = [name for name in _channel_names(table) if _method(table, name) != "nearest"]
+    names = [name for name in _channel_names(columns) if _method(columns.schema, name) != "nearest"]
     if not names:
-        return np.zeros(table.num_rows, dtype=bool)
-    return held_columns([table.column(name).to_numpy() for name in names])
+        return np.zeros(columns.num_rows, dtype=bool)
+    return held_columns(columns.column(name).to_numpy() for name in names)
 
 
-def _channel_names(table: pa.Table) -> list[str]:
-    return [name for name in table.column_names if name != "t_ns"]
+def _channel_names(columns: Columns) -> list[str]:
+    return [name for name in columns.column_names if name != "t_ns"]
 
 
-def _method(table: pa.Table, name: str) -> str:
+def _method(schema: pa.Schema, name: str) -> str:
     """Return how a channel is interpolated: nearest, linear, median, or slerp and the name of its quaternion."""
     import pyarrow as pa
 
-    field = table.schema.field(name)
+    field = schema.field(name)
     metadata = field.metadata or {}
     quantity = metadata.get(b"quantity", b"").decode()
     number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
@@ -334,12 +362,13 @@ def _method(table: pa.Table, name: str) -> str:
     return "linear"
 
 
-def _order(stream: str, table: pa.Table, members: list[str]) -> list[int]:
+def _order(stream: _Stream, members: list[str]) -> list[int]:
     """Return the positions of x, y, z and w among the four components of a quaternion."""
-    components = [(table.schema.field(name).metadata or {}).get(b"component", b"").decode() for name in members]
+    fields = [stream.columns.schema.field(name) for name in members]
+    components = [(field.metadata or {}).get(b"component", b"").decode() for field in fields]
     if sorted(components) != ["w", "x", "y", "z"]:
         raise TacpipeError(
-            f"Stream {stream!r}: the orientation in {_list(members)} has the components {_list(components)}; a "
+            f"Stream {stream.name!r}: the orientation in {_list(members)} has the components {_list(components)}; a "
             f"quaternion needs x, y, z and w once each. Check the field metadata `component`."
         )
     return [components.index(part) for part in "xyzw"]
@@ -358,7 +387,7 @@ def _field(stream: _Stream, name: str, interpolation: str, kind: pa.DataType | N
     """Return the field of a channel on the grid: ``<stream>_<column>``, where it came from and how."""
     import pyarrow as pa
 
-    found = stream.table.schema.field(name)
+    found = stream.field(name)
     metadata = {**(found.metadata or {}), b"stream": stream.name, b"interpolation": interpolation}
     return pa.field(name if name.startswith(TRUTH) else f"{stream.name}_{name}", kind or found.type, metadata=metadata)
 

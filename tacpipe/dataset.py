@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import Arrays, Tensors
+    from tacpipe.columns import Columns
 
 Reader = Callable[[str, str], bytes]  # digest, path within the dataset directory -> verified content
 
@@ -64,11 +65,24 @@ class Shard:
         """Return a stream as an arrow table with field metadata; its bytes are verified first."""
         from tacpipe.tables import from_parquet
 
+        return from_parquet(self._content(stream), columns)
+
+    def columns(self, stream: str = "") -> Columns:
+        """Return a stream whose columns are decoded when asked for, some at a time; its bytes are verified first.
+
+        It reads like an arrow table (``schema``, ``num_rows``, ``column_names``, ``column(name)``), and of a long
+        recording it takes a fraction of the memory.
+        """
+        from tacpipe.columns import Columns
+
+        return Columns(self._content(stream))
+
+    def _content(self, stream: str) -> bytes:
         if stream not in self._shards:
             raise UsageError(
                 f"Recording {self.name} has no stream {stream!r}; it has {', '.join(map(repr, self.streams))}."
             )
-        return from_parquet(self._read(self._shards[stream]["digest"], shard_path(self.name, stream)), columns)
+        return self._read(self._shards[stream]["digest"], shard_path(self.name, stream))
 
 
 class LazyFiles(Mapping[str, bytes]):

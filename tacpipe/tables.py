@@ -70,20 +70,42 @@ def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Tab
     Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there or more than
     the memory that is left.
     """
-    try:
-        file = pq.ParquetFile(pa.BufferReader(owned(content)))
-        needed = claimed(file.schema, content, columns)
-    except BROKEN as error:
-        raise _damaged(content, error) from error
-    memory.require(needed, f"A Parquet file of {len(content)} bytes", error=DamagedError)
-    try:
-        table = file.read(columns=list(columns) if columns is not None else None)
-        stored = (file.metadata.metadata or {}).get(_KEY)
-        if stored is None:
-            return table
-        return table.cast(_with_fields(table.schema, file.schema_arrow.names, json.loads(stored)))
-    except BROKEN as error:
-        raise _damaged(content, error) from error
+    return ParquetTable(content).read(columns)
+
+
+class ParquetTable:
+    """The table of a Parquet file's bytes, of which columns are decoded when asked for; raises as `from_parquet` does."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        try:
+            self._file = pq.ParquetFile(pa.BufferReader(owned(content)))
+            stored = (self._file.metadata.metadata or {}).get(_KEY)
+            self._fields = None if stored is None else json.loads(stored)
+            self.schema = self._with_fields(self._file.schema_arrow)
+        except BROKEN as error:
+            raise _damaged(content, error) from error
+
+    @property
+    def num_rows(self) -> int:
+        """How many rows the file claims."""
+        return int(self._file.metadata.num_rows)
+
+    def read(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return the table, of ``columns`` alone where they are named, with field metadata."""
+        try:
+            needed = claimed(self._file.schema, self._content, columns)
+        except BROKEN as error:
+            raise _damaged(self._content, error) from error
+        memory.require(needed, f"A Parquet file of {len(self._content)} bytes", error=DamagedError)
+        try:
+            table = self._file.read(columns=list(columns) if columns is not None else None)
+            return table if self._fields is None else table.cast(self._with_fields(table.schema))
+        except BROKEN as error:
+            raise _damaged(self._content, error) from error
+
+    def _with_fields(self, schema: pa.Schema) -> pa.Schema:
+        return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
 
 
 def owned(content: bytes) -> pa.Buffer:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,13 @@ def held(values: NDArray[Any]) -> NDArray[np.bool_]:
     return held_columns(list(values.T))
 
 
-def held_columns(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
+def held_columns(columns: Iterable[NDArray[Any]]) -> NDArray[np.bool_]:
     """Return the same as `held` for channels that lie apart, each (time,); stops at the first that leaves none held."""
-    repeated = np.ones(len(columns[0]) if columns else 0, dtype=bool)
-    repeated[:1] = False
-    for column in columns:
+    repeated = np.zeros(0, dtype=bool)
+    for number, column in enumerate(columns):
+        if not number:
+            repeated = np.ones(len(column), dtype=bool)
+            repeated[:1] = False
         repeated[1:] &= column[1:] == column[:-1]
         if not repeated.any():
             break

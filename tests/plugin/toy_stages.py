@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -66,6 +67,7 @@ class Scale:
     factor: int = 2  # that every value is multiplied by
     refuse: int = -1  # a first value that counts as bad
     pause_s: float = 0.0  # how long each recording takes
+    gate: str = ""  # a file, without which no recording is done
 
 
 @stage(version=1)
@@ -75,6 +77,8 @@ def scale(params: Scale, recording: Shard) -> pa.Table:
     import pyarrow.compute as pc
 
     time.sleep(params.pause_s)
+    while params.gate and not os.path.exists(params.gate):  # noqa: PTH110
+        time.sleep(0.01)
     table = recording.table("left")
     if table.num_rows and table["x"][0].as_py() == params.refuse:
         raise TacpipeError(f"It begins with {params.refuse}, which this stage refuses.")

@@ -105,7 +105,7 @@ def test_processes_that_ask_for_different_keys_all_get_theirs_while_garbage_is_c
 @pytest.mark.parametrize("size", CROWDS)
 def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, size: int) -> None:
     scene.run("simulate toy --trials 6 --rows 4 -o data/r")
-    commands = [f"scale data/r -o data/s{number} --factor {number % 4} --pause-s 0.1" for number in range(size)]
+    commands = [f"scale data/r -o data/s{number} --factor {number % 4} --gate gate" for number in range(size)]
     crowd = [scene.start(f"{words} --jobs 1") for words in commands]
     awaited(lambda: len(list(scene.project.glob(".tacpipe/leases/*"))) > size // 2)
     for running in crowd:
@@ -113,6 +113,7 @@ def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, siz
     for running in crowd:
         assert kills.ended(running) in (0, -signal.SIGKILL)
     assert list(scene.project.glob(".tacpipe/leases/*")), "none of them held a lease"
+    (scene.project / "gate").touch()
     for words in (*commands, "label data/r trial-000 --set material=foam", "store gc", "store repair"):
         at_once = scene.start(words, TACPIPE_LOCK_TIMEOUT_S="0")
         assert kills.ended(at_once) == 0, at_once.out.read_text()
@@ -124,13 +125,14 @@ def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, siz
 
 def test_who_waits_for_a_stopped_process_is_told_whom_and_gives_up(scene: Scene) -> None:
     scene.run("simulate toy --trials 1 --rows 4 -o data/r")
-    words = "scale data/r --pause-s 0.5 -o data/s"
+    words = "scale data/r --gate gate -o data/s"
     first = scene.start(words)
     awaited(lambda: [path for path in scene.project.glob(".tacpipe/leases/*") if not path.name.startswith("run-")])
     os.killpg(first.pid, signal.SIGSTOP)
     second = scene.start(f"{words}2", TACPIPE_LOCK_TIMEOUT_S="3")
     code, said = kills.ended(second), second.out.read_text()
     os.killpg(first.pid, signal.SIGCONT)
+    (scene.project / "gate").touch()
     assert code == 6
     waiting, gave_up = said.splitlines()
     assert waiting.startswith(f"tacpipe: waiting for process {first.pid} on {os.uname().nodename} (tacpipe {words})")

@@ -101,7 +101,7 @@ def test_synchronize_tells_the_clock_masks_what_was_lost_and_keeps_the_stamps(xe
     class Shard:
         name, attributes, streams = "r", {"master": "device"}, ("device",)
 
-        def table(self, stream: str) -> pa.Table:
+        def columns(self, stream: str) -> pa.Table:
             return xela.table
 
     stage = registry.load("synchronize")

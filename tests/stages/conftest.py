@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 import pyarrow as pa
 import pytest
 
+from tacpipe.columns import Columns
 from tacpipe.stage import Attribute
+from tacpipe.tables import to_parquet
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,9 @@ class FakeShard:
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
         return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
+
+    def columns(self, stream: str = "") -> Columns:
+        return Columns(to_parquet(self.tables[stream]))
 
 
 @pytest.fixture

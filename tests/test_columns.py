@@ -1,0 +1,48 @@
+"""Columns of a stream that are decoded some at a time are those of its table."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tacpipe.columns import Columns
+from tacpipe.errors import DamagedError
+from tacpipe.tables import from_parquet, to_parquet
+from tests.any_table import bits, tables
+
+
+@given(tables(), st.sampled_from([1, 100, 10_000, 1 << 26]), st.randoms(use_true_random=False))
+def test_each_column_is_that_of_the_table_whatever_the_order_and_the_size_of_a_block(
+    table: pa.Table, block_bytes: int, chance: Random
+) -> None:
+    content = to_parquet(table)
+    whole, found = from_parquet(content), Columns(content, block_bytes)
+    assert found.schema.equals(whole.schema, check_metadata=True)
+    assert (found.num_rows, found.column_names) == (whole.num_rows, whole.column_names)
+    names = chance.choices(whole.column_names, k=2 * whole.num_columns) if whole.num_columns else []
+    for name in names:
+        assert bits(pa.table({name: found.column(name)})) == bits(pa.table({name: whole.column(name)}))
+
+
+def test_a_stream_that_is_larger_than_a_block_is_never_decoded_whole() -> None:
+    rows, names = 1000, [f"x{number}" for number in range(40)]
+    content = to_parquet(pa.table({name: pa.array(range(rows), pa.int32()) for name in names}))
+    found = Columns(content, block_bytes=3 * 4 * rows)
+    before = pa.total_allocated_bytes()
+    for name in names:
+        assert found.column(name).to_pylist() == list(range(rows))
+        assert pa.total_allocated_bytes() - before < 5 * 4 * rows
+
+
+def test_a_column_that_is_not_there_is_a_key_error() -> None:
+    with pytest.raises(KeyError):
+        Columns(to_parquet(pa.table({"x": pa.array([1], pa.int8())}))).column("y")
+
+
+def test_bytes_that_are_no_parquet_file_are_damage() -> None:
+    with pytest.raises(DamagedError):
+        Columns(b"PAR1 nothing of the kind PAR1")
