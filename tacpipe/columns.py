@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from tacpipe.tables import ParquetTable
 
-BLOCK_BYTES = 1 << 26  # about as much is decoded at once
+BLOCK_BYTES = 1 << 24  # about as much is decoded at once
 _TEXT_BYTES = 16  # taken for a text, whose length is not known before it is read
 
 
@@ -39,9 +39,14 @@ class Columns:
         """Return one column. Raises `KeyError` where there is none of this name."""
         if name not in self._decoded.column_names:
             block = self._blocks[name]
-            self._decoded = pa.table({})  # before the next block is decoded
+            self.forget()  # before the next block is decoded
             self._decoded = self._file.read(block)
         return self._decoded.column(name)
+
+    def forget(self) -> None:
+        """Let go of what was decoded last, unless it is the whole of a small stream."""
+        if self._decoded.num_columns < len(self._blocks):
+            self._decoded = pa.table({})
 
 
 def _blocks(schema: pa.Schema, rows: int, block_bytes: int) -> list[Sequence[str]]:

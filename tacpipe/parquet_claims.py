@@ -37,7 +37,7 @@ class Page(NamedTuple):
     encoding: int
 
 
-def claimed(schema: ParquetSchema, content: bytes, columns: Collection[str] | None = None) -> int:
+def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None) -> int:
     """Return how many bytes the ``columns`` of a file (None: all) are in memory by what they claim, at least.
 
     The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
@@ -96,7 +96,7 @@ def _texts(pages: Collection[Page]) -> int:
     return total
 
 
-def _pages(content: bytes, place: int, stop: int) -> Iterator[Page]:
+def _pages(content: bytes | memoryview, place: int, stop: int) -> Iterator[Page]:
     while place < stop:
         usual = _USUAL.match(content, place, stop)
         if usual is not None:
@@ -121,7 +121,7 @@ def _whole(value: Any) -> int:
     return value
 
 
-def _varint(text: bytes) -> int:
+def _varint(text: bytes | memoryview) -> int:
     """Return a number of Thrift's compact protocol: seven bits a byte, the low ones first, in zigzag.
 
     >>> _varint(bytes([0x96, 0x01])), _varint(bytes([1]))
@@ -133,7 +133,7 @@ def _varint(text: bytes) -> int:
     return (number >> 1) ^ -(number & 1)
 
 
-def _struct(content: bytes, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
+def _struct(content: bytes | memoryview, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
     """Return the fields of a structure by number, whole numbers and structures alone, and where it ends."""
     found: dict[int, Any] = {}
     number = 0
@@ -155,7 +155,7 @@ def _struct(content: bytes, place: int, stop: int, depth: int) -> tuple[dict[int
     raise ValueError("its footer or a page's header was cut off")
 
 
-def _value(content: bytes, place: int, stop: int, kind: int, depth: int) -> tuple[Any, int]:
+def _value(content: bytes | memoryview, place: int, stop: int, kind: int, depth: int) -> tuple[Any, int]:
     if kind in (1, 2):  # true, false
         return kind == 1, place
     if kind == 3:
@@ -174,7 +174,7 @@ def _value(content: bytes, place: int, stop: int, kind: int, depth: int) -> tupl
     raise ValueError("its footer or a page's header is none")
 
 
-def _list(content: bytes, place: int, stop: int, depth: int) -> tuple[list[Any], int]:
+def _list(content: bytes | memoryview, place: int, stop: int, depth: int) -> tuple[list[Any], int]:
     head, place = _byte(content, place, stop)
     count, kind = head >> 4, head & 15
     if count == 15:
@@ -189,13 +189,13 @@ def _list(content: bytes, place: int, stop: int, depth: int) -> tuple[list[Any],
     return found, place
 
 
-def _byte(content: bytes, place: int, stop: int) -> tuple[int, int]:
+def _byte(content: bytes | memoryview, place: int, stop: int) -> tuple[int, int]:
     if place >= stop:
         raise ValueError("a page's header was cut off")
     return content[place], place + 1
 
 
-def _number(content: bytes, place: int, stop: int) -> tuple[int, int]:
+def _number(content: bytes | memoryview, place: int, stop: int) -> tuple[int, int]:
     end = place
     while end < stop and content[end] & 128:
         end += 1

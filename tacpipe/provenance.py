@@ -30,7 +30,7 @@ def _here() -> dict[str, Any]:
     git = ["git", "rev-parse", "HEAD"]
     try:
         commit = subprocess.run(git, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
-    except OSError:
+    except (OSError, subprocess.SubprocessError):  # no git, or none that answers in time
         commit = ""
     return {
         "libraries": libraries,

@@ -77,14 +77,14 @@ class ParquetTable:
     """The table of a Parquet file's bytes, of which columns are decoded when asked for; raises as `from_parquet` does."""
 
     def __init__(self, content: bytes) -> None:
-        self._content = content
+        self._content = owned(content)
         try:
-            self._file = pq.ParquetFile(pa.BufferReader(owned(content)))
+            self._file = pq.ParquetFile(pa.BufferReader(self._content))
             stored = (self._file.metadata.metadata or {}).get(_KEY)
             self._fields = None if stored is None else json.loads(stored)
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
-            raise _damaged(content, error) from error
+            raise _damaged(len(content), error) from error
 
     @property
     def num_rows(self) -> int:
@@ -94,15 +94,15 @@ class ParquetTable:
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the table, of ``columns`` alone where they are named, with field metadata."""
         try:
-            needed = claimed(self._file.schema, self._content, columns)
+            needed = claimed(self._file.schema, memoryview(self._content).cast("B"), columns)
         except BROKEN as error:
-            raise _damaged(self._content, error) from error
-        memory.require(needed, f"A Parquet file of {len(self._content)} bytes", error=DamagedError)
+            raise _damaged(self._content.size, error) from error
+        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=DamagedError)
         try:
             table = self._file.read(columns=list(columns) if columns is not None else None)
             return table if self._fields is None else table.cast(self._with_fields(table.schema))
         except BROKEN as error:
-            raise _damaged(self._content, error) from error
+            raise _damaged(self._content.size, error) from error
 
     def _with_fields(self, schema: pa.Schema) -> pa.Schema:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
@@ -119,8 +119,8 @@ def owned(content: bytes) -> pa.Buffer:
     return sink.getvalue()
 
 
-def _damaged(content: bytes, error: Exception) -> DamagedError:
-    return DamagedError(f"These {len(content)} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
+def _damaged(size: int, error: Exception) -> DamagedError:
+    return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
 
 
 def _held_share(table: pa.Table) -> float:

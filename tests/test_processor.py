@@ -58,5 +58,15 @@ def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
     assert found[0] == f"device: cuda, now {stored['device']}"
 
 
+def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hangs(*_: object, **__: object) -> None:
+        raise subprocess.TimeoutExpired("git", 5)
+
+    monkeypatch.setattr(subprocess, "run", hangs)
+    provenance._here.cache_clear()
+    assert provenance.of(0.0)["git_commit"] is None
+    provenance._here.cache_clear()
+
+
 def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
     assert provenance.unlike({"threads": 2}, provenance.of(0.0)) == []

@@ -15,11 +15,13 @@ import pyarrow as pa
 import pytest
 
 from tacpipe import registry
+from tacpipe.columns import Columns
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing
 from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.signals.clocks import fit_clock, host_times
+from tacpipe.tables import to_parquet
 from tests.sensors import made
 
 MINUTES, SKEW_PPM, OFFSET_S = 10, 50.0, 12.345
@@ -101,8 +103,8 @@ def test_synchronize_tells_the_clock_masks_what_was_lost_and_keeps_the_stamps(xe
     class Shard:
         name, attributes, streams = "r", {"master": "device"}, ("device",)
 
-        def columns(self, stream: str) -> pa.Table:
-            return xela.table
+        def columns(self, stream: str) -> Columns:
+            return Columns(to_parquet(xela.table))
 
     stage = registry.load("synchronize")
     made: Any = stage(stage.params(), Shard())

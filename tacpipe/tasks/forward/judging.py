@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,16 +48,20 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         check_rate(track, forecaster)
         trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
         starts = track.starts(forecaster.context, forecaster.horizon)
-        forecasts = [np.zeros((0, forecaster.horizon, len(forecaster.codec.latents)), np.float32)]
+        steps = [step for step in TOLD_STEPS if step <= forecaster.horizon]
+        stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
         if not trial.seen:
             loads.begin(track)
+        begins = 0
         for some in told(forecaster, track, starts):
             trial.add(some.predictions, some.truth, forecaster.feature_half)
-            forecasts.append(some.features)
+            ends = begins + len(some.now)
+            stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
+            begins = ends
             if not trial.seen:
                 loads.add(some)
-        forecast, attributes = np.concatenate(forecasts), {**shard.attributes, "seen": trial.seen}
-        kept[name] = Recording(_prediction_table(forecaster, track, starts, forecast), attributes)
+        attributes = {**shard.attributes, "seen": trial.seen}
+        kept[name] = Recording(_prediction_table(forecaster, track, starts, steps, stored), attributes)
         trials.append(trial)
     groups = scorecard.channel_groups(forecaster.codec.layout)
     tree = scorecard.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
@@ -75,18 +79,22 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     return Result(kept, files)
 
 
-def _prediction_table(forecaster: Forecaster, track: Track, starts: NDArray[np.int64], forecast: Floats) -> pa.Table:
-    """Return one row a window: the time at which its prediction is available, the features then and those predicted."""
+def _prediction_table(
+    forecaster: Forecaster, track: Track, starts: NDArray[np.int64], steps: Sequence[int], stored: NDArray[np.float32]
+) -> pa.Table:
+    """Return one row a window: the time at which its prediction is available, the features then and those predicted.
+
+    ``stored`` (step, feature, window) becomes the columns without a copy.
+    """
     now = starts + forecaster.context - 1
     columns = [track.t_ns[now], track.contact[now].astype(np.int32)]
     fields = [
         pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"}),
         pa.field("contact", pa.int32(), metadata={"quantity": "label"}),
     ]
-    steps = [0, *(step for step in TOLD_STEPS if step <= forecaster.horizon)]
     for index, name in enumerate(forecaster.codec.latents):
-        for step in steps:
-            columns.append(forecast[:, step - 1, index].astype(np.float32) if step else track.latent[now, index])
+        columns += [track.latent[now, index], *stored[:, index]]
+        for step in (0, *steps):
             about = {"quantity": "latent", "step": str(step)}
             fields.append(pa.field(f"{name}_t{step}" if step else name, pa.float32(), metadata=about))
     arrays = [pa.array(values, field.type) for values, field in zip(columns, fields, strict=True)]

@@ -46,11 +46,14 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
         track = tracks.track(shard, forecaster.codec)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
-        parts: list[Floats] = [np.zeros((0, len(steps), len(forecaster.codec.channels)))]
-        wanted = [step - 1 for step in steps]
-        parts += [some.count[:, wanted] for some in forecasts(forecaster, track, starts)]
+        counts = np.empty((len(steps), len(forecaster.codec.channels), len(starts)), np.float32)
+        wanted, begins = [step - 1 for step in steps], 0
+        for some in forecasts(forecaster, track, starts):
+            ends = begins + len(some.count)
+            counts[..., begins:ends] = some.count[:, wanted].transpose(1, 2, 0)
+            begins = ends
         t_ns = track.t_ns[starts + forecaster.context - 1]
-        found[name] = _table(forecaster, t_ns, np.concatenate(parts), steps)
+        found[name] = _table(forecaster, t_ns, counts, steps)
     return found
 
 
@@ -70,13 +73,15 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
 
 
-def _table(forecaster: Forecaster, t_ns: NDArray[np.int64], counts: Floats, steps: Sequence[int]) -> pa.Table:
-    """Return the table of predicted ``counts`` (window, step, channel)."""
+def _table(
+    forecaster: Forecaster, t_ns: NDArray[np.int64], counts: NDArray[np.float32], steps: Sequence[int]
+) -> pa.Table:
+    """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]
     for channel, name in enumerate(forecaster.codec.channels):
         for index, step in enumerate(steps):
             about = {"quantity": "prediction", "unit": "count", "step": str(step), **forecaster.codec.layout[channel]}
             fields.append(pa.field(f"{name}_t{step}", pa.float32(), metadata=about))
-            columns.append(pa.array(counts[:, index, channel].astype(np.float32)))
+            columns.append(pa.array(counts[index, channel]))
     return pa.Table.from_arrays(columns, schema=pa.schema(fields))

@@ -1,0 +1,189 @@
+"""What runs inside User-mode Linux, as its first process: commands on a logged disk, or looks at disks that lost power.
+
+Each answer is a line, ``RESULT`` and JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import io
+import json
+import os
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+DISK, LOG, PLACE = "/dev/ubda", "/dev/ubdb", Path("/run/disk")
+FINIT_MODULE = 313  # of x86-64's system calls
+POWER_OFF = 0x4321FEDC  # of <linux/reboot.h>
+STEPS = {  # mark that is set once the command has returned, and the command
+    "ingested": "ingest numbers src -o data/recordings --jobs 1",
+    "labelled": "label data/recordings a --set material=foam",
+    "scaled": "scale data/recordings -o data/scaled --jobs 1",
+    "pushed": "store push remote data/recordings",
+    "appended": "ingest numbers more -o data/recordings --jobs 1",
+}
+FIRST, MORE = ("a", "b", "c"), ("d",)
+libc = ctypes.CDLL(None, use_errno=True)
+
+
+def values(name: str) -> list[int]:
+    """Return what the raw file of a recording holds."""
+    return [ord(name) + number for number in range(2000)]
+
+
+def boot() -> None:
+    """Mount what a first process needs."""
+    for kind, place in (("proc", "/proc"), ("sysfs", "/sys"), ("devtmpfs", "/dev"), ("tmpfs", "/run")):
+        subprocess.run(["mount", "-t", kind, kind, place], check=False, capture_output=True)
+    for name in ("disk", "tmp", "home"):
+        Path("/run", name).mkdir()
+    os.environ |= {"HOME": "/run/home", "TMPDIR": "/run/tmp", "PYTHONDONTWRITEBYTECODE": "1"}
+    os.environ |= {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
+
+
+def load_module(path: str) -> None:
+    """Load a module of the kernel."""
+    handle = os.open(path, os.O_RDONLY)
+    if libc.syscall(FINIT_MODULE, handle, b"", 0):
+        raise OSError(ctypes.get_errno(), path)
+    os.close(handle)
+
+
+def run(*words: str) -> None:
+    """Run a program that must succeed."""
+    ran = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, f"{words}: {ran.stdout} {ran.stderr}"
+
+
+def tacpipe(command: str, **environment: str) -> tuple[int, str]:
+    """Run a command in this process; return its exit code and what it printed."""
+    from tacpipe import cli
+
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        before = dict(os.environ)
+        os.environ.update(environment)
+        try:
+            code = cli.answer(command.split())
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+    return code, printed.getvalue()
+
+
+def record(kind: str, modules: str) -> dict[str, Any]:
+    """Run the steps on a disk whose writes are logged, with a mark after each."""
+    for name in ("dm-mod", "dm-log-writes"):
+        load_module(f"{modules}/{name}.ko")
+    sectors = Path("/sys/block/ubda/size").read_text().strip()
+    run("dmsetup", "create", "logged", "--noudevsync", "--table", f"0 {sectors} log-writes {DISK} {LOG}")
+    run("mount", "-t", kind, "/dev/dm-0", str(PLACE))
+    project = PLACE / "project"
+    for folder, names in (("src", FIRST), ("more", MORE)):
+        (project / folder).mkdir(parents=True)
+        for name in names:
+            (project / folder / f"{name}.txt").write_text(" ".join(map(str, values(name))))
+    (project / ".tacpipe").mkdir()
+    os.sync()
+    os.chdir(project)
+    mark("prepared")
+    for name, command in STEPS.items():
+        code, printed = tacpipe(command)
+        assert code == 0, printed
+        mark(name)
+    os.sync()
+    return {"recorded": kind}
+
+
+def mark(name: str) -> None:
+    """Note in the log that all before was answered."""
+    run("dmsetup", "message", "logged", "0", "mark", name)
+
+
+def check(kind: str, disks: list[list[str]]) -> None:
+    """Print a line for each disk: what was wrong there, if anything."""
+    for number, passed in enumerate(disks):
+        PLACE.with_name(f"disk{number}").mkdir()
+        reading, writing = os.pipe()
+        child = os.fork()
+        if not child:
+            disk, place = f"/dev/ubd{chr(ord('a') + number)}", PLACE.with_name(f"disk{number}")
+            answer = apart(lambda: survived(kind, disk, place, passed))  # noqa: B023
+            os.write(writing, json.dumps(answer).encode())
+            os._exit(0)
+        os.close(writing)
+        with os.fdopen(reading, "rb") as told:
+            answer = json.loads(told.read())
+        os.waitpid(child, 0)
+        print("RESULT", json.dumps({"passed": passed, **answer}), flush=True)
+
+
+def apart(what: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what a function returns, or the error that it raised."""
+    try:
+        return what()
+    except BaseException:
+        return {"wrong": traceback.format_exc()[-3000:]}
+
+
+def survived(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, Any]:
+    """Look at a disk after a loss of power: what had been answered is there, nothing wrong is served, all can go on."""
+    import tacpipe as api
+    from tacpipe.errors import TacpipeError
+
+    run("mount", "-t", kind, disk, str(place))  # which replays the file system's journal
+    os.chdir(place / "project")
+    if "ingested" in passed:
+        names = {*FIRST, *(MORE if "appended" in passed else ())}
+        held(api.open("data/recordings"), names, labelled="labelled" in passed)
+    for path in ("data/recordings", "data/scaled"):
+        with contextlib.suppress(TacpipeError):
+            dataset = api.open(path)
+            for name, shard in dataset.shards.items():
+                with contextlib.suppress(TacpipeError):
+                    factor = 2 if path == "data/scaled" else 1
+                    found = shard.table("left" if factor == 1 else "").column("x").to_pylist()
+                    assert found == [factor * value for value in values(name)], f"{path} {name} serves something else"
+    code, printed = tacpipe("store verify")
+    assert code in (0, 4), printed
+    assert code == 0 or "missing" in printed, printed
+    if "pushed" in passed:
+        code, printed = tacpipe("store verify", TACPIPE_STORE=str(place / "project/remote"))
+        assert code == 0, f"the remote: {printed}"
+    for command in STEPS.values():
+        code, printed = tacpipe(command)
+        assert code == 0, f"{command}: {printed}"
+    held(api.open("data/recordings"), {*FIRST, *MORE}, labelled=True)
+    code, printed = tacpipe("store verify")
+    assert code == 0, printed
+    return {"wrong": ""}
+
+
+def held(dataset: Any, names: set[str], *, labelled: bool) -> None:
+    """Expect recordings with all their values, and the label that was set by hand."""
+    assert names <= set(dataset.shards), f"{sorted(dataset.shards)} of {sorted(names)}"
+    for name, shard in dataset.shards.items():
+        assert shard.table("left").column("x").to_pylist() == values(name), name
+    if labelled:
+        assert dataset.shards["a"].attributes.get("material") == "foam", dict(dataset.shards["a"].attributes)
+
+
+def main() -> None:
+    """Do as the file that is named first says, then turn the power off."""
+    boot()
+    given = json.loads(Path(sys.argv[1]).read_text())
+    if "modules" in given:
+        print("RESULT", json.dumps(apart(lambda: record(given["kind"], given["modules"]))), flush=True)
+    else:
+        check(given["kind"], given["disks"])
+    os.sync()
+    libc.reboot(POWER_OFF)
+
+
+if __name__ == "__main__":
+    main()
