@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tacpipe import replacing
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.files import sync_folder, sync_folders, write_whole
+from tacpipe.files import listed, sync_folder, sync_folders, walk, write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import MissingError, Store
@@ -82,13 +82,14 @@ def publish_alone(
 
 def sweep(directory: Path) -> None:
     """Remove what a process left that was killed while it wrote here."""
-    for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
+    folders = [directory, *(path for path in listed(directory) if path.is_dir() and not path.is_symlink())]
+    for draft in [draft for folder in folders for draft in listed(folder, f".*{_DRAFT}")]:
         draft.unlink(missing_ok=True)
 
 
 def sweep_beside(path: Path) -> None:
     """Do as `sweep` for what was to become the file ``path``; what else lies in its folder is not ours."""
-    for draft in path.parent.glob(f".{glob.escape(path.name[:100])}.*{_DRAFT}"):
+    for draft in listed(path.parent, f".{glob.escape(path.name[:100])}.*{_DRAFT}"):
         draft.unlink(missing_ok=True)
 
 
@@ -146,7 +147,8 @@ def check_output(store: Store, directory: Path) -> None:
         raise UsageError(f"{directory} lies within the dataset {around}. Give -o a directory outside of it.")
     if not directory.is_dir():
         return
-    for path in directory.rglob("*"):  # a project that was moved: its shards are known, its path is not
+    below = (Path(place, name) for place, _, names in walk(directory, links=False) for name in names)
+    for path in below:  # a project that was moved: its shards are known, its path is not
         if path.name == NAME and path.is_file():
             raise UsageError(f"{directory} holds the dataset {path.parent}. Give -o a directory of its own.")
         if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):

@@ -14,6 +14,7 @@ from typing import Any
 from tacpipe import extras, failures
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
+from tacpipe.files import listed
 from tacpipe.stage import Stage
 
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
@@ -31,7 +32,7 @@ def entry_points() -> dict[str, dict[str, str]]:
         for file in _entry_point_files(folder):
             try:
                 text = file.read_text(encoding="utf-8")
-            except OSError:
+            except (FileNotFoundError, NotADirectoryError, PermissionError):
                 continue
             if "[tacpipe." not in text:
                 continue
@@ -46,13 +47,12 @@ def entry_points() -> dict[str, dict[str, str]]:
 
 
 def _entry_point_files(folder: str) -> list[Path]:
-    if not folder or not folder.endswith("-packages"):
-        pattern = "*.egg-info/entry_points.txt"
-        places = [Path(folder or ".")]
-    else:
-        pattern = "*.dist-info/entry_points.txt"
-        places = [Path(folder)]
-    return [file for place in places for file in place.glob(pattern)]
+    """Return where the entry points of what is installed in a folder may be."""
+    pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
+    try:
+        return [found / "entry_points.txt" for found in listed(Path(folder or "."), pattern)]
+    except PermissionError:  # nothing can be imported from there either: Python passes over such a folder too
+        return []
 
 
 @functools.cache
