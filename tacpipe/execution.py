@@ -256,7 +256,7 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
     yield found
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
-            raise TacpipeError(f"{path} changed while it was read. Run the same command again.")
+            raise StorageError(f"{path} changed while it was read. Run the same command again.")
 
 
 def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
