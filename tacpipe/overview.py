@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from tacpipe import execution, model_overview
+from tacpipe import execution, model_overview, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.headline import counted
@@ -118,8 +118,8 @@ def to_text(value: dict[str, Any], *, full: bool = False) -> str:
     told = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
     if value["kind"] in told:
         made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        return "\n".join([*told[value["kind"]](value), *_files(value), made])
-    return "\n".join(_recordings_text(value, full))
+        return terminal.lines([*told[value["kind"]](value), *_files(value), made])
+    return terminal.lines(_recordings_text(value, full))
 
 
 def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:

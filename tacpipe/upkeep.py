@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution
+from tacpipe import execution, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
 from tacpipe.files import walk, write_whole
@@ -181,7 +181,7 @@ def status_text(value: dict[str, Any]) -> str:
         for root in value["roots"]
     ]
     lines += [f"  at work: process {note.get('pid')} on {note.get('host')}" for note in value["running"]]
-    return "\n".join(lines)
+    return terminal.lines(lines)
 
 
 def _find(root: dict[str, Any]) -> manifest_of.Found | None:
