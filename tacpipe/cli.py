@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import extras, failures, interruption, places, terminal
+from tacpipe import extras, failures, interruption, memory, places, terminal
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.files import told
 
@@ -70,10 +70,17 @@ def main() -> None:
     code = INTERRUPTED
     try:
         terminal.prepare()
+        memory.guard()
         interruption.heed()
         code = _printed(answer(sys.argv[1:]))
     except KeyboardInterrupt:  # as it began, or after it was done
         interruption.tell()
+    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be told apart
+        short = memory.shortage(error)
+        if short is None:
+            raise
+        _complain(str(short))
+        code = FAILED
     sys.exit(interruption.done(code))
 
 
@@ -104,10 +111,10 @@ def answer(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         return DONE
     except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
-        code, sentence = FAILED, told(error)
+        code, sentence = FAILED, str(memory.shortage(error) or told(error))
         _complain(sentence)
     except Exception as error:
-        found = failures.text(error)
+        found = str(memory.shortage(error) or "") or failures.text(error)
         if found is None and not interruption.wished():
             raise
         code, sentence = FAILED, str(found)

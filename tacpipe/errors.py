@@ -43,6 +43,10 @@ class StorageError(TacpipeError):
     """The disk or the store failed, which says nothing of what was to be stored."""
 
 
+class ShortageError(StorageError):
+    """The computer ran out of memory, threads or processes, which says nothing of what was worked on."""
+
+
 class DamagedError(TacpipeError):
     """Stored bytes are not what they were, and cannot be made again."""
 

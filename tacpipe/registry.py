@@ -11,7 +11,7 @@ from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
-from tacpipe import extras, failures
+from tacpipe import extras, failures, memory
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
 from tacpipe.files import listed
@@ -106,6 +106,8 @@ def _import(name: str, target: str) -> Any:
     try:
         loaded = importlib.import_module(module)
     except ImportError as error:
+        if (short := memory.shortage(error)) is not None:
+            raise short from error
         sentence = f"{name} needs {error.name or target}, which cannot be imported ({error})."
         raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
     except TacpipeError:

@@ -243,8 +243,12 @@ def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
 
     content = regular.source(path)
     try:
-        if not content.startswith(b"\x93NUMPY"):  # numpy would take it for an archive of arrays, or a pickle
-            raise ValueError("it does not begin as an array of numpy does")
+        file = io.BytesIO(content)
+        wide = np.lib.format.read_magic(file) != (1, 0)
+        read_head = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
+        shape, _, kind = read_head(file)
+        if math.prod(shape) * kind.itemsize > len(content):  # before memory is taken for it
+            raise ValueError(f"its head claims {math.prod(shape)} numbers, and it has {len(content)} bytes")
         found: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
