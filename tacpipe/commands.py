@@ -61,7 +61,8 @@ def _show(program: typer.Typer) -> None:
     ) -> None:
         from tacpipe import overview
 
-        _print(overview.of(dataset), overview.to_text, as_json=as_json, full=full)
+        most = None if full or as_json else overview.SHOWN
+        _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
 
 
 def _explain(program: typer.Typer) -> None:

@@ -53,15 +53,15 @@ def publish_alone(
     """Do as `publish` does, in the block of `changing`.
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
-    What the dataset before held and cannot be computed again stays in the store, and so does its manifest; of one that was
-    ``relabelled``, nothing is gone.
+    What the dataset before held and cannot be computed again stays in the store, and so does its manifest. Of one that was
+    ``relabelled`` nothing is gone and no shard is looked at: a label costs what it changes.
     """
     directory = directory.absolute()
     check_output(store, directory)
     wanted = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    stale = _stale(store, manifest, directory) if current else list(wanted)
-    gone = _named(directory) - set(wanted)
+    stale = [] if relabelled else _stale(store, manifest, directory) if current else list(wanted)
+    gone = set() if relabelled else _named(directory) - set(wanted)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
@@ -69,7 +69,7 @@ def publish_alone(
         if before is not None and lasting:
             replacing.adopt(store, directory, before)
         store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
-        sweep(directory)
+        sweep(directory, shards=bool(stale))
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in may_lack else [])):
                 place(store, wanted[path], directory / path, copy=manifest.recorded)
@@ -80,9 +80,10 @@ def publish_alone(
             _settle(store, directory, stale)
 
 
-def sweep(directory: Path) -> None:
-    """Remove what a process left that was killed while it wrote here."""
-    folders = [directory, *(path for path in listed(directory) if path.is_dir() and not path.is_symlink())]
+def sweep(directory: Path, *, shards: bool = True) -> None:
+    """Remove what a process left that was killed while it wrote here: drafts of the manifest, and of ``shards``."""
+    below = listed(directory) if shards else ()
+    folders = [directory, *(path for path in below if path.is_dir() and not path.is_symlink())]
     for draft in [draft for folder in folders for draft in listed(folder, f".*{_DRAFT}")]:
         draft.unlink(missing_ok=True)
 
