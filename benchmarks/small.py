@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import shutil
 import statistics
+from collections.abc import Callable
 from pathlib import Path
 
 import timing
 
 HERE = Path(__file__).parent
 TRIALS = 1000
+FEW = 20  # as many as `tacpipe show` lists
 ENTRY_POINTS = "[tacpipe.stages]\nsimulate.small = small_stages:make\nadd = small_stages:add\n"
 PLAIN = """
 import sys
@@ -35,7 +37,8 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
     (project / ".tacpipe").mkdir(parents=True)
 
     def tacpipe(command: str) -> None:
-        timing.run(f"tacpipe {command} --quiet", project, PYTHONPATH=str(plugin))
+        quiet = "" if command.startswith(("show", "label")) else " --quiet"
+        timing.run(f"tacpipe {command}{quiet}", project, PYTHONPATH=str(plugin))
 
     tacpipe(f"simulate small --trials {TRIALS} -o recordings")
     tacpipe("add recordings -o added")
@@ -47,7 +50,24 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
         rounds,
     )
     hit = timing.at_most(f"a hit at {TRIALS:,} shards", times, "hit", "bare typer program", 2.0)
-    return [hit, _overhead(project, plugin, max(3, rounds // 5))]
+    return [hit, *_looks(tacpipe, max(3, rounds // 4)), _overhead(project, plugin, max(3, rounds // 5))]
+
+
+def _looks(tacpipe: Callable[[str], None], rounds: int) -> list[timing.Line]:
+    """Return what `show` and one label take on all recordings, beside what they take on a few of them."""
+    tacpipe(f"simulate small --trials {FEW} -o few")
+    values, many, few = itertools.count(), f"on {TRIALS:,}", f"on {FEW} recordings"
+    contestants: dict[str, dict[str, Callable[[], None]]] = {
+        "show": {many: lambda: tacpipe("show recordings"), few: lambda: tacpipe("show few")},
+        "one label": {
+            many: lambda: tacpipe(f"label recordings trial-000 --set pressed={next(values)}"),
+            few: lambda: tacpipe(f"label few trial-000 --set pressed={next(values)}"),
+        },
+    }
+    return [
+        timing.at_most(f"{what} {many}", timing.interleaved(both, rounds), many, few, 2.0)
+        for what, both in contestants.items()
+    ]
 
 
 def _overhead(project: Path, plugin: Path, rounds: int) -> timing.Line:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tacpipe import terminal
 from tacpipe.errors import DONE, FAILED, DeviceError, TacpipeError, UsageError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def add(program: typer.Typer, summary: str) -> None:
             raise UsageError("acquire needs a rig file, as in `tacpipe acquire rig.toml -o data/recordings`.")
         found = rig_of.read(rig) if rig is not None else None
         if found is not None and dry_run:
-            print(_dry_run(found, as_json=as_json))
+            terminal.result(_dry_run(found, as_json=as_json))
             return
         if found is not None and output is None and not recover:
             raise UsageError("acquire needs -o: the dataset of recordings to append to.")
@@ -95,7 +95,7 @@ def add(program: typer.Typer, summary: str) -> None:
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
         _tell(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
         if lost and as_json:  # the object on stdout holds the error already
-            print(f"tacpipe: {failed}", file=sys.stderr)
+            terminal.note(f"tacpipe: {failed}")
             raise typer.Exit(failed.exit_code)
         if lost:
             raise failed
@@ -125,7 +125,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
         recorder.await_first(ended)
         recorded, lost = trials.run(recorder, store, plan, view, ended)
     for one in recorded if not quiet else ():
-        print(one.line(), file=sys.stderr)
+        terminal.note(one.line())
     return recorded, lost
 
 
@@ -145,12 +145,12 @@ def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
             continue  # it ended before a sample came
         except Exception as error:  # whatever a damaged spool or another version's driver may raise
             why = error if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            print(f"tacpipe: The spool {folder} stays as it is. {why}", file=sys.stderr)
+            terminal.note(f"tacpipe: The spool {folder} stays as it is. {why}")
             left += 1
             continue
         sealed.append(one)
         if not quiet:
-            print(f"recovered {one.line()}", file=sys.stderr)
+            terminal.note(f"recovered {one.line()}")
     return sealed, left
 
 
@@ -212,7 +212,7 @@ def _tell(
             "seconds": seconds,
         }
         error = {} if failed is None else {"error": str(failed), "exit_code": failed.exit_code}
-        print(json.dumps({**value, **error}))
+        terminal.result_json({**value, **error})
         return
     if output is not None:
-        print(output)
+        terminal.result(output)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tacpipe import replacing
+from tacpipe import replacing, terminal
 from tacpipe.errors import UsageError
 from tacpipe.excerpt import plain
 
@@ -73,13 +72,13 @@ def candidates(
     if output is not None:
         _write(output, _csv(rows))
     if as_json:
-        print(json.dumps({"schema_version": 1, "candidates": rows, "units": _units(rows)}))
+        terminal.result_json({"schema_version": 1, "candidates": rows, "units": _units(rows)})
     elif output is not None:
-        print(output)
+        terminal.result(output)
     elif _on_terminal():
         _print_table(rows)
     else:
-        print(_csv(rows), end="")
+        terminal.result(_csv(rows).rstrip("\n"))
 
 
 def _on_terminal() -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution, replacing
+from tacpipe import execution, replacing, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.hashing import bytes_digest
@@ -88,7 +88,7 @@ def to_text(listed: list[Known]) -> str:
         lines.append(
             f"{one.manifest[:12]}  {written}  {one.stage:<20}  {one.recordings:>10}  {one.labelled:>8}  {one.path}{state}"
         )
-    return "\n".join(lines)
+    return terminal.lines(lines)
 
 
 def checkout(name: str, output: Path, *, replace: bool = False) -> Manifest:

@@ -6,12 +6,12 @@ torch, pyarrow, pandas, scikit-learn or open3d. What it takes to build one comes
 
 from __future__ import annotations
 
-import json
+import io
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import extras, failures, interruption, places
+from tacpipe import extras, failures, interruption, memory, places, terminal
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.files import told
 
@@ -48,7 +48,7 @@ def app(arguments: Sequence[str]) -> typer.Typer:
         if show:
             from importlib.metadata import version as installed
 
-            typer.echo(installed("tacpipe"))
+            terminal.result(installed("tacpipe"))
             raise typer.Exit
 
     first = next((argument for argument in arguments if not argument.startswith("-")), None)
@@ -69,11 +69,31 @@ def main() -> None:
     """Run the command line of this process, which ends within a second of Ctrl-C; exit with the documented codes."""
     code = INTERRUPTED
     try:
+        terminal.prepare()
+        memory.guard()
         interruption.heed()
-        code = answer(sys.argv[1:])
+        code = _printed(answer(sys.argv[1:]))
     except KeyboardInterrupt:  # as it began, or after it was done
         interruption.tell()
+    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be told apart
+        short = memory.shortage(error)
+        if short is None:
+            raise
+        _complain(str(short))
+        code = FAILED
     sys.exit(interruption.done(code))
+
+
+def _printed(code: int) -> int:
+    """Return the exit code of a command once what it printed is written; one whose result could not be has failed."""
+    failure = terminal.unprinted()
+    if failure is None or code != DONE:
+        return code
+    _complain(
+        f"What the command made is kept, but its result could not be written to standard output: {failure.strerror}. "
+        f"Write that to another place."
+    )
+    return FAILED
 
 
 def answer(arguments: Sequence[str]) -> int:
@@ -91,10 +111,10 @@ def answer(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         return DONE
     except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
-        code, sentence = FAILED, told(error)
+        code, sentence = FAILED, str(memory.shortage(error) or told(error))
         _complain(sentence)
     except Exception as error:
-        found = failures.text(error)
+        found = str(memory.shortage(error) or "") or failures.text(error)
         if found is None and not interruption.wished():
             raise
         code, sentence = FAILED, str(found)
@@ -103,13 +123,13 @@ def answer(arguments: Sequence[str]) -> int:
         interruption.tell()
         code, sentence = INTERRUPTED, "The command was interrupted."
     if sentence and "--json" in arguments:
-        print(json.dumps({"schema_version": 1, "error": sentence, "exit_code": code}))
+        terminal.result_json({"schema_version": 1, "error": sentence, "exit_code": code})
     return code
 
 
 def _complain(sentence: str) -> None:
     if not interruption.wished():
-        print(f"tacpipe: {sentence}", file=sys.stderr)
+        terminal.note(f"tacpipe: {sentence}")
 
 
 def _call(arguments: Sequence[str]) -> tuple[int, str]:
@@ -124,7 +144,9 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
     except typer.Abort:
         return FAILED, ""
     except _misuse() as error:
-        error.show()
+        text = io.StringIO()
+        error.show(text)
+        terminal.note(text.getvalue().rstrip("\n"))
         return error.exit_code, error.format_message()
     return code if isinstance(code, int) else DONE, ""
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from tacpipe import terminal
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
@@ -46,7 +47,7 @@ def _label(program: typer.Typer) -> None:
             "recordings": changed.recordings,
             "labels": wanted,
         }
-        print(json.dumps(value) if as_json else changed.directory)
+        terminal.result_json(value) if as_json else terminal.result(changed.directory)
 
 
 def _show(program: typer.Typer) -> None:
@@ -60,7 +61,8 @@ def _show(program: typer.Typer) -> None:
     ) -> None:
         from tacpipe import overview
 
-        _print(overview.of(dataset), overview.to_text, as_json=as_json, full=full)
+        most = None if full or as_json else overview.SHOWN
+        _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
 
 
 def _explain(program: typer.Typer) -> None:
@@ -81,7 +83,7 @@ def _demo(program: typer.Typer) -> None:
     ) -> None:
         from tacpipe import demonstration
 
-        print(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
+        terminal.result(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
 
 
 def _store(program: typer.Typer) -> None:
@@ -110,7 +112,7 @@ def _acquire(program: typer.Typer) -> None:
 
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `tacpipe show DATASET | head` ends as it does for any Unix tool
-    print(json.dumps(value) if as_json else to_text(value, **options))
+    terminal.result_json(value) if as_json else terminal.result(to_text(value, **options))
 
 
 NAMES: dict[str, Callable[[typer.Typer], None]] = {

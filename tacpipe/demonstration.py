@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tacpipe import extras, interruption
+from tacpipe import extras, interruption, terminal
 from tacpipe.errors import TacpipeError
 
 TRIALS = 30
@@ -104,7 +104,7 @@ def run_rig(output: Path, rig_file: Path) -> Path:
     """
     extras.require("The demo on a rig", *LEARNING, *LINKS)
     emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / EMULATED)]
-    print("$ tacpipe " + " ".join(emulate) + " &", file=sys.stderr, flush=True)
+    terminal.note("$ tacpipe " + " ".join(emulate) + " &")
     serving = subprocess.Popen([sys.executable, "-m", "tacpipe.cli", *emulate], stdout=subprocess.PIPE)
     assert serving.stdout is not None
     try:
@@ -121,7 +121,7 @@ def run_rig(output: Path, rig_file: Path) -> Path:
 
 def _run(several: list[list[str]]) -> None:
     for command in several:
-        print("$ tacpipe " + " ".join(command), file=sys.stderr, flush=True)
+        terminal.note("$ tacpipe " + " ".join(command))
         process = subprocess.Popen([sys.executable, "-m", "tacpipe.cli", *command], stdout=subprocess.DEVNULL)
         with interruption.saying(""):  # the command says it
             try:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tacpipe import replacing
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.files import sync_folder, sync_folders, write_whole
+from tacpipe.files import listed, sync_folder, sync_folders, walk, write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
 from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import MissingError, Store
@@ -53,15 +53,15 @@ def publish_alone(
     """Do as `publish` does, in the block of `changing`.
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
-    What the dataset before held and cannot be computed again stays in the store, and so does its manifest; of one that was
-    ``relabelled``, nothing is gone.
+    What the dataset before held and cannot be computed again stays in the store, and so does its manifest. Of one that was
+    ``relabelled`` nothing is gone and no shard is looked at: a label costs what it changes.
     """
     directory = directory.absolute()
     check_output(store, directory)
     wanted = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    stale = _stale(store, manifest, directory) if current else list(wanted)
-    gone = _named(directory) - set(wanted)
+    stale = [] if relabelled else _stale(store, manifest, directory) if current else list(wanted)
+    gone = set() if relabelled else _named(directory) - set(wanted)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
@@ -69,7 +69,7 @@ def publish_alone(
         if before is not None and lasting:
             replacing.adopt(store, directory, before)
         store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
-        sweep(directory)
+        sweep(directory, shards=bool(stale))
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in may_lack else [])):
                 place(store, wanted[path], directory / path, copy=manifest.recorded)
@@ -80,15 +80,17 @@ def publish_alone(
             _settle(store, directory, stale)
 
 
-def sweep(directory: Path) -> None:
-    """Remove what a process left that was killed while it wrote here."""
-    for draft in [*directory.glob(f".*{_DRAFT}"), *directory.glob(f"*/.*{_DRAFT}")]:
+def sweep(directory: Path, *, shards: bool = True) -> None:
+    """Remove what a process left that was killed while it wrote here: drafts of the manifest, and of ``shards``."""
+    below = listed(directory) if shards else ()
+    folders = [directory, *(path for path in below if path.is_dir() and not path.is_symlink())]
+    for draft in [draft for folder in folders for draft in listed(folder, f".*{_DRAFT}")]:
         draft.unlink(missing_ok=True)
 
 
 def sweep_beside(path: Path) -> None:
     """Do as `sweep` for what was to become the file ``path``; what else lies in its folder is not ours."""
-    for draft in path.parent.glob(f".{glob.escape(path.name[:100])}.*{_DRAFT}"):
+    for draft in listed(path.parent, f".{glob.escape(path.name[:100])}.*{_DRAFT}"):
         draft.unlink(missing_ok=True)
 
 
@@ -146,7 +148,8 @@ def check_output(store: Store, directory: Path) -> None:
         raise UsageError(f"{directory} lies within the dataset {around}. Give -o a directory outside of it.")
     if not directory.is_dir():
         return
-    for path in directory.rglob("*"):  # a project that was moved: its shards are known, its path is not
+    below = (Path(place, name) for place, _, names in walk(directory, links=False) for name in names)
+    for path in below:  # a project that was moved: its shards are known, its path is not
         if path.name == NAME and path.is_file():
             raise UsageError(f"{directory} holds the dataset {path.parent}. Give -o a directory of its own.")
         if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):

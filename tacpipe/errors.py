@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from tacpipe import terminal
+
 LONGEST_WORD = 250  # letters: more is no path or name that a person gave
 DONE, FAILED, USAGE, WOULD_CHANGE, DAMAGED, DEVICE, LOCKED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
@@ -18,9 +20,7 @@ class TacpipeError(Exception):
         text = super().__str__()
         if len(text) > LONGEST_WORD:
             text = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][:100]}…{word[0][-100:]}", text)
-        if text.isprintable():
-            return text
-        return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+        return terminal.lines(text.split("\n"))
 
 
 class UsageError(TacpipeError):
@@ -41,6 +41,10 @@ class MissingModuleError(TacpipeError, ImportError):
 
 class StorageError(TacpipeError):
     """The disk or the store failed, which says nothing of what was to be stored."""
+
+
+class ShortageError(StorageError):
+    """The computer ran out of memory, threads or processes, which says nothing of what was worked on."""
 
 
 class DamagedError(TacpipeError):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe import extras, failures, provenance, registry
+from tacpipe import extras, failures, memory, provenance, registry
 from tacpipe import params as params_of
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
@@ -89,7 +89,7 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments:
         try:
-            with extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
+            with memory.told(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
                 returned = stage(params, **arguments)
         except Exception as error:
             failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
@@ -256,7 +256,7 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
     yield found
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
-            raise TacpipeError(f"{path} changed while it was read. Run the same command again.")
+            raise StorageError(f"{path} changed while it was read. Run the same command again.")
 
 
 def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:

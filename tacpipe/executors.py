@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from tacpipe import interruption
+from tacpipe import interruption, memory
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
     """Start ``jobs`` workers; add the connection to each, and the one that keeps it alive, to ``workers``."""
     import multiprocessing
 
+    memory.require_library("pyarrow")  # which each of them loads
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(preload))
     _start_server()
@@ -115,7 +116,8 @@ def _work(tasks: Connection, alive: Connection) -> None:
 
 def _computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
     try:
-        return [compute(task) for task in chunk]
+        with memory.told():
+            return [compute(task) for task in chunk]
     except Exception as error:  # a mistake in a stage, which is raised again where the stage was asked for
         import pickle
         import traceback

@@ -71,6 +71,54 @@ def listed(folder: Path, pattern: str = "*") -> list[Path]:
     return [folder / name for name in sorted(names) if fnmatchcase(name, pattern)]
 
 
+def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yield ``source`` and each folder below it with the folders and files in it, sorted, from the top down.
+
+    Links are followed, circles of them are not; without ``links`` one to a folder counts as a file. Folders that are taken
+    out of the list are passed over, and so are those that are removed meanwhile. Raises `StorageError` for a folder that
+    cannot be listed: `os.walk` passes over it, and what it holds would seem to be gone.
+    """
+    seen: set[str] = set()
+    pending = [os.fspath(source)]
+    while pending:
+        place = pending.pop()
+        real = os.path.realpath(place)
+        if real in seen:
+            continue
+        seen.add(real)
+        try:
+            folders, files = _contents(place, links)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise StorageError(
+                f"{error.filename or place} cannot be listed: {error.strerror or error}. What it holds would be left out: "
+                f"make it readable, or take it away, and run the same command again."
+            ) from error
+        yield place, folders, files
+        pending += [f"{place.rstrip('/')}/{name}" for name in reversed(folders)]
+
+
+def _contents(place: str, links: bool) -> tuple[list[str], list[str]]:
+    """Return the names of the folders in a folder, and of all else, sorted."""
+    folders: list[str] = []
+    files: list[str] = []
+    with os.scandir(place) as entries:
+        for entry in entries:
+            (folders if _is_folder(entry, links) else files).append(entry.name)
+    return sorted(folders), sorted(files)
+
+
+def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
+    """Return whether an entry is a folder, or a link to one; a link in a circle is none."""
+    try:
+        return entry.is_dir(follow_symlinks=links)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        return False
+
+
 def read_json(path: Path) -> dict[str, Any] | None:
     """Return the mapping that a file holds; None if it is not there or holds none."""
     try:

@@ -61,7 +61,7 @@ def file_digest(path: Path | str) -> str:
 
     Raises `TacpipeError` for a pipe, a device or a folder, which have no content or no end of it.
     """
-    with regular.opened(path) as file:
+    with regular.opened(path) as file, regular.naming(path):
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

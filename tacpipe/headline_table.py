@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tacpipe import headline, manifest
+from tacpipe import headline, manifest, terminal
 from tacpipe.headline import Headline
 from tacpipe.store import locate
 
@@ -20,19 +20,21 @@ def of_output(output: Path, file: str) -> list[Headline]:
 def show(headlines: Sequence[Headline]) -> None:
     """Print headlines on stderr."""
     if not (headlines and sys.stderr.isatty()):
-        print(headline.text(headlines), file=sys.stderr)
+        terminal.note(headline.text(headlines))
         return
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     heads, rows = headline.table(headlines)
-    told = Table(box=box.SIMPLE_HEAD, caption=headline.caption(headlines), caption_justify="left", pad_edge=False)
+    told = Table(
+        box=box.SIMPLE_HEAD, caption=terminal.shown(headline.caption(headlines)), caption_justify="left", pad_edge=False
+    )
     for at, head in enumerate(heads):
-        told.add_column(head, justify="left" if at < 2 else "right")
+        told.add_column(terminal.shown(head), justify="left" if at < 2 else "right")
     styles = {headline.BETTER: "green", headline.WORSE: "red"}
     for row, one in zip(rows, _each(headlines), strict=True):
-        told.add_row(*row, style=styles.get(one.verdict) if row[0] else "dim")
+        told.add_row(*map(terminal.shown, row), style=styles.get(one.verdict) if row[0] else "dim")
     Console(stderr=True, highlight=False, markup=False).print(told)
 
 

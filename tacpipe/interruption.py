@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any, NoReturn
 
+from tacpipe import terminal
 from tacpipe.errors import INTERRUPTED
 
 GRACE_S = 0.7  # to end in good order
@@ -89,7 +90,7 @@ class _Program:
         if self.code is None and not self.told and self.sentence:
             self.told = True
             with contextlib.suppress(OSError):
-                os.write(2, f"{self.sentence}\n".encode())
+                os.write(2, f"{terminal.shown(self.sentence)}\n".encode(errors="backslashreplace"))
         os._exit(INTERRUPTED if self.code is None else self.code)
 
 
@@ -123,7 +124,7 @@ def tell() -> None:
     """Tell that the command was interrupted, and what is kept."""
     sentence, _program.sentence, _program.told = _program.sentence, SENTENCE, True
     if sentence:
-        print(sentence, file=sys.stderr, flush=True)
+        terminal.note(sentence)
 
 
 def done(code: int) -> int:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import manifest as manifest_of
+from tacpipe import terminal
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import listed
 from tacpipe.manifest import Manifest
@@ -139,7 +140,7 @@ def to_text(tree: dict[str, Any]) -> str:
         libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
         commit = f" at commit {made['git_commit'][:10]}" if made["git_commit"] else ""
         lines.append(f"Made on {made['host']}{commit} with {libraries}.")
-    return "\n".join([*lines, "", *_lines(tree, 0, set())])
+    return terminal.lines([*lines, "", *_lines(tree, 0, set())])
 
 
 def _lines(node: dict[str, Any], depth: int, told: set[str], argument: str = "") -> list[str]:

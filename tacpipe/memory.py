@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import resource
+import sys
+from collections.abc import Iterator
+from importlib.abc import MetaPathFinder
 from pathlib import Path
+from typing import Any
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import ShortageError, TacpipeError
 
 MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
 GROUP = Path("/sys/fs/cgroup")  # of a container: its limit, and what is used of it
 AT_HAND = 1 << 26  # bytes that are not worth asking the system about
 KEPT = 0.9  # share of what is left that one file may claim
+SCARCE = 1 << 29  # bytes: a request that fails although so much is left was for more than a sound file needs
+LIBRARIES = {  # bytes of address space that loading each takes, and its threads; measured with 2 cores
+    "numpy": 140 << 20,
+    "pyarrow": 384 << 20,
+    "sklearn": 512 << 20,
+    "torch": 768 << 20,
+    "open3d": 1200 << 20,
+}
+A_CORE = 32 << 20  # bytes that each further core's thread of the linear algebra in numpy takes
+_NO_ROOM = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
+_NO_THREAD = ("can't start new thread", "Resource temporarily unavailable")
 
 
 def available() -> int:
@@ -28,6 +45,92 @@ def available() -> int:
         with contextlib.suppress(OSError, ValueError, IndexError):
             left.append(limit - int(STATM.read_text().split()[0]) * resource.getpagesize())
     return max(0, min(left))
+
+
+def limited() -> bool:
+    """Return whether this process has a limit of address space, as ``ulimit -v`` sets it."""
+    return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+
+
+def scarce() -> bool:
+    """Return whether so little is left that a request which fails says nothing of what asked for it."""
+    return available() < SCARCE
+
+
+def shortage(error: BaseException) -> ShortageError | None:
+    """Return in words that memory or threads ran out, where ``error`` or what it came from says so; else None."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, ShortageError):
+            return seen
+        if _is_shortage(seen):
+            return _short(f"memory ran out ({' '.join(str(seen).split())[:160] or type(seen).__name__})")
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
+def _is_shortage(error: BaseException) -> bool:
+    if isinstance(error, MemoryError) or (isinstance(error, SystemError) and scarce()):
+        return True
+    if isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EAGAIN):
+        return True
+    if isinstance(error, OSError) and error.errno is None and scarce():  # of libraries that name no cause, as Arrow's
+        return True
+    text = str(error)
+    if isinstance(error, ImportError) and any(words in text for words in _NO_ROOM):
+        return True
+    return isinstance(error, RuntimeError) and any(words in text for words in (*_NO_ROOM, *_NO_THREAD))
+
+
+def _short(what: str) -> ShortageError:
+    limit = (
+        f", of the {_megabytes(resource.getrlimit(resource.RLIMIT_AS)[0])} that `ulimit -v` allows" if limited() else ""
+    )
+    return ShortageError(
+        f"This command needs more memory than there is: {what}; {_megabytes(available())} are left{limit}. What was "
+        f"finished is kept: run the same command again with more, or with a smaller --jobs."
+    )
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:,.0f} MB"
+
+
+def guard() -> None:
+    """Under a limit of address space, have libraries loaded only where there is room for them, and reserve none ahead.
+
+    Where there is not, their own threads abort the process. Called once, before any of them is loaded.
+    """
+    if limited():
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # others reserve a gigabyte at once
+        sys.meta_path.insert(0, _Guard())
+
+
+class _Guard(MetaPathFinder):
+    """Finds no module, and raises `ShortageError` for a library that there is no room for."""
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> None:
+        if name in LIBRARIES:
+            require_library(name)
+
+
+def require_library(name: str) -> None:
+    """Raise `ShortageError` where loading a library of `LIBRARIES` takes more than is left under a limit."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    needed = LIBRARIES[name] + A_CORE * max(0, cores - 2)
+    if limited() and available() < needed:
+        raise _short(f"{name} takes {_megabytes(needed)} to load")
+
+
+@contextlib.contextmanager
+def told() -> Iterator[None]:
+    """Raise what says that memory ran out as `ShortageError`."""
+    try:
+        yield
+    except Exception as error:
+        if not isinstance(error, TacpipeError) and (short := shortage(error)) is not None:
+            raise short from error
+        raise
 
 
 def require(needed: int, what: str, *, error: type[TacpipeError] = TacpipeError) -> None:

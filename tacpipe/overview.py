@@ -5,26 +5,28 @@ What is shown follows from what the dataset holds, whichever stage made it.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from tacpipe import execution, model_overview
+from tacpipe import execution, model_overview, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.headline import counted
 from tacpipe.stage import ROLES
 from tacpipe.store import locate
 
-_SHOWN = 20  # recordings listed before the rest is counted
+SHOWN = 20  # recordings listed before the rest is counted
 _TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
 _SPLIT = ("recording", "fold", "role")  # columns of a split
 _GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 
 
-def of(path: Path) -> dict[str, Any]:
+def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     """Return what is in the dataset at ``path``: its ``kind`` (recordings, split, model, result), files, and the rest by it.
 
-    Of recordings, numbers a stream and labels; of a split, recordings by fold and role; of a model and of a result, what
+    Of recordings, labels, and numbers a stream of the first ``most`` by name (None: of all), whose shards alone are read; of
+    a split, recordings by fold and role; of a model and of a result, what
     `tacpipe.model_overview` finds.
     """
     found = manifest_of.find(path)
@@ -41,7 +43,7 @@ def of(path: Path) -> dict[str, Any]:
     return {
         "kind": "recordings",
         **about,
-        "recordings": {name: _recording(shard) for name, shard in opened.shards.items()},
+        "recordings": {name: _recording(opened.shards[name]) for name in sorted(opened.shards)[:most]},
         "attributes": {name: dict(shard.attributes) for name, shard in opened.shards.items()},
         "excluded": _excluded(opened),
     }
@@ -114,36 +116,36 @@ def _stream(shard: Shard, stream: str) -> dict[str, Any]:
 
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
-    """Return the overview as lines: of recordings, one a stream of each, then labels; then files and totals."""
+    """Return the overview as lines: one a stream of each recording that was read, then labels; then files and totals."""
     told = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
     if value["kind"] in told:
         made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        return "\n".join([*told[value["kind"]](value), *_files(value), made])
-    return "\n".join(_recordings_text(value, full))
+        return terminal.lines([*told[value["kind"]](value), *_files(value), made])
+    return terminal.lines(_recordings_text(value, full))
 
 
 def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
-    names = sorted(value["recordings"])
-    shown = names if full else names[:_SHOWN]
+    shown, count = sorted(value["recordings"]), len(value["attributes"])
     lines = [
         f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "
         f"{'gaps':>5} {'held':>5} {'saturated':>9}"
     ]
     for name in shown:
+        cell = terminal.padded(terminal.shown(name), 24)
         for stream, found in value["recordings"][name].items():
             held = f"{found['held_share']:.0%}" if "held_share" in found else ""
             lines.append(
-                f"{name:<24} {stream or '-':<10} {found['rows']:>7} {found['columns']:>7} {found.get('duration_s', ''):>8} "
+                f"{cell} {stream or '-':<10} {found['rows']:>7} {found['columns']:>7} {found.get('duration_s', ''):>8} "
                 f"{found.get('rate_hz', '') or '':>8} {found.get('gaps', ''):>5} {held:>5} {found.get('saturated', ''):>9}"
             )
-    if len(names) > len(shown):
-        lines.append(f"… and {len(names) - len(shown)} more (--full)")
+    if count > len(shown):
+        lines.append(f"… and {count - len(shown)} more (--full)")
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
     lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
     lines += _files(value)
     lines.append(
-        f"{counted(len(names), 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
+        f"{counted(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
         f"made by {value['stage']} [{value['digest'][:12]}]"
     )
     return lines
@@ -182,8 +184,8 @@ def _labels(attributes: dict[str, dict[str, Any]], full: bool) -> list[str]:
             numbers = [value for value in values if isinstance(value, int | float)]
             lines.append(f"{label}: {min(numbers):g} to {max(numbers):g}")
             continue
-        counts = {str(value): [str(other) for other in values].count(str(value)) for value in values}
-        if len(counts) <= _SHOWN:
+        counts = Counter(str(value) for value in values)
+        if len(counts) <= SHOWN:
             lines.append(f"{label}: " + ", ".join(f"{value} ({count})" for value, count in sorted(counts.items())))
         else:
             lines.append(f"{label}: {len(counts)} values")

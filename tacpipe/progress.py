@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from tacpipe import terminal
+
 _quiet = False
 
 
@@ -23,7 +25,7 @@ def wanted() -> bool:
 def say(sentence: str) -> None:
     """Tell on stderr what a user should know while it happens, unless quiet was asked for."""
     if not _quiet:
-        print(f"tacpipe: {sentence}", file=sys.stderr, flush=True)
+        terminal.note(f"tacpipe: {sentence}")
 
 
 @contextmanager
@@ -40,12 +42,12 @@ def bar(description: str, total: int) -> Iterator[Callable[..., None]]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(description, total=total, note="")
 
         def advance(steps: int = 1, note: str = "") -> None:
-            progress.update(task, advance=steps, note=note)
+            progress.update(task, advance=steps, note=terminal.shown(note))
 
         yield advance

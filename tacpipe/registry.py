@@ -11,9 +11,10 @@ from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
-from tacpipe import extras, failures
+from tacpipe import extras, failures, memory
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
+from tacpipe.files import listed
 from tacpipe.stage import Stage
 
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
@@ -31,7 +32,7 @@ def entry_points() -> dict[str, dict[str, str]]:
         for file in _entry_point_files(folder):
             try:
                 text = file.read_text(encoding="utf-8")
-            except OSError:
+            except (FileNotFoundError, NotADirectoryError, PermissionError):
                 continue
             if "[tacpipe." not in text:
                 continue
@@ -46,13 +47,12 @@ def entry_points() -> dict[str, dict[str, str]]:
 
 
 def _entry_point_files(folder: str) -> list[Path]:
-    if not folder or not folder.endswith("-packages"):
-        pattern = "*.egg-info/entry_points.txt"
-        places = [Path(folder or ".")]
-    else:
-        pattern = "*.dist-info/entry_points.txt"
-        places = [Path(folder)]
-    return [file for place in places for file in place.glob(pattern)]
+    """Return where the entry points of what is installed in a folder may be."""
+    pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
+    try:
+        return [found / "entry_points.txt" for found in listed(Path(folder or "."), pattern)]
+    except PermissionError:  # nothing can be imported from there either: Python passes over such a folder too
+        return []
 
 
 @functools.cache
@@ -106,6 +106,8 @@ def _import(name: str, target: str) -> Any:
     try:
         loaded = importlib.import_module(module)
     except ImportError as error:
+        if (short := memory.shortage(error)) is not None:
+            raise short from error
         sentence = f"{name} needs {error.name or target}, which cannot be imported ({error})."
         raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
     except TacpipeError:

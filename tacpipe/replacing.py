@@ -16,10 +16,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import execution, places
+from tacpipe import execution, places, recording_names
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.excerpt import listed
+from tacpipe.excerpt import listed, plain
 from tacpipe.manifest import ACQUIRE, Manifest
 from tacpipe.store import Store
 
@@ -149,6 +149,7 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
             f"{output} holds recordings of the same name that came from other files: {listed(sorted(changed), _SHOWN)}. "
             f"Rename the new ones, or give -o another directory, {alone}"
         )
+    _refuse_alike(before, output, plan, alone)
     others = sorted(set(before.recordings) - set(plan.sources))
     if plan.sources and others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
         raise UsageError(
@@ -156,6 +157,25 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
             f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
             f"together, or give -o another directory, {alone}"
         )
+
+
+def _refuse_alike(before: Manifest, output: Path, plan: Plan, alone: str) -> None:
+    """Raise `UsageError` where a new recording has the raw files of one at ``output``, or its name but for case."""
+    new = [name for name in plan.sources if name not in before.recordings]
+    names = {recording_names.folded(name): name for name in before.recordings}
+    files = {frozenset(dict(digests).items()): name for name, digests in before.sources.items()}
+    for name in new:
+        same = files.get(frozenset(dict(plan.sources[name]).items()))
+        if same is not None:
+            raise UsageError(
+                f"{output} holds the files of {plain(name)} already, as the recording {plain(same)}. Name the folder as it "
+                f"was, or give -o another directory, {alone}"
+            )
+        if (other := names.get(recording_names.folded(name))) is not None:
+            raise UsageError(
+                f"{output} holds the recording {plain(other)}, which differs from {plain(name)} only in case. Rename the "
+                f"new one, or give -o another directory, {alone}"
+            )
 
 
 def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> None:

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe import execution, manifest, registry
+from tacpipe import execution, manifest, recording_names, registry
 from tacpipe import params as params_of
 from tacpipe.errors import UsageError
 from tacpipe.hashing import remembered_file_digest
@@ -163,7 +163,9 @@ def _discover(stage: Stage, request: Request) -> dict[str, dict[str, Path]]:
         raise UsageError(f"{request.name} needs a folder of recordings to read.")
     if not request.source.exists():
         raise UsageError(f"There is no {request.source} to read recordings from.")
-    return {name: dict(files) for name, files in sorted(stage.discover(request.params, request.source).items())}
+    found = {name: dict(files) for name, files in sorted(stage.discover(request.params, request.source).items())}
+    recording_names.refuse_shared((name, next(iter(files.values()), request.source)) for name, files in found.items())
+    return found
 
 
 def _hash(sources: Mapping[str, Mapping[str, Path]]) -> dict[str, dict[str, str]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tacpipe import registry
+from tacpipe import registry, terminal
 from tacpipe.errors import DEVICE, TacpipeError
 
 if TYPE_CHECKING:
@@ -41,13 +41,13 @@ def list_(as_json: AsJson = False) -> None:
     """
     rows = [_row(name) for name in registry.sensors()]
     if as_json:
-        print(json.dumps({"schema_version": SCHEMA_VERSION, "sensors": rows}))
+        terminal.result_json({"schema_version": SCHEMA_VERSION, "sensors": rows})
         return
     head = {"name": "sensor", "links": "links", "rate_hz": "rate", "baud": "baud", "summary": "what it is"}
     table = [[head[key] for key in head], *([_cell(key, row[key]) for key in head] for row in rows)]
     widths = [max(len(line[column]) for line in table) for column in range(len(head))]
     for line in table:
-        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+        terminal.result("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
 
 
 def probe(
@@ -72,11 +72,11 @@ def probe(
         unasked = passive or (port is None and not usb_id)  # a machine's own port may lead anywhere, a console even
         reports.append(probing.probe(address, usb_id, passive=unasked, tell=_tell))
         if not as_json:
-            print(_text(reports[-1]))
+            terminal.result(_text(reports[-1]))
     if as_json:
-        print(json.dumps({"schema_version": SCHEMA_VERSION, "ports": [_json(report) for report in reports]}))
+        terminal.result_json({"schema_version": SCHEMA_VERSION, "ports": [_json(report) for report in reports]})
     elif not found:
-        print("There is no serial port and no HID device. Plug one in, or name an address.")
+        terminal.result("There is no serial port and no HID device. Plug one in, or name an address.")
     if not any(report.findings for report in reports):
         raise typer.Exit(DEVICE)
 
@@ -123,7 +123,7 @@ def _usb_id(port: str) -> str:
 
 def _tell(step: str) -> None:
     if sys.stderr.isatty():
-        print(step, file=sys.stderr)
+        terminal.note(step)
 
 
 def _text(report: Report) -> str:

@@ -13,7 +13,7 @@ import typer
 
 from tacpipe import fields as fields_of
 from tacpipe import params as params_of
-from tacpipe import pipeline, progress, registry
+from tacpipe import pipeline, progress, registry, terminal
 from tacpipe.constraints import NonNegativeInt
 from tacpipe.errors import FAILED
 from tacpipe.outcome import Outcome
@@ -76,7 +76,7 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
         options={field: _parsed(given[field], params_of.fields(stage)[field]) for field in named},
     )
     if given["print_params"]:
-        print(json.dumps(params_of.to_json(params), indent=1))
+        terminal.result(json.dumps(params_of.to_json(params), indent=1))
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
@@ -102,11 +102,11 @@ def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) 
 
 def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
     for note in outcome.notes:
-        print(f"tacpipe: {note}", file=sys.stderr)
+        terminal.note(f"tacpipe: {note}")
     for name, why in outcome.bad.items():
-        print(f"tacpipe: left out {name}: {why}", file=sys.stderr)
+        terminal.note(f"tacpipe: left out {name}: {why}")
     if not quiet:
-        print(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s", file=sys.stderr)
+        terminal.note(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s")
     told: dict[str, Any] = {}
     if headline is not None and (as_json or not quiet):
         from tacpipe import headline_table
@@ -116,11 +116,11 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
         if not quiet:
             headline_table.show(found)
     if as_json:
-        print(json.dumps({"schema_version": 1, **outcome.to_json(), **told}))
+        terminal.result_json({"schema_version": 1, **outcome.to_json(), **told})
     else:
-        print(outcome.output)
+        terminal.result(outcome.output)
     if outcome.differs:
-        print(f"tacpipe: {outcome.describe_differences()}", file=sys.stderr)
+        terminal.note(f"tacpipe: {outcome.describe_differences()}")
         raise typer.Exit(FAILED)
 
 

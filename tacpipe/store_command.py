@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from tacpipe import garbage
+from tacpipe import garbage, terminal
 from tacpipe.errors import DAMAGED, UsageError
 from tacpipe.store import Store, locate
 
@@ -141,7 +140,7 @@ def link(datasets: Paths) -> None:
 
     for path in datasets:
         count = upkeep.link(path)
-        print(f"{path}: {count} linked anew")
+        terminal.result(f"{path}: {count} linked anew")
 
 
 def push(remote: Remote, datasets: Paths, ancestors: Ancestors = False, as_json: AsJson = False) -> None:
@@ -171,4 +170,4 @@ def _moved(verb: str, done: Any) -> str:
 
 
 def _print(value: Any, *, as_json: bool, text: str) -> None:
-    print(json.dumps(value) if as_json else text)
+    terminal.result_json(value) if as_json else terminal.result(text)

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tacpipe import memory
-from tacpipe.errors import DamagedError
+from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.excerpt import plain
 from tacpipe.parquet_claims import claimed
 
@@ -84,7 +84,7 @@ class ParquetTable:
             self._fields = None if stored is None else json.loads(stored)
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
-            raise _damaged(len(content), error) from error
+            raise _unread(len(content), error) from error
 
     @property
     def num_rows(self) -> int:
@@ -96,13 +96,13 @@ class ParquetTable:
         try:
             needed = claimed(self._file.schema, memoryview(self._content).cast("B"), columns)
         except BROKEN as error:
-            raise _damaged(self._content.size, error) from error
+            raise _unread(self._content.size, error) from error
         memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=DamagedError)
         try:
             table = self._file.read(columns=list(columns) if columns is not None else None)
             return table if self._fields is None else table.cast(self._with_fields(table.schema))
         except BROKEN as error:
-            raise _damaged(self._content.size, error) from error
+            raise _unread(self._content.size, error) from error
 
     def _with_fields(self, schema: pa.Schema) -> pa.Schema:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
@@ -119,7 +119,10 @@ def owned(content: bytes) -> pa.Buffer:
     return sink.getvalue()
 
 
-def _damaged(size: int, error: Exception) -> DamagedError:
+def _unread(size: int, error: Exception) -> TacpipeError:
+    """Return in words why bytes could not be read: they are damaged, or there is too little memory left to know."""
+    if memory.scarce() and (short := memory.shortage(error)) is not None:
+        return short
     return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution
+from tacpipe import execution, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
-from tacpipe.files import write_whole
+from tacpipe.files import walk, write_whole
 from tacpipe.hashing import bytes_digest, file_digest
 from tacpipe.roots import PUSHED
 from tacpipe.store import MissingError, Store, locate
@@ -96,7 +98,7 @@ def repair(store: Store) -> Soundness:
 def _roots_again(store: Store) -> list[str]:
     """Write damaged roots anew whose datasets lie beside the store; return their names."""
     names, found = store.roots.damaged(), []
-    for place, folders, files in os.walk(store.root.parent) if names else ():
+    for place, folders, files in walk(store.root.parent, links=False) if names else ():
         folders[:] = [folder for folder in folders if not folder.startswith(".")]
         if manifest_of.NAME not in files:
             continue
@@ -153,10 +155,18 @@ def status(store: Store) -> dict[str, Any]:
     """Return where the store is, counts and bytes of what lies in it, its roots and who is at work."""
     folders = {}
     for name in ("objects", "records", "quarantine", "tmp", "checkpoints"):
-        files = [path for path in (store.root / name).rglob("*") if path.is_file()]
-        folders[name] = {"files": len(files), "bytes": sum(path.stat().st_size for path in files)}
+        sizes = list(_sizes(store.root / name))
+        folders[name] = {"files": len(sizes), "bytes": sum(sizes)}
     roots = [{**root, "reachable": root["kind"] == PUSHED or Path(root["path"]).exists()} for root in store.roots.all()]
     return {"store": str(store.root), **folders, "roots": roots, "running": [run.note for run in store.leases.runs()]}
+
+
+def _sizes(folder: Path) -> Iterator[int]:
+    """Yield the size in bytes of each file below a folder."""
+    for place, _, names in walk(folder, links=False):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):  # a draft that became an object meanwhile
+                yield os.lstat(f"{place}/{name}").st_size
 
 
 def status_text(value: dict[str, Any]) -> str:
@@ -171,7 +181,7 @@ def status_text(value: dict[str, Any]) -> str:
         for root in value["roots"]
     ]
     lines += [f"  at work: process {note.get('pid')} on {note.get('host')}" for note in value["running"]]
-    return "\n".join(lines)
+    return terminal.lines(lines)
 
 
 def _find(root: dict[str, Any]) -> manifest_of.Found | None:

@@ -11,8 +11,9 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.errors import TacpipeError
-from tacpipe.formats.folders import Params, walk
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.files import walk
+from tacpipe.formats.folders import Params
 from tacpipe.stage import Files, Recording, stage
 
 if TYPE_CHECKING:
@@ -45,9 +46,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
             if match is None:
                 continue
             files = found.setdefault(recording_name(int(match[1]), int(match[2])), {})
-            if name in files:
-                raise TacpipeError(
-                    f"{files[name]} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
+            same = next((path for other, path in files.items() if other.endswith(f"_{match[3]}.csv")), None)
+            if same is not None:  # mat3_7_bio.csv in two folders, or beside mat03_7_bio.csv
+                raise UsageError(
+                    f"{same} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
                 )
             files[name] = Path(place) / name
     slides = {

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from tacpipe import regular
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import excerpt, listed, plain
+from tacpipe.tables import owned
 
 _STAMP = re.compile(r"\s*\d{1,10}(\.\d{1,9})?\s*")
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
@@ -56,9 +57,10 @@ def read_csv(
     _check_header(path, names, [seconds, *columns] if seconds else columns)
     tail = [""] if trailing_comma else []
     stamps = {seconds: pa.decimal128(19, 9)} if seconds else {}
+    content = regular.source(path)
     try:
         table = pc.read_csv(
-            path,
+            pa.BufferReader(owned(content)),
             read_options=pc.ReadOptions(column_names=[*names, *tail], skip_rows=1, use_threads=False),
             convert_options=pc.ConvertOptions(
                 column_types={**dict.fromkeys(names, pa.float64()), **dict.fromkeys(tail, pa.string()), **stamps},
@@ -132,12 +134,12 @@ def file_row(path: Path, index: int) -> int:
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each line that is not blank."""
     try:
-        with io.TextIOWrapper(regular.opened(path), "utf-8-sig", "replace", "") as file:
+        with regular.failing(path), io.TextIOWrapper(regular.opened(path), "utf-8-sig", "replace", "") as file:
             reader = csv.reader(file)
             for cells in reader:
                 if cells:
                     yield reader.line_num, cells
-    except (OSError, csv.Error) as error:
+    except csv.Error as error:
         raise TacpipeError(
             f"{path} cannot be read: {plain(str(error), 200)}. Check the path and copy the file again."
         ) from error

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tacpipe import recording_names
 from tacpipe.errors import TacpipeError
+from tacpipe.files import walk
 from tacpipe.stage import Files
 
 PREFIX = "data_sample_"
@@ -28,7 +29,7 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
 
     A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
     recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
-    Raises `TacpipeError` if ``source`` is no folder or holds no trial.
+    Raises `TacpipeError` if ``source`` is no folder or holds no trial, `UsageError` where two trials share a name even so.
     """
     if not source.is_dir():
         raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
@@ -46,42 +47,33 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         )
     by_name: dict[str, list[Path]] = {}
     for folder in folders:
-        by_name.setdefault(valid(folder.name), []).append(folder)
-    found: dict[str, dict[str, Path]] = {}
-    for name, same in by_name.items():
+        by_name.setdefault(recording_names.folded(valid(folder.name)), []).append(folder)
+    named: list[tuple[str, Path]] = []
+    for same in by_name.values():
         for folder in same:
-            unique = name if len(same) == 1 else valid("-".join([*folder.relative_to(source).parts[:-1], name]))
-            found[unique] = {file: folder / file for file in names if file in holds[folder]}
-    return dict(sorted(found.items()))
-
-
-def walk(source: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield each folder below ``source`` and ``source``, with the folders and files in it, as `os.walk` does.
-
-    Links are followed, circles of them are not. Folders that are taken out of the list are passed over.
-    """
-    seen: set[str] = set()
-    for place, below, files in os.walk(source, followlinks=True):
-        real = os.path.realpath(place)
-        if real in seen:
-            below.clear()
-            continue
-        seen.add(real)
-        yield place, below, files
+            name = valid(folder.name)
+            above = folder.relative_to(source).parts[:-1]
+            named.append((name if len(same) == 1 else valid("-".join([*above, name])), folder))
+    recording_names.refuse_shared(named)
+    return {name: {file: folder / file for file in names if file in holds[folder]} for name, folder in sorted(named)}
 
 
 def require(files: Files, names: Sequence[str]) -> str:
-    """Return the name of the trial's folder. Raises `TacpipeError` if it lacks one of the files ``names``."""
+    """Return the name of the trial's folder, as `text`. Raises `TacpipeError` if it lacks one of the files ``names``."""
     folder = next((path.parent for path in files.values()), None)
     missing = [name for name in names if name not in files]
     if missing:
         place = str(folder) if folder else "A trial folder"
         raise TacpipeError(f"{place} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
     assert folder is not None
-    return folder.name
+    return text(folder.name)
+
+
+def text(name: str) -> str:
+    """Return a name of the file system as text: bytes in it that are no UTF-8 become U+FFFD."""
+    return os.fsencode(name).decode(errors="replace")
 
 
 def valid(name: str) -> str:
-    """Return a folder's name as that of a recording: letters, digits, dots, dashes and underscores."""
-    short = name.removeprefix(PREFIX) or name
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", short).strip("-.") or "trial"
+    """Return a folder's name as that of a recording (`tacpipe.recording_names.valid`), without the prefix of trials."""
+    return recording_names.valid(name.removeprefix(PREFIX) or name) or "trial"

@@ -51,7 +51,7 @@ def read(path: Path) -> Cloud:
     Raises `TacpipeError`, naming the file, where it is no PCD 0.7, has no x, y and z of floats or no points, is shorter
     than its header says or longer by more than padding, is compressed, or holds points that are not finite.
     """
-    xyz, colours = parsed(path, _content(path))
+    xyz, colours = parsed(path, regular.source(path))
     finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
     if not finite.all():
         raise TacpipeError(
@@ -87,7 +87,7 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
 
     Raises `TacpipeError`, naming the file and what its header lacks or says wrong.
     """
-    lines, length = _header_lines(path, _content(path) if content is None else content)
+    lines, length = _header_lines(path, regular.source(path) if content is None else content)
     missing = [keyword for keyword in ("VERSION", "FIELDS", "SIZE", "TYPE", "POINTS") if keyword not in lines]
     if missing:
         raise TacpipeError(
@@ -132,15 +132,6 @@ def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
     [[255, 128, 1]]
     """
     return np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return regular.content(path)
-    except OSError as error:
-        raise TacpipeError(
-            f"{path} cannot be read: {error.strerror or error}. Copy it again from its source."
-        ) from error
 
 
 def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:

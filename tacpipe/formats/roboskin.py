@@ -8,6 +8,8 @@ has is told from its values. The rate is not published.
 from __future__ import annotations
 
 import ast
+import functools
+import io
 import math
 import os
 import re
@@ -20,7 +22,7 @@ from tacpipe import regular
 from tacpipe.constraints import Rate
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import excerpt, plain
-from tacpipe.formats.folders import walk
+from tacpipe.files import walk
 from tacpipe.stage import Attribute, Files, Recording, stage
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
 LARGEST = 255.0  # readings stem from eight bits, compensated for temperature
 ALONG_TIME = 0.85  # correlation of neighbours: of published slides 0.92 or more along time, 0.82 or less otherwise
 UNREADABLE = (
-    *(OSError, ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, MemoryError, OverflowError),
+    *(ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, OverflowError),
     tokenize.TokenError,
 )
 MADE = "from nominal rate"
@@ -127,7 +129,7 @@ def _found(source: Path) -> list[tuple[str, Path]]:
 def _slides(path: Path) -> int:
     """Return how many slides a block has, from the head of the file alone: numpy takes longer to load than a hit."""
     try:
-        with regular.opened(path) as file:
+        with regular.failing(path), regular.opened(path) as file:
             if file.read(6) != b"\x93NUMPY":
                 raise ValueError("it does not begin as an array of numpy does")
             wide = file.read(2)[0] > 1
@@ -225,16 +227,32 @@ def _label(block: Path, path: Path, place: int) -> int:
 
 
 def _array(path: Path) -> NDArray[Any]:
-    """Return an array without reading it whole. Raises `TacpipeError` if the file is none; a pickle is never opened."""
+    """Return an array. Raises `TacpipeError` if the file is none; a pickle is never opened."""
+    with regular.failing(path):
+        stat = path.stat()
+    return _read(path, stat.st_size, stat.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=2)  # a block and its labels: the slides of a block are read one after another
+def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
+    """Return the array of a file, for as long as the file has this size and time of change.
+
+    Not as a map of memory: a disk that fails ends the process there, with SIGBUS.
+    """
     import numpy as np
 
+    content = regular.source(path)
     try:
-        with regular.opened(path) as file:
-            if file.read(6) != b"\x93NUMPY":  # numpy would take it for an archive of arrays, or a pickle
-                raise ValueError("it does not begin as an array of numpy does")
-        found: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        file = io.BytesIO(content)
+        wide = np.lib.format.read_magic(file) != (1, 0)
+        read_head = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
+        shape, _, kind = read_head(file)
+        if math.prod(shape) * kind.itemsize > len(content):  # before memory is taken for it
+            raise ValueError(f"its head claims {math.prod(shape)} numbers, and it has {len(content)} bytes")
+        found: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
+    found.flags.writeable = False
     return found
 
 

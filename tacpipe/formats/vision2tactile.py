@@ -15,11 +15,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe import regular
+from tacpipe import recording_names, regular
 from tacpipe.constraints import NonNegativeFloat
 from tacpipe.errors import TacpipeError
 from tacpipe.excerpt import plain
-from tacpipe.formats.folders import require, valid, walk
+from tacpipe.files import walk
+from tacpipe.formats.folders import require, text, valid
 from tacpipe.hashing import remembered_file_digest
 from tacpipe.stage import Files, Recording, stage
 
@@ -52,19 +53,18 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     if not source.is_dir():
         raise TacpipeError(f"{source} is no folder; give the folder that holds those of the objects, bleach and so on.")
     found: dict[str, dict[str, Path]] = {}
+    named: list[tuple[str, Path]] = []
     for place, _, names in walk(source):
         there = [name for name in NAMES if name in names]
         if not there:
             continue
         above, time_s = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
-        label = os.path.basename(above)  # noqa: PTH119
+        label, time_s = text(os.path.basename(above)), text(time_s)  # noqa: PTH119
         files = {f"{label}/{time_s}/{name}": Path(place, name) for name in there}
-        other = found.setdefault(valid(f"{label}-{time_s}"), files)
-        if other is not files:
-            raise TacpipeError(
-                f"{next(iter(other.values())).parent} and {place} are the same grasp. Give the folder that holds "
-                f"one of them."
-            )
+        name = valid(f"{label}-{time_s}")
+        named.append((name, Path(place)))
+        found[name] = files
+    recording_names.refuse_shared(named)
     if not found:
         raise TacpipeError(
             f"{source} holds no grasp: no folder in it has {', '.join(NAMES)}. Give the folder of the unpacked data set."
@@ -136,8 +136,8 @@ def _add_twins(found: dict[str, dict[str, Path]]) -> None:
 def _lines(path: Path) -> list[str]:
     """Return the lines of a small file of text. Raises `TacpipeError` if it is empty, or none."""
     try:
-        lines = regular.content(path).decode("ascii").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = regular.source(path).decode("ascii").splitlines()
+    except UnicodeDecodeError as error:
         raise TacpipeError(f"{path} cannot be read as text: {error}. Copy it again from its source.") from error
     while lines and not lines[-1].strip():
         lines.pop()
@@ -204,11 +204,11 @@ def _reading(path: Path) -> list[int]:
         )
     values = []
     for place, cell in enumerate(cells, start=2):
-        text = cell.strip()
-        if not (text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= LARGEST):
+        count = cell.strip()
+        if not (count.isascii() and count.isdigit() and len(count) <= 4 and int(count) <= LARGEST):
             raise TacpipeError(
-                f"{path}, row 1, field {place}: {text[:20]!r} is no count; it must be a whole number from 0 to {LARGEST} "
+                f"{path}, row 1, field {place}: {count[:20]!r} is no count; it must be a whole number from 0 to {LARGEST} "
                 f"(12 bits). Copy it again."
             )
-        values.append(int(text))
+        values.append(int(count))
     return values

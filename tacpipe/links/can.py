@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe import extras
 from tacpipe.errors import DeviceError, UsageError
+from tacpipe.files import listed
 from tacpipe.links import serial_port
 from tacpipe.links.arrival import Arrivals
 from tacpipe.links.opened import Arrived, Opened
@@ -64,7 +65,7 @@ def _refused(error: Exception, kind: str, channel: str, bitrate: int | None, nam
     if kind == "slcan":
         within = error if isinstance(error, OSError) else error.__cause__ or error.__context__
         return serial_port.refused(within if isinstance(within, OSError) else OSError(str(error)), channel, name)
-    there = [path.name for path in INTERFACES.glob("*") if _type(path) == IS_CAN]
+    there = [path.name for path in listed(INTERFACES) if _type(path) == IS_CAN]
     if kind == "socketcan" and channel not in there:
         return DeviceError(
             f"{name}: there is no CAN interface {channel}; there {'are' if len(there) > 1 else 'is'} "

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe import extras
+from tacpipe import extras, files
 from tacpipe.errors import DeviceError, MissingModuleError
 
 BY_ID = Path("/dev/serial/by-id")
@@ -34,7 +34,7 @@ def serial_ports() -> list[Port]:
     with extras.named("A serial port"):
         from serial.tools import list_ports
 
-    lasting = {str(path.resolve()): str(path) for path in BY_ID.glob("*")} if BY_ID.is_dir() else {}
+    lasting = {str(path.resolve()): str(path) for path in files.listed(BY_ID)}
     found = []
     for port in sorted(list_ports.comports()):
         usb_id = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from tacpipe import progress
+from tacpipe import progress, terminal
 from tacpipe.recording import clock
 from tacpipe.recording.watch import Figures, Watch, tactile_channels
 
@@ -55,14 +54,16 @@ class View:
             self._live.update(self._picture(state, figures))
         else:
             told = "; ".join(line(name, found) for name, found in figures.items())
-            print(f"{state}: {told}", file=sys.stderr, flush=True)
+            terminal.note(f"{state}: {told}")
 
     def _picture(self, state: str, figures: Mapping[str, Figures]) -> Any:
         from rich.console import Group
         from rich.table import Table
         from rich.text import Text
 
-        table = Table("stream", "Hz", "jitter ms", "latency ms", "samples", "lost", "bytes lost", title=state)
+        table = Table(
+            "stream", "Hz", "jitter ms", "latency ms", "samples", "lost", "bytes lost", title=terminal.shown(state)
+        )
         for name, found in figures.items():
             latency = "" if found.latency_ms is None else f"{found.latency_ms:.2f}"
             row = (f"{found.rate_hz:.1f}", f"{found.jitter_ms:.2f}", latency, str(found.samples))

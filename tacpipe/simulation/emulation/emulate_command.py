@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from tacpipe import terminal
+
 SUMMARY = "Serve the streams of a rig file without hardware, each with its own bytes at its own rate."
 EXAMPLE = (
     "\n\nFOLDER/rig.toml is the rig file with the addresses that were made: give it to `tacpipe acquire`. FOLDER/ledger "
@@ -48,12 +50,12 @@ def emulate(
     with Ended() as ended, readable_errors(output):
         with Emulator(asked, seed, wrong, output) as emulator:
             write_whole(str(path), rig_file.text(emulator.rig).encode(), f"{path}.draft")
-            print(path, flush=True)
+            terminal.result(path)
             for name, stream in emulator.rig.streams.items():
-                print(f"{name}: {stream.kind} at {stream.address}", file=sys.stderr)
+                terminal.note(f"{name}: {stream.kind} at {stream.address}")
             ended.wait(duration)
         for ledger in emulator.ledger.values():
             ledger.write(output / "ledger")
     for name, ledger in emulator.ledger.items():
         told = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
-        print(f"{name}: {told or 'nobody listened'}", file=sys.stderr)
+        terminal.note(f"{name}: {told or 'nobody listened'}")

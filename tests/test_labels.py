@@ -1,0 +1,74 @@
+"""What `label` and `show` cost: they read and write what they change or list, however many recordings there are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tacpipe.overview import SHOWN
+from tacpipe.store import Store
+from tests.conftest import Lab
+
+MANY = SHOWN + 10
+STREAMS = 2  # of each recording of the toy
+
+
+@pytest.fixture
+def many(lab: Lab) -> Lab:
+    lab.run(f"simulate toy --trials {MANY} -o data/r --jobs 1")
+    return lab
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+    """A function that returns how many objects were read since it was called last."""
+    names: list[str] = []
+    real = Store.read
+    monkeypatch.setattr(Store, "read", lambda store, name: names.append(name) or real(store, name))  # type: ignore[func-returns-value]
+
+    def count() -> int:
+        found = len(names)
+        names.clear()
+        return found
+
+    return count
+
+
+def test_show_reads_the_shards_of_the_recordings_that_it_lists(many: Lab, read: Callable[[], int]) -> None:
+    text = many.run("show data/r").out
+    assert read() == SHOWN * STREAMS
+    assert text.count("left") == SHOWN
+    assert f"… and {MANY - SHOWN} more (--full)" in text
+    assert f"{MANY} recordings, {MANY * STREAMS * 20} rows" in text
+    assert f"material: cork ({MANY})" in text
+    assert many.run("show data/r --full").out.count("left") == MANY
+    assert read() == MANY * STREAMS
+    assert len(json.loads(many.run("show data/r --json").out)["recordings"]) == MANY
+
+
+def inodes(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_ino for path in folder.rglob("*.parquet")}
+
+
+def test_a_label_reads_and_writes_no_shard(many: Lab, read: Callable[[], int]) -> None:
+    before = inodes(many.folder / "data/r")
+    assert len(before) == MANY * STREAMS
+    read()
+    many.run("label data/r trial-003 --set material=foam")
+    shards = {digest for _, digest in many.manifest("data/r").objects()}
+    assert read() <= 3  # manifests
+    assert inodes(many.folder / "data/r") == before
+    assert all(many.store.has(digest) for digest in shards)
+    assert many.manifest("data/r").recordings["trial-003"]["attributes"]["material"] == "foam"
+
+
+def test_a_shard_that_is_gone_when_a_label_is_set_is_brought_back_by_link(many: Lab) -> None:
+    shard = many.folder / "data/r/trial-000/left.parquet"
+    content = shard.read_bytes()
+    shard.unlink()
+    many.run("label data/r trial-003 --set material=foam")
+    many.run("store link data/r")
+    assert shard.read_bytes() == content

@@ -1,0 +1,111 @@
+"""Too little memory is one sentence: no traceback, no abort, and never called damage or a bad recording."""
+
+from __future__ import annotations
+
+import errno
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tacpipe import memory
+from tacpipe.errors import DamagedError, ShortageError, TacpipeError
+from tacpipe.tables import from_parquet, to_parquet
+from tests.conftest import Lab
+
+
+@pytest.mark.parametrize(
+    ("error", "short"),
+    [
+        (MemoryError(), True),
+        (pa.ArrowMemoryError("malloc of size 65536 failed"), True),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), True),
+        (OSError(errno.EAGAIN, "Resource temporarily unavailable"), True),
+        (ImportError("libarrow.so: failed to map segment from shared object"), True),
+        (RuntimeError("can't start new thread"), True),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory"), True),
+        (OSError(errno.EIO, "Input/output error"), False),
+        (ImportError("No module named torch"), False),
+        (RuntimeError("shapes do not match"), False),
+        (ValueError("a mistake"), False),
+    ],
+)
+def test_what_libraries_raise_for_lack_of_memory_is_known_also_as_a_cause(error: Exception, short: bool) -> None:
+    assert (memory.shortage(error) is not None) is short
+    try:
+        raise KeyError("of whoever called it") from error
+    except KeyError as outer:
+        assert (memory.shortage(outer) is not None) is short
+
+
+@pytest.mark.parametrize(
+    "failure", [pa.ArrowMemoryError("malloc of size 65536 failed"), OSError("ZSTD_DCtx create failed")]
+)
+def test_a_table_that_memory_does_not_hold_is_not_called_damaged(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    content = to_parquet(pa.table({"x": np.arange(10)}))
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise failure
+
+    monkeypatch.setattr(pq.ParquetFile, "read", fail)
+    monkeypatch.setattr(memory, "available", lambda: 1 << 20)
+    with pytest.raises(ShortageError, match="needs more memory than there is"):
+        from_parquet(content)
+    monkeypatch.setattr(memory, "available", lambda: 1 << 40)
+    with pytest.raises(DamagedError):
+        from_parquet(content)
+
+
+def test_a_recording_that_memory_does_not_hold_is_no_bad_recording(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    (lab.folder / "raw").mkdir()
+    for name in ("a", "b"):
+        (lab.folder / "raw" / f"{name}.txt").write_text("1\n2\n")
+    real = Path.read_text
+
+    def read_text(path: Path, *given: Any, **named: Any) -> str:
+        if path.name == "b.txt":
+            raise MemoryError
+        return real(path, *given, **named)
+
+    monkeypatch.setattr(Path, "read_text", read_text)
+    ran = lab.call("ingest numbers raw -o data/r --skip-bad")
+    assert ran.code == 1
+    assert "This command needs more memory than there is" in ran.err
+    assert "Traceback" not in ran.err
+    assert not (lab.folder / "data").exists()
+
+
+@pytest.mark.parametrize("megabytes", [60, 150, 400])
+@pytest.mark.parametrize("command", ["show data/r", "scale data/r -o data/s --jobs 2"])
+def test_a_limit_of_address_space_is_answered_by_one_sentence(lab: Lab, command: str, megabytes: int) -> None:
+    lab.run("simulate toy -o data/r --trials 9")
+    ran = subprocess.run(
+        [sys.executable, "-m", "tacpipe.cli", *command.split()],
+        cwd=lab.folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (megabytes << 20, megabytes << 20)),
+    )
+    assert ran.returncode == 1, ran.stderr
+    (line,) = ran.stderr.splitlines()
+    assert line.startswith("tacpipe: This command needs more memory than there is: ")
+    assert line.endswith("run the same command again with more, or with a smaller --jobs.")
+
+
+def test_a_limit_is_named_and_a_library_without_room_is_not_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 100 << 20)
+    memory.require_library("torch")  # there is no limit: the computer may swap
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (512_000_000, 512_000_000))
+    with pytest.raises(
+        TacpipeError, match=r"torch takes .* MB to load; 105 MB are left, of the 512 MB that `ulimit -v`"
+    ):
+        memory.require_library("torch")
