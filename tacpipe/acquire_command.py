@@ -106,7 +106,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     from tacpipe.interruption import Ended
     from tacpipe.recording import appending, trials, triggers
     from tacpipe.recording.recorder import Recorder
-    from tacpipe.recording.view import View
+    from tacpipe.recording.view import View, say
 
     for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
         if value not in known:
@@ -125,7 +125,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
         recorder.await_first(ended)
         recorded, lost = trials.run(recorder, store, plan, view, ended)
     for one in recorded if not quiet else ():
-        print(one.line(), file=sys.stderr)
+        say(one.line())
     return recorded, lost
 
 
@@ -133,6 +133,7 @@ def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
     """Seal what earlier processes left behind; what cannot be sealed is told and stays, and keeps nobody from recording."""
     from tacpipe.recording import spool, trials
     from tacpipe.recording.appending import NothingError
+    from tacpipe.recording.view import say
 
     sealed, left = [], 0
     for folder in spool.abandoned(store.root):
@@ -145,12 +146,12 @@ def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
             continue  # it ended before a sample came
         except Exception as error:  # whatever a damaged spool or another version's driver may raise
             why = error if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            print(f"tacpipe: The spool {folder} stays as it is. {why}", file=sys.stderr)
+            say(f"tacpipe: The spool {folder} stays as it is. {why}")
             left += 1
             continue
         sealed.append(one)
         if not quiet:
-            print(f"recovered {one.line()}", file=sys.stderr)
+            say(f"recovered {one.line()}")
     return sealed, left
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -17,6 +17,30 @@ FRAMES_HZ = 8.0  # of the view on a terminal
 LINE_S = 5.0  # between two plain lines
 SHADES = ("grey15", "dark_blue", "blue", "dark_cyan", "green", "yellow", "orange1", "red")
 COLUMNS = 16  # of the heat map, at most
+
+
+class _Unfailing:
+    """A stream that may be closed at its other end, as by a terminal: what cannot be written is left out."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+
+def say(line: str) -> None:
+    """Print a line to standard error; where nobody can read it any more nothing happens."""
+    print(line, file=_Unfailing(sys.stderr), flush=True)
 
 
 class View:
@@ -40,7 +64,8 @@ class View:
         from rich.console import Console
         from rich.live import Live
 
-        with Live(console=Console(stderr=True), refresh_per_second=FRAMES_HZ, transient=True) as self._live:
+        shown: Any = _Unfailing(sys.stderr)
+        with Live(console=Console(file=shown), refresh_per_second=FRAMES_HZ, transient=True) as self._live:
             yield self
         self._live = None
 
@@ -55,7 +80,7 @@ class View:
             self._live.update(self._picture(state, figures))
         else:
             told = "; ".join(line(name, found) for name, found in figures.items())
-            print(f"{state}: {told}", file=sys.stderr, flush=True)
+            say(f"{state}: {told}")
 
     def _picture(self, state: str, figures: Mapping[str, Figures]) -> Any:
         from rich.console import Group
