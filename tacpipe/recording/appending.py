@@ -13,6 +13,7 @@ import numpy as np
 from tacpipe import directory, provenance
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.excerpt import plain
 from tacpipe.manifest import ACQUIRE, Entry, Manifest
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
@@ -76,7 +77,14 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             files=dict(sorted({**now.files, named: text}.items())),
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
-        store.put(now.content, durable=True)
+        try:
+            manifest_of.check(now)
+            content = now.content
+        except (ValueError, TypeError, KeyError) as error:  # what every reader would refuse is never published
+            raise TacpipeError(
+                f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
+            ) from error
+        store.put(content, durable=True)
         directory.publish_alone(store, now, output, may_lack=_others(now, name, named))
     return name
 

@@ -9,11 +9,13 @@ from pathlib import Path
 
 from tacpipe import interruption
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt, plain
 from tacpipe.interruption import Ended
-from tacpipe.recording import appending, clock, sealing, triggers
+from tacpipe.manifest import NAME_BYTES
+from tacpipe.recording import appending, clock, header, sealing, triggers
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import Spool, Spooled
+from tacpipe.recording.spool import Spool, Spooled, users
 from tacpipe.recording.view import View
 from tacpipe.stage import Attribute
 from tacpipe.store import Store
@@ -54,7 +56,7 @@ class Recorded:
             f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
             for name, rows in self.rows.items()
         )
-        return f"{self.name}: {self.seconds:.1f} s, {told}"
+        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {told}"
 
 
 def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> tuple[list[Recorded], list[str]]:
@@ -88,16 +90,21 @@ def _await(recorder: Recorder, starts: triggers.Trigger, ended: Ended, view: Vie
     recorder.run(lambda: ended() or starts(), lambda: view.show(waiting))
 
 
-def recover(store: Store, folder: Path) -> Recorded:
+def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
     """Seal what an abandoned spool holds and append it to the dataset that it was recorded for.
 
-    Raises `TacpipeError` with what keeps it from being sealed; it stays as it is then.
+    ``opened`` is the dataset that this command was given, None for none. Raises `TacpipeError` with what keeps it from being
+    sealed: it is another user's, it names what no dataset can hold, or a dataset elsewhere. It stays as it is then.
     """
     from tacpipe.recording import rig as rig_of
 
-    spooled = Spooled(folder)
-    rig = rig_of.parse(spooled.header["rig"], f"The rig file in {folder}")
-    return _sealed(store, Path(spooled.header["output"]), spooled, rig)
+    spooled = Spooled(folder, users(folder.parent, [folder.lstat().st_uid]))
+    told = spooled.header.get("rig")
+    if not isinstance(told, str):
+        raise TacpipeError(f"Its rig file is {excerpt(told)}; it must be a text.")
+    rig = rig_of.parse(told, f"The rig file in {folder}")
+    header.check(spooled.header, rig.streams)
+    return _sealed(store, header.destination(spooled.header, store, opened), spooled, rig)
 
 
 def _record(
@@ -105,8 +112,8 @@ def _record(
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
-    header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
-    spool = Spool(store.root, {**header, "rig": recorder.rig.text}, list(recorder.stations))
+    told = {"output": header.output(store, plan.output), "recording": name, "attributes": attributes}
+    spool = Spool(store.root, {**told, "rig": recorder.rig.text}, list(recorder.stations))
     began_s = clock.now_s()
 
     def over() -> bool:
