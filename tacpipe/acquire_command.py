@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import sys
@@ -167,10 +168,11 @@ def _tell_others(store: Store) -> None:
     from tacpipe.recording import spool
     from tacpipe.recording.view import say
 
-    others = spool.owners(store.root)
-    ours = spool.users(store.root / spool.FOLDER, others.values())
-    for folder, owner in others.items():
-        if owner not in ours:
+    with contextlib.suppress(OSError):  # of a disk that failed, which was said already
+        others = spool.owners(store.root)
+        ours = spool.users(store.root / spool.FOLDER, others.values())
+        for folder in [folder for folder, owner in others.items() if owner not in ours]:
+            owner = others[folder]
             say(f"The spool {folder} belongs to {spool.user(owner)}, who alone can seal it.")
 
 

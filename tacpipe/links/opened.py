@@ -63,6 +63,11 @@ class Opened:
         """How many packets this computer dropped: 0 where it does not tell."""
         return 0
 
+    @property
+    def kernel_stamped(self) -> bool:
+        """Whether the kernel stamps what arrives: no, it is stamped when it is read."""
+        return False
+
     def lost(self, why: str, check: str = "its cable and its power") -> LinkLostError:
         """Return the error that says that the device is gone."""
         return LinkLostError(f"{self.name} is lost: {why}. Check {check}.")

@@ -89,6 +89,7 @@ class UdpLink(Descriptor):
         self._prompt, self._talks = prompt, talks
         self._arrivals = Arrivals()
         self._overruns = 0
+        self._stamped = False
         self._sender: Any = None  # of the last datagram
         self._failed: LinkLostError | None = None  # why the link is lost, until that is told
 
@@ -102,6 +103,11 @@ class UdpLink(Descriptor):
     def overruns(self) -> int:
         """How many datagrams the kernel dropped because its queue was full."""
         return self._overruns
+
+    @property
+    def kernel_stamped(self) -> bool:
+        """Whether the kernel stamped the last datagram."""
+        return self._stamped
 
     def _receive(self, timeout_s: float) -> Arrived:
         found = super()._receive(timeout_s) if self._failed is None else []
@@ -146,6 +152,7 @@ class UdpLink(Descriptor):
                 wall_ns = seconds * 1_000_000_000 + nanoseconds
             elif level == socket.SOL_SOCKET and kind == DROPS:
                 self._overruns = int.from_bytes(data[:4], "little")
+        self._stamped = wall_ns is not None
         return time.time_ns() if wall_ns is None else wall_ns
 
     def _send(self, data: bytes) -> None:

@@ -182,6 +182,8 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
             attributes[f"{name}_missing"] = True
         if one.undecoded:
             attributes[f"{name}_undecoded_bytes"] = one.undecoded
+        if one.uncertain:
+            attributes[f"{name}_uncertain_samples"] = one.uncertain
         if one.crashed[0]:
             attributes |= {f"{name}_crash_lost_reads": one.crashed[0], f"{name}_crash_lost_bytes": one.crashed[1]}
     return attributes
