@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device says of a sample; they stay as they are
-UNCERTAIN = (
-    "t_uncertain_ns"  # by how much a sample came earlier than its stamp, where the recorder was held up; no channel
-)
+UNCERTAIN = "t_uncertain_ns"  # by how much a sample may be stamped late; the recorder's, and no channel
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
 MEDIAN_NS = (
     10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls

@@ -61,6 +61,10 @@ def add(program: typer.Typer, summary: str) -> None:
         ] = None,
         dry_run: Annotated[bool, typer.Option("--dry-run", help="Open, check rates for 3 s, record nothing.")] = False,
         recover: Annotated[bool, typer.Option("--recover", help="Seal what a crash left behind, and end.")] = False,
+        keep_spool: Annotated[
+            bool,
+            typer.Option("--keep-spool", help="Keep the raw bytes of the links too; the spool's place is printed."),
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="Nothing on stderr but errors.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
@@ -93,6 +97,7 @@ def add(program: typer.Typer, summary: str) -> None:
             stop,
             contact_count,
             trials > 1 if tare is None else tare,
+            keep_spool,
             _attributes(label or [], note),
         )
         recorded, lost = _record(found, store, plan, quiet=quiet)

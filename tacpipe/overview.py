@@ -12,6 +12,7 @@ from tacpipe import execution, model_overview
 from tacpipe import manifest as manifest_of
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.headline import counted
+from tacpipe.recording import ending
 from tacpipe.stage import ROLES
 from tacpipe.store import locate
 
@@ -140,6 +141,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
         lines.append(f"… and {len(names) - len(shown)} more (--full)")
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
+    lines += ending.lines(value["attributes"], value["recordings"])
     lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
     lines += _files(value)
     lines.append(

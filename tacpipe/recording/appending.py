@@ -176,6 +176,9 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
     master = rig.streams[rig.master]
     attributes: dict[str, Attribute] = {"sensor": master.sensor.product or master.kind, "master": rig.master}
     attributes |= {**rig.labels, **spooled.header["attributes"]}
+    attributes["ended"] = spooled.ended
+    if spooled.header.get("duration_s") is not None:
+        attributes["requested_duration_s"] = float(spooled.header["duration_s"])
     for name, one in sealed.items():
         attributes[f"{name}_lost"] = one.lost
         if not one.table.num_rows:

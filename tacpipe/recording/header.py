@@ -63,6 +63,9 @@ def check(header: Mapping[str, Any], streams: Iterable[str]) -> None:
         raise TacpipeError(
             f"Its attributes are {excerpt(attributes)}; each must be text, a finite number, true or false."
         )
+    duration_s = header.get("duration_s")  # spools of before have none
+    if duration_s is not None and (not _is_attribute(duration_s) or isinstance(duration_s, str)):
+        raise TacpipeError(f"Its duration is {excerpt(duration_s)}; it must be a number of seconds.")
     readings = [clock.get(key) for key in ("monotonic_ns", "utc_ns")] if isinstance(clock, dict) else [None]
     if not all(type(one) is int and abs(one) < MOST_NS for one in readings):
         raise TacpipeError(f"Its clock is {excerpt(clock)}; it must hold monotonic_ns and utc_ns, whole nanoseconds.")

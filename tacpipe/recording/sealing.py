@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
+from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import MOST_CATCH_UP_NS, parsed
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
@@ -220,6 +221,17 @@ def _joined(parts: Sequence[Any], kind: Any) -> NDArray[Any]:
     return np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
 
 
+def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Event, str]]:
+    """Return the event of a recording that was not completed, with how much of it there is; nothing for one that was."""
+    stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
+    if spooled.ended == COMPLETED or not stamps:
+        return []
+    first_ns, last_ns = min(times[0].as_py() for times in stamps), max(times[-1].as_py() for times in stamps)
+    requested_s = spooled.header.get("duration_s")
+    of = "no duration was requested" if requested_s is None else f"{requested_s:g} s were requested"
+    return [(Event(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {of}"), "")]
+
+
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     """Return the table of what went wrong in all streams, in the order of time."""
     import pyarrow as pa
@@ -227,6 +239,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     from tacpipe.formats import channels
 
     rows = sorted((event, name) for name, one in sealed.items() for event in one.events)
+    rows += _cut_off(sealed, spooled)
     rows = [
         (Event(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=found.bytes), "")
         for found in spooled.damage

@@ -3,7 +3,8 @@
 A recording's folder in the store holds
 
 - ``header.json``: what is recorded and for whom, and the UTC time of one reading of the monotonic clock;
-- ``bytes``: blocks, each with a mark, a check sum, and the chunks of one stream with their arrival, or a note;
+- ``bytes``: blocks, each with a mark, a check sum, and the chunks of one stream with their arrival, or a note on a stream or
+  on the recording, as how it ended;
 - ``tally``: how much every stream has received so far, in memory shared with the disk cache: what a killed process had
   read and not yet written is known from it.
 
@@ -41,12 +42,16 @@ import numpy as np
 from tacpipe import regular
 from tacpipe.errors import TacpipeError
 from tacpipe.files import listed, readable_errors, sync_folder, write_whole
+from tacpipe.recording.ending import COMPLETED, INTERRUPTED, RECOVERED
 from tacpipe.sensors.framing import Chunks
 
 FOLDER = "spool"  # within the store
 MARK = b"tacB"
 HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
 CHUNKS, NOTE = 0, 1  # kinds of blocks
+WHOLE = 255  # in the place of a stream's number: a note on the recording, which has the stream ""
+ENDED = "ended"  # such a note
+KEPT = "kept-spools"  # within the store: where spools lie that are sealed and kept
 TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
 YOUNG_S = 60.0  # for which a spool without a header may be one that is being begun
 RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # after a full disk
@@ -133,7 +138,7 @@ class Spool:
     def note(self, note: Note) -> None:
         """Add a note."""
         body = json.dumps({"t_ns": note.t_ns, "what": note.what, "detail": note.detail}).encode()
-        self._waiting.append(_block(NOTE, self.streams[note.stream], 0, body))
+        self._waiting.append(_block(NOTE, self.streams[note.stream] if note.stream else WHOLE, 0, body))
 
     def write(self) -> None:
         """Hand over what was added to the operating system: it outlasts this process.
@@ -201,14 +206,21 @@ class Spooled:
                 f"Remove the folder."
             ) from error
         self.damage: list[Damage] = []
+        self._notes: list[Note] = []  # on the recording
+
+    @property
+    def ended(self) -> str:
+        """How the recording ended, as far as its blocks were read: one whose process did not end it was recovered."""
+        told = next((note.detail for note in self._notes if note.what == ENDED), "")
+        return told if told in (COMPLETED, INTERRUPTED) else RECOVERED
 
     def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | Note]]:
         """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
 
-        What is no block is passed over, and noted in ``damage``.
+        What is no block is passed over, and noted in ``damage``. Notes on the recording are read along, see `ended`.
         """
         wanted = None if stream is None else self.streams.index(stream)
-        self.damage = []
+        self.damage, self._notes = [], []
         with contextlib.ExitStack() as opened:
             file = opened.enter_context(self._opened("bytes"))
             if not os.fstat(file.fileno()).st_size:
@@ -234,6 +246,9 @@ class Spooled:
                         self._damaged(place, stop - place)
                     else:
                         yield self.streams[number], told
+                elif number == WHOLE:
+                    told = _body(kind, "", count, content[place + HEAD.size : place + HEAD.size + size])
+                    self._notes += [told] if isinstance(told, Note) else []
                 place = stop
 
     def _damaged(self, offset: int, size: int) -> None:
@@ -260,6 +275,18 @@ class Spooled:
     def remove(self) -> None:
         """Remove the spool, whose content is sealed."""
         _remove(self.folder)
+
+    def keep(self) -> Path:
+        """Move the spool, whose content is sealed, to where no command looks for one; return where it lies."""
+        kept = self.folder.parent.parent / KEPT
+        with readable_errors(kept.parent):
+            kept.mkdir(mode=0o777, exist_ok=True)
+            if kept.is_symlink():
+                raise TacpipeError(f"{kept} is a symbolic link. Remove it.")
+            self.folder.rename(kept / self.folder.name)
+            for folder in (kept, self.folder.parent, kept.parent):
+                sync_folder(str(folder))
+        return kept / self.folder.name
 
     def _opened(self, name: str) -> io.FileIO:
         """Return one of its files, opened. Raises `TacpipeError` for one that is no regular file, or another user's."""
