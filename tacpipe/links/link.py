@@ -63,6 +63,10 @@ class Link(Protocol):
         """How many packets this computer dropped so far because they were not fetched in time, where it tells."""
 
     @property
+    def foreign(self) -> int:
+        """How many packets of other senders were left out so far, where the address names the one that counts."""
+
+    @property
     def kernel_stamped(self) -> bool:
         """Whether the kernel stamps what arrives: its stamps are right however late it is read."""
 

@@ -64,6 +64,11 @@ class Opened:
         return 0
 
     @property
+    def foreign(self) -> int:
+        """How many packets of other senders were left out: 0 where any sender counts."""
+        return 0
+
+    @property
     def kernel_stamped(self) -> bool:
         """Whether the kernel stamps what arrives: no, it is stamped when it is read."""
         return False

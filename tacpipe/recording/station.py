@@ -22,6 +22,8 @@ from tacpipe.sensors.sensor import Sensor
 
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
+FOREIGN = "foreign"  # packets of other senders than the one that counts
+FOREIGN_S = 1.0  # between two notes of such
 STALLED, CAUGHT_UP = (
     "recorder_stalled",
     "caught_up",
@@ -53,7 +55,8 @@ class Station:
         self._thread = threading.Thread(target=self._run, name=stream.name, daemon=True)
         self._keeping = threading.Lock()
         self._orders: deque[Callable[[Link], None]] = deque()  # carried out by the thread, between two reads
-        self._chunks = self._bytes = self._overruns = 0
+        self._chunks = self._bytes = self._overruns = self._foreign = 0
+        self._foreign_s = 0.0  # when such packets were noted last
         self._wait_s = AGAIN_S[0]
 
     def start(self) -> None:
@@ -81,12 +84,16 @@ class Station:
             self._chunks = sum(len(block.size) for block in counted)
             self._bytes = sum(len(block.data) for block in counted)
             self._tally = tally
+            self._foreign = (
+                self._link.foreign if self._link is not None else 0
+            )  # what came before is not of this recording
             return found
 
     def end(self) -> list[Chunks | Note]:
         """Return what came since the last call, and tell no tally any more."""
         with self._keeping:
             self._tally = None
+            self._note_foreign(self._link)
             return self._taken()
 
     def tare(self) -> bool:
@@ -135,7 +142,7 @@ class Station:
         except BaseException:
             link.close()
             raise
-        self._overruns = link.overruns
+        self._overruns, self._foreign = link.overruns, link.foreign
         self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
         self._link, self.error = link, None
         self._keep(early)
@@ -185,6 +192,9 @@ class Station:
                         pace.resume(clock.now_ns())
             if link.overruns != self._overruns:
                 self._overran(link.overruns)
+            if link.foreign != self._foreign and time.monotonic() - self._foreign_s > FOREIGN_S:
+                with self._keeping:
+                    self._note_foreign(link)
 
     def _paced(self, link: Link, timeout_s: float, pace: Pace) -> list[tuple[int, bytes]]:
         """Return what came, and note where this program was held up before it, and where what is read no longer waited."""
@@ -227,6 +237,12 @@ class Station:
         while self._orders:
             self._orders.popleft()(link)
             pace.resume(clock.now_ns())
+
+    def _note_foreign(self, link: Link | None) -> None:
+        if link is not None and link.foreign > self._foreign:
+            told = f"{link.foreign - self._foreign} packets of other senders were left out"
+            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, told))
+            self._foreign, self._foreign_s = link.foreign, time.monotonic()
 
     def _overran(self, overruns: int) -> None:
         self._notes.append(Note(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))

@@ -65,7 +65,7 @@ def spooled(folder: Path, **streams: list[Chunks | Note]) -> Spooled:
 class Link:
     """A link that gives what it is told to, and raises what it is told to."""
 
-    packets, overruns, kernel_stamped = False, 0, False
+    packets, overruns, foreign, kernel_stamped = False, 0, 0, False
     local: dict[str, Any] = {}  # noqa: RUF012
 
     def __init__(self, came: list[Any], closing: Exception | None = None, pace_s: float = 0.0) -> None:

@@ -34,7 +34,8 @@ READ_NS = round(READ_S * 1e9)
 class Device:
     """A serial device that sends a frame a millisecond, and a computer that stops now and then."""
 
-    overruns, local = 0, {}
+    overruns = foreign = 0
+    local: dict[str, Any] = {}  # noqa: RUF012
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, sent: list[bytes], stops: dict[int, int], asleep: bool = False):
         self.now_ns, self.asleep_ns = START_NS, 0
