@@ -233,8 +233,7 @@ class Spooled:
                     passed += PASSED_BYTES
                 stop = _end(content, place)
                 if stop is None:
-                    found = content.find(MARK, place + 1)
-                    found = len(content) if found < 0 else found
+                    found = _next(file.fileno(), content, place)
                     self._damaged(place, found - place)
                     place = found
                     continue
@@ -430,6 +429,21 @@ def _end(content: mmap.mmap, place: int) -> int | None:
         return None
     with memoryview(content) as view, view[place + 8 : stop] as covered:
         return stop if zlib.crc32(covered) == check else None
+
+
+def _next(handle: int, content: mmap.mmap, place: int) -> int:
+    """Return where after ``place``, where there is no block, one may begin; holes of the file are passed over unread."""
+    try:
+        data = os.lseek(handle, place, os.SEEK_DATA)
+        if data > place:
+            return min(data, len(content))
+        stop = min(os.lseek(handle, place, os.SEEK_HOLE), len(content))
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # nothing follows but a hole
+            return len(content)
+        stop = len(content)  # a file system that does not tell
+    found = content.find(MARK, place + 1, stop)
+    return stop if found < 0 else found
 
 
 def _body(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | None:
