@@ -57,7 +57,7 @@ def name_signals() -> None:
     def name(number: int, frame: FrameType | None) -> None:
         test = os.environ.get("PYTEST_CURRENT_TEST", "no test")
         told = f"\nprocess {os.getpid()} of pytest ends by {signal.Signals(number).name} in {test}:\n"
-        os.write(error, (told + "".join(traceback.format_stack(frame))).encode())
+        os.write(error, (told + "".join(traceback.format_stack(frame, limit=4))).encode())
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
