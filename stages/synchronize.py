@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device says of a sample; they stay as they are
+UNCERTAIN = "t_uncertain_ns"  # by how much a sample may be stamped late; the recorder's, and no channel
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
 MEDIAN_NS = (
     10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
@@ -148,7 +149,7 @@ def _on_host_clock(
         )
     device_ns = column.cast(pa.int64()).to_numpy()
     try:
-        fit = fit_clock(device_ns, arrival_ns)
+        fit = fit_clock(device_ns, arrival_ns, _certain(columns))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording}, stream {stream!r}: {error}") from error
     return host_times(fit, device_ns, arrival_ns), {
@@ -156,6 +157,14 @@ def _on_host_clock(
         f"{stream}_clock_drift_ppm": round(fit.drift_ppm, 1),
         f"{stream}_clock_residual_ms": round(fit.median_residual_ns / 1e6, 3),
     }
+
+
+def _certain(columns: Columns) -> NDArray[np.bool_] | None:
+    """Return which rows have an arrival that was recorded in time, None where all have."""
+    if UNCERTAIN not in columns.column_names:
+        return None
+    found: NDArray[np.bool_] = columns.column(UNCERTAIN).to_numpy() == 0
+    return found
 
 
 def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
@@ -346,7 +355,7 @@ def _held(columns: Columns) -> NDArray[np.bool_]:
 
 
 def _channel_names(columns: Columns) -> list[str]:
-    return [name for name in columns.column_names if name != "t_ns"]
+    return [name for name in columns.column_names if name not in ("t_ns", UNCERTAIN)]
 
 
 def _method(schema: pa.Schema, name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import time
@@ -35,7 +36,8 @@ def add(program: typer.Typer, summary: str) -> None:
     def acquire(
         rig: Annotated[Path | None, typer.Argument(help="The rig file; docs/rig.md tells how to write one.")] = None,
         output: Annotated[
-            Path | None, typer.Option("-o", "--output", help="Dataset of recordings to append to.")
+            Path | None,
+            typer.Option("-o", "--output", help="Dataset to append to; --recover seals what was recorded for it too."),
         ] = None,
         duration: Annotated[
             float | None, typer.Option(help="Seconds a recording; without it until Ctrl-C or --stop.")
@@ -59,6 +61,10 @@ def add(program: typer.Typer, summary: str) -> None:
         ] = None,
         dry_run: Annotated[bool, typer.Option("--dry-run", help="Open, check rates for 3 s, record nothing.")] = False,
         recover: Annotated[bool, typer.Option("--recover", help="Seal what a crash left behind, and end.")] = False,
+        keep_spool: Annotated[
+            bool,
+            typer.Option("--keep-spool", help="Keep the raw bytes of the links too; the spool's place is printed."),
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="Nothing on stderr but errors.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
@@ -76,7 +82,9 @@ def add(program: typer.Typer, summary: str) -> None:
         if found is not None and output is None and not recover:
             raise UsageError("acquire needs -o: the dataset of recordings to append to.")
         began_s = time.monotonic()
-        sealed, left = _recovered(store, quiet=quiet)
+        sealed, left = _recovered(store, output, quiet=quiet)
+        if recover and not quiet:
+            _tell_others(store)
         if found is None or output is None or recover:
             _tell(output, sealed, began_s, as_json=as_json)
             raise typer.Exit(FAILED if left else DONE)
@@ -89,6 +97,7 @@ def add(program: typer.Typer, summary: str) -> None:
             stop,
             contact_count,
             trials > 1 if tare is None else tare,
+            keep_spool,
             _attributes(label or [], note),
         )
         recorded, lost = _record(found, store, plan, quiet=quiet)
@@ -104,14 +113,14 @@ def add(program: typer.Typer, summary: str) -> None:
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe import directory
     from tacpipe.interruption import Ended
-    from tacpipe.recording import appending, trials, triggers
+    from tacpipe.recording import appending, header, trials, triggers
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import View
 
     for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
         if value not in known:
             raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
-    if not NAME.fullmatch(plan.name):
+    if not NAME.fullmatch(plan.name) or not header.is_name(plan.name):
         raise UsageError(f"--name {plan.name!r} names no file; take letters, digits, _, - and dots, no dot in front.")
     if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
         raise UsageError("--trials and --duration must be above 0.")
@@ -129,8 +138,12 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     return recorded, lost
 
 
-def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Seal what earlier processes left behind; what cannot be sealed is told and stays, and keeps nobody from recording."""
+def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
+    """Seal what earlier processes of this user left behind; what cannot be sealed is told and stays.
+
+    It keeps nobody from recording. ``output`` is the dataset that this command was given.
+    """
+    from tacpipe.excerpt import plain
     from tacpipe.recording import spool, trials
     from tacpipe.recording.appending import NothingError
 
@@ -140,11 +153,11 @@ def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
             with spool.claimed(folder) as ours:
                 if not ours:
                     continue
-                one = trials.recover(store, folder)
+                one = trials.recover(store, folder, output)
         except NothingError:
             continue  # it ended before a sample came
         except Exception as error:  # whatever a damaged spool or another version's driver may raise
-            why = error if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+            why = error if isinstance(error, TacpipeError) else plain(f"{type(error).__name__}: {error}", 300)
             terminal.note(f"tacpipe: The spool {folder} stays as it is. {why}")
             left += 1
             continue
@@ -152,6 +165,18 @@ def _recovered(store: Store, *, quiet: bool) -> tuple[list[Recorded], int]:
         if not quiet:
             terminal.note(f"recovered {one.line()}")
     return sealed, left
+
+
+def _tell_others(store: Store) -> None:
+    """Print whose the spools are that another user recorded, in a store that is shared."""
+    from tacpipe.recording import spool
+
+    with contextlib.suppress(OSError):  # of a disk that failed, which was said already
+        others = spool.owners(store.root)
+        ours = spool.users(store.root / spool.FOLDER, others.values())
+        for folder in [folder for folder, owner in others.items() if owner not in ours]:
+            owner = others[folder]
+            terminal.note(f"The spool {folder} belongs to {spool.user(owner)}, who alone can seal it.")
 
 
 def _dry_run(rig: Rig, *, as_json: bool) -> str:

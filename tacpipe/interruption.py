@@ -1,13 +1,17 @@
-"""A wish to end, by Ctrl-C or SIGTERM: a command ends within a second, whatever it is doing, and says one sentence.
+"""A wish to end, by Ctrl-C, SIGTERM or SIGHUP: a command ends within a second, whatever it is doing, and says one sentence.
 
 Python hears of a signal between two of its own steps, and a long call in C has none. So a thread hears of it too, and ends
 the process where `KeyboardInterrupt` has not. That is safe at any point: nothing in a store is ever half written.
+
+SIGHUP comes when a terminal or an ssh connection closes: from the kernel, and often again from the shell or from systemd. It
+never counts as a second request. What was connected to standard output and error may be gone, so writing there may fail.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import sys
 import threading
@@ -22,7 +26,7 @@ from tacpipe.errors import INTERRUPTED
 GRACE_S = 0.7  # to end in good order
 TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a wish is the same one
 SENTENCE = "tacpipe: interrupted; what was finished is kept."
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class _Wishes:
@@ -56,8 +60,11 @@ class _Program:
         self.restore: Callable[[], None] = lambda: None  # what was done to the terminal
 
     def ask(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt` for the first wish, end at once for the second: the handler of both signals."""
-        if not self.heard.another():
+        """Raise `KeyboardInterrupt` for the first wish, end at once for the second: the handler of all signals."""
+        hung_up = number == signal.SIGHUP
+        if hung_up:
+            drop_closed_streams()
+        if not self.heard.another() or (hung_up and self.ending):
             return
         if self.ending or self.code is not None:
             self.end()
@@ -67,11 +74,12 @@ class _Program:
 
     def listen(self, wakeups: int) -> None:
         """See to it that the process ends soon after a wish: run by a thread that hears of signals from C."""
-        expected = False
+        expected = requested = False
         while True:
             (number,) = os.read(wakeups, 1)
-            if number not in _SIGNALS or not self.noticed.another():
+            if number not in _SIGNALS or not self.noticed.another() or (number == signal.SIGHUP and requested):
                 continue
+            requested = True
             if self.own_way:
                 self.own_way = False
             elif expected:
@@ -167,9 +175,13 @@ def held() -> Iterator[None]:
 
 
 class Ended:
-    """Whether somebody asked to end: the first wish ends what runs in its own way and keeps it, the second interrupts."""
+    """Whether somebody asked to end: the first wish ends what runs in its own way and keeps it, the second interrupts.
+
+    ``number`` is the signal that asked, None before.
+    """
 
     def __init__(self) -> None:
+        self.number: int | None = None
         self._asked = threading.Event()
         self._heard = _Wishes()
 
@@ -183,6 +195,8 @@ class Ended:
 
     def __exit__(self, *_: object) -> None:
         _program.own_way = False
+        if self.number == signal.SIGHUP:
+            drop_closed_streams()  # those at the other end of a pipe may have ended after this process heard of it
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
@@ -195,12 +209,30 @@ class Ended:
         self._asked.wait(timeout_s)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        if not self._heard.another():
+        if number == signal.SIGHUP:
+            drop_closed_streams()
+        if not self._heard.another() or (number == signal.SIGHUP and self._asked.is_set()):
             return
         if self._asked.is_set():
             _program.ending = True
             raise KeyboardInterrupt
+        self.number = number
         self._asked.set()
+
+
+def drop_closed_streams() -> None:
+    """Connect standard output and error to /dev/null where their terminal or the other end of their pipe is closed.
+
+    Every write there would raise, and end what is still to be finished.
+    """
+    for handle in (1, 2):
+        with contextlib.suppress(OSError):
+            watched = select.poll()
+            watched.register(handle, select.POLLOUT)
+            if any(state & (select.POLLHUP | select.POLLERR) for _, state in watched.poll(0)):
+                nothing = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nothing, handle)
+                os.close(nothing)
 
 
 def _terminal() -> Callable[[], None]:

@@ -13,6 +13,7 @@ from tacpipe import execution, model_overview, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.headline import counted
+from tacpipe.recording import ending
 from tacpipe.stage import ROLES
 from tacpipe.store import locate
 
@@ -142,6 +143,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
         lines.append(f"… and {count - len(shown)} more (--full)")
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
+    lines += ending.lines(value["attributes"], value["recordings"])
     lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
     lines += _files(value)
     lines.append(

@@ -62,7 +62,8 @@ def result_json(value: Any) -> None:
 
 def note(text: object) -> None:
     """Print on stderr what a user should know beside the result, line by line `shown`."""
-    print(lines(str(text).split("\n")), file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError, ValueError):  # nobody can read it any more
+        print(lines(str(text).split("\n")), file=sys.stderr, flush=True)
 
 
 class _Standard(io.FileIO):

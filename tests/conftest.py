@@ -9,9 +9,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 import pytest
 from hypothesis import settings
@@ -42,6 +44,26 @@ settings.load_profile("tacpipe")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: programs that the tests interrupt inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    name_signals()
+
+
+def name_signals() -> None:
+    """Have a signal that would end this process without a word named first: else a worker dies and nobody knows why."""
+    error = os.dup(2)  # now: while tests run it is captured, and what is captured dies with the process
+
+    def name(number: int, frame: FrameType | None) -> None:
+        test = os.environ.get("PYTEST_CURRENT_TEST", "no test")
+        told = f"\nprocess {os.getpid()} of pytest ends by {signal.Signals(number).name} in {test}:\n"
+        os.write(error, (told + "".join(traceback.format_stack(frame, limit=4))).encode())
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGIO, signal.SIGUSR1, signal.SIGUSR2):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, name)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

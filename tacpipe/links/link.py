@@ -62,6 +62,14 @@ class Link(Protocol):
     def overruns(self) -> int:
         """How many packets this computer dropped so far because they were not fetched in time, where it tells."""
 
+    @property
+    def foreign(self) -> int:
+        """How many packets of other senders were left out so far, where the address names the one that counts."""
+
+    @property
+    def kernel_stamped(self) -> bool:
+        """Whether the kernel stamps what arrives: its stamps are right however late it is read."""
+
 
 def parse(text: str) -> Address:
     """Return the address that a rig file or a command line names.

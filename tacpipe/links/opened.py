@@ -63,6 +63,16 @@ class Opened:
         """How many packets this computer dropped: 0 where it does not tell."""
         return 0
 
+    @property
+    def foreign(self) -> int:
+        """How many packets of other senders were left out: 0 where any sender counts."""
+        return 0
+
+    @property
+    def kernel_stamped(self) -> bool:
+        """Whether the kernel stamps what arrives: no, it is stamped when it is read."""
+        return False
+
     def lost(self, why: str, check: str = "its cable and its power") -> LinkLostError:
         """Return the error that says that the device is gone."""
         return LinkLostError(f"{self.name} is lost: {why}. Check {check}.")

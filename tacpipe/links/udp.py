@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import socket
 import struct
 import time
 from collections.abc import Mapping
 from typing import Any
 
-from tacpipe.errors import DeviceError
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.excerpt import plain
 from tacpipe.links import holders, network
 from tacpipe.links.arrival import Arrivals
 from tacpipe.links.link import LinkLostError
@@ -21,17 +23,25 @@ QUEUE = 8 << 20  # bytes that the kernel keeps until they are fetched, if it gra
 LINGER_S = 0.005  # after the first datagram, for more to be fetched with it: their stamps are the kernel's
 STAMPS, DROPS = 35, 40  # SO_TIMESTAMPNS and SO_RXQ_OVFL of <asm-generic/socket.h>, which Python does not name
 FORCED_QUEUE = 33  # SO_RCVBUFFORCE of the same
+FIRST = "first"  # the sender of the first datagram
+MOST_QUEUED = 16_384  # datagrams that are fetched in one go
 ROOM = 128  # bytes for both ancillary messages
 
 
 def open_udp(place: str, sensor: Sensor, name: str) -> UdpLink:
     """Return an open port: listening for ``:PORT`` and for sensors that are listened to, else talking to the host.
 
-    Raises `DeviceError` for a local port that is taken, and for a host that is unknown or unreachable.
+    Where it listens, ``?sender=ADDRESS`` has it read what that address sends alone, and ``?sender=first`` what the first one
+    sends that it hears. Raises `UsageError` for another sender, `DeviceError` for a local port that is taken, and for a host
+    that is unknown or unreachable.
     """
+    place, _, option = place.partition("?")
     host, port = network.place("udp", place)
     if not host or sensor.listens:
-        return UdpLink(name, bound(host, port, name), prompt=hurries(sensor))
+        sender = _declared(option, name)
+        return UdpLink(name, bound(host, port, name), prompt=hurries(sensor), sender=sender)
+    if option:
+        raise UsageError(f"{name}: only what {host} sends is read there; leave ?{plain(option)} out.")
     made = None
     try:
         family, *_, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -43,6 +53,19 @@ def open_udp(place: str, sensor: Sensor, name: str) -> UdpLink:
             made.close()
         raise network.failed(error, host, port, name) from error
     return UdpLink(name, made, prompt=hurries(sensor), talks=True)
+
+
+def _declared(option: str, name: str) -> str:
+    """Return the sender that the option of an address declares, empty for any. Raises `UsageError` for what is none."""
+    key, _, sender = option.partition("=")
+    if not option or (key == "sender" and sender == FIRST):
+        return sender
+    try:
+        if key == "sender":
+            return str(ipaddress.ip_address(sender))
+    except ValueError:
+        pass
+    raise UsageError(f"{name}: ?{plain(option)} is no sender; write ?sender=192.168.1.20, or ?sender={FIRST}.")
 
 
 def bound(host: str, port: int, name: str) -> socket.socket:
@@ -83,13 +106,16 @@ class UdpLink(Descriptor):
 
     packets = True
 
-    def __init__(self, name: str, port: socket.socket, *, prompt: bool, talks: bool = False) -> None:
+    def __init__(self, name: str, port: socket.socket, *, prompt: bool, talks: bool = False, sender: str = "") -> None:
         super().__init__(name, port.fileno())
         self.socket = port
         self._prompt, self._talks = prompt, talks
         self._arrivals = Arrivals()
         self._overruns = 0
+        self._stamped = False
         self._sender: Any = None  # of the last datagram
+        self._declared = sender  # the only host whose datagrams count, `FIRST` until it is known; empty: any
+        self._foreign = 0
         self._failed: LinkLostError | None = None  # why the link is lost, until that is told
 
     @property
@@ -102,6 +128,16 @@ class UdpLink(Descriptor):
     def overruns(self) -> int:
         """How many datagrams the kernel dropped because its queue was full."""
         return self._overruns
+
+    @property
+    def foreign(self) -> int:
+        """How many datagrams of other senders were left out."""
+        return self._foreign
+
+    @property
+    def kernel_stamped(self) -> bool:
+        """Whether the kernel stamped the last datagram."""
+        return self._stamped
 
     def _receive(self, timeout_s: float) -> Arrived:
         found = super()._receive(timeout_s) if self._failed is None else []
@@ -118,11 +154,14 @@ class UdpLink(Descriptor):
         return [(self._arrivals.of(wall_ns), data) for wall_ns, data in queued]
 
     def _queued(self) -> Arrived:
-        """Return the datagrams that wait, with their arrivals on the wall clock; an error is kept for `_receive`."""
+        """Return the datagrams that wait, with their arrivals on the wall clock; an error is kept for `_receive`.
+
+        Those of other senders are counted alone. A flood is left to the next read, so that one always ends.
+        """
         found: Arrived = []
-        while True:
+        for _ in range(MOST_QUEUED):
             try:
-                data, told, _, self._sender = self.socket.recvmsg(MOST, ROOM)
+                data, told, _, sender = self.socket.recvmsg(MOST, ROOM)
             except BlockingIOError:
                 return found
             except OSError as error:
@@ -130,7 +169,21 @@ class UdpLink(Descriptor):
                     return found
                 self._failed = self._refused(error)  # which the kernel tells once, before what waits
                 continue
-            found.append((self._arrival(told), data))
+            arrival_ns = self._arrival(told)
+            if self._counts(sender):
+                self._sender = sender
+                found.append((arrival_ns, data))
+            else:
+                self._foreign += 1
+        return found
+
+    def _counts(self, sender: Any) -> bool:
+        if not self._declared:
+            return True
+        host = str(sender[0]).partition("%")[0]  # without the interface of a link-local one
+        if self._declared == FIRST:
+            self._declared = host
+        return host == self._declared
 
     def _refused(self, error: OSError) -> LinkLostError:
         if isinstance(error, ConnectionRefusedError):
@@ -146,6 +199,7 @@ class UdpLink(Descriptor):
                 wall_ns = seconds * 1_000_000_000 + nanoseconds
             elif level == socket.SOL_SOCKET and kind == DROPS:
                 self._overruns = int.from_bytes(data[:4], "little")
+        self._stamped = wall_ns is not None
         return time.time_ns() if wall_ns is None else wall_ns
 
     def _send(self, data: bytes) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from tacpipe import directory, provenance
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.excerpt import plain
 from tacpipe.manifest import ACQUIRE, Entry, Manifest
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
@@ -76,7 +77,14 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             files=dict(sorted({**now.files, named: text}.items())),
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
-        store.put(now.content, durable=True)
+        try:
+            manifest_of.check(now)
+            content = now.content
+        except (ValueError, TypeError, KeyError) as error:  # what every reader would refuse is never published
+            raise TacpipeError(
+                f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
+            ) from error
+        store.put(content, durable=True)
         directory.publish_alone(store, now, output, may_lack=_others(now, name, named))
     return name
 
@@ -168,12 +176,17 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
     master = rig.streams[rig.master]
     attributes: dict[str, Attribute] = {"sensor": master.sensor.product or master.kind, "master": rig.master}
     attributes |= {**rig.labels, **spooled.header["attributes"]}
+    attributes["ended"] = spooled.ended
+    if spooled.header.get("duration_s") is not None:
+        attributes["requested_duration_s"] = float(spooled.header["duration_s"])
     for name, one in sealed.items():
         attributes[f"{name}_lost"] = one.lost
         if not one.table.num_rows:
             attributes[f"{name}_missing"] = True
         if one.undecoded:
             attributes[f"{name}_undecoded_bytes"] = one.undecoded
+        if one.uncertain:
+            attributes[f"{name}_uncertain_samples"] = one.uncertain
         if one.crashed[0]:
             attributes |= {f"{name}_crash_lost_reads": one.crashed[0], f"{name}_crash_lost_bytes": one.crashed[1]}
     return attributes

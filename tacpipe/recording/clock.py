@@ -18,3 +18,10 @@ def now_s() -> float:
 def sleep(seconds: float) -> None:
     """Wait so long."""
     time.sleep(seconds)
+
+
+def suspended_ns() -> int:
+    """Return for how long the computer was suspended since its start, in ns: the monotonic clock stands still meanwhile."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):  # this system does not tell
+        return 0
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()

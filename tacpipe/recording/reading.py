@@ -201,9 +201,14 @@ def _event(loss: Loss, frames: int) -> Event:
 
 
 def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[Event]:
-    """Return the samples that the device passed over itself: those that its own counter misses beyond lost packets."""
-    beyond = skipped.missing - counted.missing
-    return [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
+    """Return the samples that the device passed over itself: those that its own counter misses beyond lost packets.
+
+    Where that counter began anew, or jumped beyond what time allows, it says nothing of that.
+    """
+    beyond = np.where(skipped.reset, 0, skipped.missing - counted.missing)
+    found = [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
+    anew = np.flatnonzero(skipped.reset & ~counted.reset)
+    return found + [Event(int(t_ns[row]), RESET, detail="the device's second counter") for row in anew]
 
 
 def _chosen(batch: Batch, rows: NDArray[np.bool_]) -> Batch:

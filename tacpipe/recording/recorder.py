@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 
 from tacpipe.errors import DeviceError
 from tacpipe.recording import clock, stranger
+from tacpipe.recording.pace import STALL_NS
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Note, Spool
 from tacpipe.recording.station import LOST, Station
@@ -31,6 +32,11 @@ class Recorder:
         self.stations = {name: Station(stream) for name, stream in rig.streams.items()}
         self.watches = {name: Watch(stream) for name, stream in rig.streams.items()}
         self._spool: Spool | None = None
+        self._looked_ns: int | None = None  # when what came was last looked for
+        self._awake_ns = (
+            0  # since when that happens all the time: a silence that began before may be this program's own
+        )
+        self._held_ns = 0  # for how long in all this program was held up
         self._before: dict[str, deque[tuple[int, list[Chunks | Note]]]] = {name: deque() for name in rig.streams}
 
     @contextlib.contextmanager
@@ -54,6 +60,7 @@ class Recorder:
 
     def tick(self) -> None:
         """Look at what came since the last tick: first it is spooled, then looked at."""
+        self._look()
         came = {name: station.take() for name, station in self.stations.items()}
         if self._spool is not None:
             for name, blocks in came.items():
@@ -76,9 +83,12 @@ class Recorder:
         deadline_s = clock.now_s() + FIRST_S
         late = {name for name, watch in self.watches.items() if watch.stream.sensor.awaited}
 
+        held_ns = self._held_ns
+
         def settled() -> bool:
             late.difference_update({name for name in late if self.watches[name].samples})
-            return not late or stopped() or clock.now_s() > deadline_s
+            self._look()
+            return not late or stopped() or clock.now_s() - (self._held_ns - held_ns) / 1e9 > deadline_s
 
         self.run(settled)
         if late and not stopped():
@@ -105,6 +115,8 @@ class Recorder:
             yield
         finally:
             self._spool = None
+            if self._look():
+                clock.sleep(TICK_S)  # for those that read the links to fetch what waited meanwhile
             last = {name: station.end() for name, station in self.stations.items()}
             for name, blocks in last.items():
                 _spooled(spool, name, blocks)
@@ -115,10 +127,14 @@ class Recorder:
                 self._watched(name, blocks)  # the next recording may want what came right before it
 
     def lost(self) -> list[str]:
-        """Return a sentence for each stream whose link is lost now, or open and silent where it should not be."""
+        """Return a sentence for each stream whose link is lost now, or open and silent where it should not be.
+
+        What counts is the silence up to the last look at what came: a slow disk, or this program being stopped, is none.
+        """
         sentences = []
         for name, station in self.stations.items():
-            silent_s = (clock.now_ns() - (self.watches[name].last_ns or 0)) / 1e9
+            heard_ns = max(self.watches[name].last_ns or 0, self._awake_ns)
+            silent_s = ((self._looked_ns or heard_ns) - heard_ns) / 1e9
             if station.error is not None:
                 sentences.append(str(station.error))
             elif station.stream.sensor.awaited and silent_s > SILENT_S:
@@ -134,6 +150,16 @@ class Recorder:
             station.tare()
         for watch in self.watches.values():
             watch.tare()
+
+    def _look(self) -> bool:
+        """Take note that what came is looked at now; return whether that was overdue, so that links may hold what waited."""
+        now_ns = clock.now_ns()
+        since_ns, self._looked_ns = now_ns - (self._looked_ns or now_ns), now_ns
+        overdue_ns = since_ns - round(TICK_S * 1e9)
+        if overdue_ns <= STALL_NS:
+            return False
+        self._awake_ns, self._held_ns = now_ns, self._held_ns + overdue_ns
+        return True
 
     def _watched(self, name: str, blocks: list[Chunks | Note]) -> None:
         """Look at what came, and keep it as long as a trigger may want it."""

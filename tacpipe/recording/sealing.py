@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
+from tacpipe.recording.ending import COMPLETED
+from tacpipe.recording.pace import MOST_CATCH_UP_NS, parsed
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Note, Spooled
-from tacpipe.recording.station import LOST, OPENED, OVERRUN
+from tacpipe.recording.station import CAUGHT_UP, LOST, OPENED, OVERRUN, STALLED
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 END_S = 0.5  # by which a stream may end before the others without a word
 UNDECODED = "undecoded"  # bytes at which the driver gave up
 CRASH = "crash"  # what a process had read and not yet written when it ended
+UNCERTAIN = "t_uncertain_ns"  # column, only where this program was held up
 MOST_BYTES = 8 << 20  # of a stream's chunks that are decoded in one go
 
 
@@ -36,6 +39,7 @@ class Sealed:
     received: int = 0  # bytes
     undecoded: int = 0  # of them, that the driver could not make sense of: its mistake, or another device
     crashed: tuple[int, int] = (0, 0)  # chunks and bytes that were read and never spooled
+    uncertain: int = 0  # samples that had waited while this program was held up
 
 
 @dataclass
@@ -47,6 +51,42 @@ class _Parts:
         self.events += batch.events
         if len(batch):
             self.batches.append(batch)
+
+
+class _Stalls:
+    """Where this program was held up while it recorded a stream, and what that did to stamps."""
+
+    def __init__(self) -> None:
+        self._windows: list[tuple[int, int, int]] = []  # stamps from, to, and when the link was last known to be empty
+        self._suspended: list[tuple[int, int]] = []  # stamps from, and for how long the clock had stood still
+
+    def take(self, note: Note) -> Event | None:
+        """Take a note; return the event of one that gives a stall."""
+        stall = parsed(note.detail) if note.what == STALLED else None
+        if note.what == CAUGHT_UP and self._windows:
+            begin_ns, end_ns, empty_ns = self._windows[-1]
+            self._windows[-1] = begin_ns, min(end_ns, note.t_ns), empty_ns
+        if stall is None:
+            return None
+        if stall.late_ns:
+            self._windows.append((note.t_ns, note.t_ns + MOST_CATCH_UP_NS, note.t_ns - stall.late_ns))
+        self._suspended += [(note.t_ns, stall.suspended_ns)] if stall.suspended_ns else []
+        told = [f"nothing was read for {stall.lasted_ns / 1e9:.3f} s"]
+        told += [f"the computer was suspended for {stall.suspended_ns / 1e9:.3f} s of it"] if stall.suspended_ns else []
+        told += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
+        return Event(note.t_ns, STALLED, detail="; ".join(told))
+
+    def uncertain_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return by how much samples may have come earlier than these stamps (sample,); 0 where they are certain."""
+        found = np.zeros_like(t_ns)
+        for begin_ns, end_ns, empty_ns in self._windows:
+            rows = (t_ns >= begin_ns) & (t_ns < end_ns)
+            found[rows] = t_ns[rows] - empty_ns
+        return found
+
+    def awake_ns(self, t_ns: Any) -> Any:
+        """Return stamps with the time added for which the computer was suspended before them."""
+        return t_ns + sum((t_ns >= since_ns) * lasted_ns for since_ns, lasted_ns in self._suspended)
 
 
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
@@ -61,7 +101,7 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
     ``end_ns`` is when the last byte of any stream came: one that fell silent long before says so.
     """
     sensor = rig.streams[name].sensor
-    reading, parts = Reading(sensor), _Parts()
+    reading, parts, stalls = Reading(sensor), _Parts(), _Stalls()
     chunks = size = undecoded = 0
     away = False
     for block in _gathered(spooled, name):
@@ -69,7 +109,10 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
             away |= block.what == LOST
             if block.what == LOST:
                 parts.add(reading.broken())
-            if block.what != OPENED or away:  # that it opened before it was recorded is no event
+            if block.what in (STALLED, CAUGHT_UP):
+                stall = stalls.take(block)
+                parts.events += [] if stall is None else [stall]
+            elif block.what != OPENED or away:  # that it opened before it was recorded is no event
                 parts.events.append(_told(block, sensor))
             continue
         chunks += len(block.size)
@@ -87,10 +130,13 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
         parts.events.append(Event(last_ns, CRASH, bytes=crashed[1], detail=detail))
-    events = [event._replace(t_ns=spooled.utc_ns(event.t_ns)) for event in parts.events]
+    events = [event._replace(t_ns=spooled.utc_ns(stalls.awake_ns(event.t_ns))) for event in parts.events]
     lost = sum(event.frames for event in events)
-    made = table(sensor.fields(), parts.batches, spooled)
-    return Sealed(made, events, lost, received=size, undecoded=undecoded, crashed=crashed)
+    t_ns = _joined([batch.t_ns for batch in parts.batches], np.int64)
+    uncertain_ns = stalls.uncertain_ns(t_ns)
+    made = table(sensor.fields(), parts.batches, spooled.utc_ns(stalls.awake_ns(t_ns)), uncertain_ns)
+    late = int(np.count_nonzero(uncertain_ns))
+    return Sealed(made, events, lost, received=size, undecoded=undecoded, crashed=crashed, uncertain=late)
 
 
 def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
@@ -133,15 +179,19 @@ def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
         yield Chunks.joined(waiting)
 
 
-def table(fields: Sequence[pa.Field], batches: Sequence[Batch], spooled: Spooled) -> pa.Table:
-    """Return batches as the table of a stream, stamps in UTC."""
+def table(
+    fields: Sequence[pa.Field], batches: Sequence[Batch], t_ns: NDArray[np.int64], uncertain_ns: NDArray[np.int64]
+) -> pa.Table:
+    """Return batches as the table of a stream with these stamps (sample,), and how uncertain they are where any is."""
     import pyarrow as pa
 
     from tacpipe.formats import channels
 
     columns: list[tuple[pa.Field, Any]] = []
-    t_ns = _joined([batch.t_ns for batch in batches], np.int64)
-    columns.append((channels.time_field(), spooled.utc_ns(t_ns)))
+    columns.append((channels.time_field(), t_ns))
+    if uncertain_ns.any():
+        kind = pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"})
+        columns.append((kind, uncertain_ns))
     first = batches[0] if batches else None
     if first is not None and first.t_device_ns is not None:
         kind = pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
@@ -171,6 +221,17 @@ def _joined(parts: Sequence[Any], kind: Any) -> NDArray[Any]:
     return np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
 
 
+def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Event, str]]:
+    """Return the event of a recording that was not completed, with how much of it there is; nothing for one that was."""
+    stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
+    if spooled.ended == COMPLETED or not stamps:
+        return []
+    first_ns, last_ns = min(times[0].as_py() for times in stamps), max(times[-1].as_py() for times in stamps)
+    requested_s = spooled.header.get("duration_s")
+    of = "no duration was requested" if requested_s is None else f"{requested_s:g} s were requested"
+    return [(Event(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {of}"), "")]
+
+
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     """Return the table of what went wrong in all streams, in the order of time."""
     import pyarrow as pa
@@ -178,6 +239,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     from tacpipe.formats import channels
 
     rows = sorted((event, name) for name, one in sealed.items() for event in one.events)
+    rows += _cut_off(sealed, spooled)
     rows = [
         (Event(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=found.bytes), "")
         for found in spooled.damage

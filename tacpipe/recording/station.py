@@ -7,12 +7,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError
-from tacpipe.recording import stranger
+from tacpipe.recording import clock, stranger
+from tacpipe.recording.pace import Pace
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool import Note
 from tacpipe.sensors.framing import Chunks
@@ -20,6 +22,12 @@ from tacpipe.sensors.sensor import Sensor
 
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
+FOREIGN = "foreign"  # packets of other senders than the one that counts
+FOREIGN_S = 1.0  # between two notes of such
+STALLED, CAUGHT_UP = (
+    "recorder_stalled",
+    "caught_up",
+)  # this program was held up; from here on arrivals are certain again
 READ_S = 0.1  # longest wait of a read, after which the thread looks whether it should end
 AGAIN_S = (0.1, 2.0)  # between two tries to open a lost link: first, and at most
 MUTE_S = 4.0  # after which a device that should send datagrams and does not is asked anew: nothing else tells its loss
@@ -47,7 +55,8 @@ class Station:
         self._thread = threading.Thread(target=self._run, name=stream.name, daemon=True)
         self._keeping = threading.Lock()
         self._orders: deque[Callable[[Link], None]] = deque()  # carried out by the thread, between two reads
-        self._chunks = self._bytes = self._overruns = 0
+        self._chunks = self._bytes = self._overruns = self._foreign = 0
+        self._foreign_s = 0.0  # when such packets were noted last
         self._wait_s = AGAIN_S[0]
 
     def start(self) -> None:
@@ -75,12 +84,16 @@ class Station:
             self._chunks = sum(len(block.size) for block in counted)
             self._bytes = sum(len(block.data) for block in counted)
             self._tally = tally
+            self._foreign = (
+                self._link.foreign if self._link is not None else 0
+            )  # what came before is not of this recording
             return found
 
     def end(self) -> list[Chunks | Note]:
         """Return what came since the last call, and tell no tally any more."""
         with self._keeping:
             self._tally = None
+            self._note_foreign(self._link)
             return self._taken()
 
     def tare(self) -> bool:
@@ -129,7 +142,7 @@ class Station:
         except BaseException:
             link.close()
             raise
-        self._overruns = link.overruns
+        self._overruns, self._foreign = link.overruns, link.foreign
         self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
         self._link, self.error = link, None
         self._keep(early)
@@ -161,22 +174,41 @@ class Station:
         link, sensor = self._link, self.stream.sensor
         assert link is not None
         asked, answers = sensor.request(), type(sensor).answer is not Sensor.answer
+        pace = Pace(clock.now_ns(), clock.suspended_ns())
         if asked:
-            self._ask(link, asked)
+            self._ask(link, asked, pace)
             return
         heard_s = time.monotonic()
         while not self._ending.is_set():
-            came = link.read(READ_S)
+            came = self._paced(link, READ_S, pace)
             heard_s = self._heard(heard_s, came)
             self._keep(came)
-            self._obey(link)
+            self._obey(link, pace)
             if answers:
                 for _, chunk in came:
                     said = sensor.answer(chunk)
                     if said:
                         link.write(said)
+                        pace.resume(clock.now_ns())
             if link.overruns != self._overruns:
                 self._overran(link.overruns)
+            if link.foreign != self._foreign and time.monotonic() - self._foreign_s > FOREIGN_S:
+                with self._keeping:
+                    self._note_foreign(link)
+
+    def _paced(self, link: Link, timeout_s: float, pace: Pace) -> list[tuple[int, bytes]]:
+        """Return what came, and note where this program was held up before it, and where what is read no longer waited."""
+        began_ns = clock.now_ns()
+        came = link.read(timeout_s)
+        ended_ns = clock.now_ns()
+        stall = pace.read(began_ns, ended_ns, round(timeout_s * 1e9), clock.suspended_ns())
+        at_ns = came[0][0] if came else ended_ns
+        if stall is not None:
+            late_ns = 0 if link.kernel_stamped else stall.late_ns
+            self._notes.append(Note(at_ns, self.stream.name, STALLED, replace(stall, late_ns=late_ns).detail))
+        elif pace.caught_up(began_ns, ended_ns):
+            self._notes.append(Note(at_ns, self.stream.name, CAUGHT_UP))
+        return came
 
     def _heard(self, before_s: float, came: list[tuple[int, bytes]]) -> float:
         """Return when the device was heard last. Raises `LinkLostError` for one that is mute, where silence alone tells."""
@@ -188,21 +220,29 @@ class Station:
             raise LinkLostError(told.strip())
         return before_s
 
-    def _ask(self, link: Link, asked: bytes) -> None:
+    def _ask(self, link: Link, asked: bytes, pace: Pace) -> None:
         """Read a device that sends a frame when it is asked: at the sensor's rate, never before it replied."""
         period_s = 1.0 / self.stream.sensor.rate_hz
         due_s = time.monotonic()
         while not self._ending.is_set():
             link.write(asked)
-            self._keep(link.read(REPLY_S))
-            self._obey(link)
+            pace.resume(clock.now_ns())
+            self._keep(self._paced(link, REPLY_S, pace))
+            self._obey(link, pace)
             due_s = max(due_s + period_s, time.monotonic() - period_s)
             while not self._ending.is_set() and (left_s := due_s - time.monotonic()) > 0:
-                self._keep(link.read(min(left_s, READ_S)))  # the rest of a reply that came in pieces
+                self._keep(self._paced(link, min(left_s, READ_S), pace))  # the rest of a reply that came in pieces
 
-    def _obey(self, link: Link) -> None:
+    def _obey(self, link: Link, pace: Pace) -> None:
         while self._orders:
             self._orders.popleft()(link)
+            pace.resume(clock.now_ns())
+
+    def _note_foreign(self, link: Link | None) -> None:
+        if link is not None and link.foreign > self._foreign:
+            told = f"{link.foreign - self._foreign} packets of other senders were left out"
+            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, told))
+            self._foreign, self._foreign_s = link.foreign, time.monotonic()
 
     def _overran(self, overruns: int) -> None:
         self._notes.append(Note(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tacpipe import interruption
 from tacpipe.errors import TacpipeError
+from tacpipe.excerpt import excerpt, plain
 from tacpipe.interruption import Ended
-from tacpipe.recording import appending, clock, sealing, triggers
+from tacpipe.manifest import NAME_BYTES
+from tacpipe.recording import appending, clock, header, sealing, triggers
+from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import Spool, Spooled
+from tacpipe.recording.spool import ENDED, Note, Spool, Spooled, users
 from tacpipe.recording.view import View
 from tacpipe.stage import Attribute
 from tacpipe.store import Store
@@ -31,7 +35,13 @@ class Plan:
     stop: str = "duration"
     contact_count: float = 50.0
     tare: bool = False
+    keep_spool: bool = False
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    @property
+    def requested(self) -> bool:
+        """Whether an end was requested; else the recording lasts until it is interrupted, which completes it."""
+        return self.duration_s is not None or self.stop != "duration"
 
     @property
     def names(self) -> list[str]:
@@ -47,6 +57,8 @@ class Recorded:
     seconds: float
     rows: dict[str, int]  # stream to samples
     lost: dict[str, int]  # stream to frames
+    ended: str = COMPLETED  # or interrupted, or recovered
+    spool: str = ""  # where its spool is kept
 
     def line(self) -> str:
         """Return it in words."""
@@ -54,7 +66,8 @@ class Recorded:
             f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
             for name, rows in self.rows.items()
         )
-        return f"{self.name}: {self.seconds:.1f} s, {told}"
+        kept = f"; its spool is kept in {self.spool}" if self.spool else ""
+        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {told}{kept}"
 
 
 def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> tuple[list[Recorded], list[str]]:
@@ -88,16 +101,21 @@ def _await(recorder: Recorder, starts: triggers.Trigger, ended: Ended, view: Vie
     recorder.run(lambda: ended() or starts(), lambda: view.show(waiting))
 
 
-def recover(store: Store, folder: Path) -> Recorded:
+def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
     """Seal what an abandoned spool holds and append it to the dataset that it was recorded for.
 
-    Raises `TacpipeError` with what keeps it from being sealed; it stays as it is then.
+    ``opened`` is the dataset that this command was given, None for none. Raises `TacpipeError` with what keeps it from being
+    sealed: it is another user's, it names what no dataset can hold, or a dataset elsewhere. It stays as it is then.
     """
     from tacpipe.recording import rig as rig_of
 
-    spooled = Spooled(folder)
-    rig = rig_of.parse(spooled.header["rig"], f"The rig file in {folder}")
-    return _sealed(store, Path(spooled.header["output"]), spooled, rig)
+    spooled = Spooled(folder, users(folder.parent, [folder.lstat().st_uid]))
+    told = spooled.header.get("rig")
+    if not isinstance(told, str):
+        raise TacpipeError(f"Its rig file is {excerpt(told)}; it must be a text.")
+    rig = rig_of.parse(told, f"The rig file in {folder}")
+    header.check(spooled.header, rig.streams)
+    return _sealed(store, header.destination(spooled.header, store, opened), spooled, rig)
 
 
 def _record(
@@ -105,18 +123,25 @@ def _record(
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
-    header = {"output": str(plan.output.absolute()), "recording": name, "attributes": attributes}
-    spool = Spool(store.root, {**header, "rig": recorder.rig.text}, list(recorder.stations))
+    told = {"output": header.output(store, plan.output), "recording": name, "attributes": attributes}
+    wanted = {"duration_s": plan.duration_s, "keep": plan.keep_spool}
+    spool = Spool(store.root, {**told, **wanted, "rig": recorder.rig.text}, list(recorder.stations))
     began_s = clock.now_s()
+    how = COMPLETED
 
     def over() -> bool:
-        late = plan.duration_s is not None and clock.now_s() - began_s >= plan.duration_s
-        return ended() or late or stops()
+        nonlocal how
+        if plan.duration_s is not None and clock.now_s() - began_s >= plan.duration_s:
+            return True
+        if ended() and (plan.requested or ended.number == signal.SIGHUP):
+            how = INTERRUPTED
+        return ended() or stops()
 
     kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
     with interruption.saying(f"tacpipe: interrupted. {kept}."), contextlib.closing(spool):  # nobody else may recover it
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
+            spool.note(Note(clock.now_ns(), "", ENDED, how))
         lost = recorder.lost()  # now: while it is sealed nobody looks at what comes
         view.show(f"sealing {name}")
         try:
@@ -132,11 +157,13 @@ def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     sealed = sealing.seal(spooled, rig)
     with store.at_work():
         name = appending.append(store, output, spooled, rig, sealed)
+    kept = str(spooled.keep()) if spooled.header.get("keep") is True else ""
     spooled.remove()
     rows = {stream: one.table.num_rows for stream, one in sealed.items()}
     stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
     first, last = (min(times[0].as_py() for times in stamps), max(times[-1].as_py() for times in stamps))
-    return Recorded(name, (last - first) / 1e9, rows, {stream: one.lost for stream, one in sealed.items()})
+    lost = {stream: one.lost for stream, one in sealed.items()}
+    return Recorded(name, (last - first) / 1e9, rows, lost, spooled.ended, kept)
 
 
 def _triggers(

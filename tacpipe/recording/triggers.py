@@ -49,7 +49,9 @@ def keys() -> Iterator[Keys]:
     def pressed(*, must: bool = False) -> bool:
         nonlocal waiting, ended
         if not ended and select.select([source], [], [], 0)[0]:
-            read = os.read(source, 4096)  # not through sys.stdin, which keeps what select does not see
+            read = b""
+            with contextlib.suppress(OSError):  # of a terminal that was closed: no key can be pressed any more
+                read = os.read(source, 4096)  # not through sys.stdin, which keeps what select does not see
             waiting, ended = waiting + read, not read
         taken, found = _pressed(waiting, lines=settings is None)
         waiting = waiting[taken:]
@@ -64,7 +66,8 @@ def keys() -> Iterator[Keys]:
         yield pressed
     finally:
         if settings is not None:
-            termios.tcsetattr(source, termios.TCSADRAIN, settings)
+            with contextlib.suppress(termios.error):  # of a terminal that was closed
+                termios.tcsetattr(source, termios.TCSADRAIN, settings)
 
 
 def _pressed(typed: bytes, *, lines: bool) -> tuple[int, bool]:

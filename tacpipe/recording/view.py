@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -39,7 +40,7 @@ class View:
         from rich.console import Console
         from rich.live import Live
 
-        with Live(console=Console(stderr=True), refresh_per_second=FRAMES_HZ, transient=True) as self._live:
+        with Live(console=Console(file=sys.stderr), refresh_per_second=FRAMES_HZ, transient=True) as self._live:
             yield self
         self._live = None
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 Integers = NDArray[np.int64]
 
+MOST_RATE_HZ = 100_000.0  # of a device whose rate nobody gave: no program sends records faster
 RESET_TIMES = 3.0  # a gap longer than so many times what the clock allows is a device that began anew
 RESET_SLACK = 32  # samples beyond that which a burst may bring
 AGREES = 0.05  # beyond the slack, of what the clock estimates for an outage through which the device went on counting
@@ -23,7 +24,9 @@ class Counted:
     missing: Integers  # samples that were lost right before
     duplicate: NDArray[np.bool_]  # the same sample once more
     late: NDArray[np.bool_]  # it was passed over before, and counted as lost
-    reset: NDArray[np.bool_]  # the device began to count anew; ``missing`` is then what the clock says, or 0
+    reset: NDArray[
+        np.bool_
+    ]  # it began to count anew, or jumped beyond what time allows; ``missing`` is by the clock, or 0
 
 
 NAMES = tuple(field.name for field in fields(Counted))
@@ -35,12 +38,14 @@ class Counting:
     def __init__(self, modulus: int, rate_hz: float, step: int = 1) -> None:
         self.modulus, self.rate_hz, self.step = modulus, rate_hz, step
         self._last: tuple[int, int, int] | None = None  # highest count as sent, unrolled, and its arrival
+        self._before: int | None = None  # what was sent last before a reset, which may have been a single false count
         self._doubted = False  # whether the device may have begun anew since
 
     def reopened(self) -> None:
         """Take note that the link was lost: the device may have been off, so the clock must confirm the next counter.
 
-        Where it does not, or the counter went back, the device began anew. Without a rate one that grew is believed.
+        Where it does not, or the counter went back, the device began anew. Without a rate one that grew is taken as it is,
+        up to what `MOST_RATE_HZ` allows.
         """
         self._doubted = self._last is not None
 
@@ -62,7 +67,7 @@ class Counting:
         slow = elapsed_ns * 1e-9 * self.rate_hz * self.step > self.modulus / 2  # never where no rate is known
         if (delta[first:] == self.step).all() and not slow.any():  # nothing happened, as nearly always
             seq = last_seq + np.arange(len(raw)) + (not first)
-            self._last = int(raw[-1]), int(seq[-1]), int(t_ns[-1])
+            self._last, self._before = (int(raw[-1]), int(seq[-1]), int(t_ns[-1])), None
             nothing = np.zeros(len(raw), dtype=bool)
             return Counted(seq, np.zeros(len(raw), dtype=np.int64), nothing, nothing, nothing)
         return self._slowly(raw, t_ns, last_raw, last_seq, last_ns, first=first)
@@ -79,13 +84,25 @@ class Counting:
         expected = (at_ns - last_ns) * 1e-9 * self.rate_hz
         if self.rate_hz:
             steps += rounds * round((expected - steps) / rounds)
-        agrees = not self.rate_hz or abs(steps - expected) <= RESET_SLACK + AGREES * expected
+        agrees = (
+            abs(steps - expected) <= RESET_SLACK + AGREES * expected
+            if self.rate_hz
+            else steps <= _most(at_ns - last_ns)
+        )
         reset = bool(off) or steps < 1 or not agrees
         if reset:
             steps = max(1, round(expected))
         self._last, self._doubted = (raw, last_seq + steps, at_ns), False
         nothing = np.zeros(1, dtype=bool)
         return Counted(np.array([last_seq + steps]), np.array([steps - 1]), nothing, nothing, np.array([reset]))
+
+    def _went_on(self, raw: int) -> int:
+        """Return by how much a count goes on from where it was before a reset, 0 where it does not."""
+        if self._before is None:
+            return 0
+        half = self.modulus // 2
+        steps, off = divmod((raw - self._before + half) % self.modulus - half, self.step)
+        return steps if not off and 0 < steps <= RESET_SLACK else 0
 
     def _slowly(
         self, raw: Integers, t_ns: Integers, last_raw: int, last_seq: int, last_ns: int, *, first: bool
@@ -95,18 +112,22 @@ class Counting:
         half = self.modulus // 2
         for row, (value, at_ns) in enumerate(zip(raw.tolist(), t_ns.tolist(), strict=True)):
             steps, off = divmod((value - last_raw + half) % self.modulus - half, self.step)
-            expected = (at_ns - last_ns) * 1e-9 * self.rate_hz if self.rate_hz else max(0.0, steps)
+            expected = (at_ns - last_ns) * 1e-9 * self.rate_hz  # 0 where no rate is known
             rounds = self.modulus // self.step
             if expected > rounds / 2:
                 steps += rounds * round((expected - steps) / rounds)
+            went_on, self._before = self._went_on(value), None
             if first:
                 first, steps = False, 0
+            elif went_on and steps != 1:
+                steps = max(1, went_on - 1)  # the false one has taken a place
+                reset[row], missing[row] = True, steps - 1
             elif (
                 off
-                or steps > RESET_TIMES * expected + RESET_SLACK
+                or steps > (RESET_TIMES * expected + RESET_SLACK if self.rate_hz else _most(at_ns - last_ns))
                 or (steps < 0 and (steps < -RESET_SLACK or at_ns - last_ns > LATE_NS))
             ):
-                steps = max(1, round(expected))
+                steps, self._before = max(1, round(expected)), last_raw
                 reset[row], missing[row] = True, steps - 1
             elif steps > 0:
                 missing[row] = steps - 1
@@ -118,3 +139,8 @@ class Counting:
             last_raw, last_ns = value, at_ns
         self._last = last_raw, last_seq, last_ns
         return Counted(seq, missing, duplicate, late, reset)
+
+
+def _most(elapsed_ns: int) -> float:
+    """Return how many samples a device of unknown rate may have sent in this time."""
+    return max(0, elapsed_ns) * 1e-9 * MOST_RATE_HZ + RESET_SLACK

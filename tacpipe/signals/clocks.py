@@ -13,7 +13,7 @@ Stamps are int64 nanoseconds; first values are subtracted before anything become
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -83,11 +83,13 @@ class ClockFit:
         return self.longest.drift * 1e6
 
 
-def fit_clock(device_ns: Times, arrival_ns: Times) -> ClockFit:
+def fit_clock(device_ns: Times, arrival_ns: Times, certain: NDArray[np.bool_] | None = None) -> ClockFit:
     """Return the fit of a device's clock (time,) against the arrival of its samples (time,), in row order.
 
-    A segment too short to show a drift takes that of the longest one that does, or none. Raises `TacpipeError` for a
-    clock that stands still, or whose rate differs from the host's by more than 10 %.
+    Where ``certain`` (time,) is given, the other rows have arrivals that say nothing, as of a host that was held up, and are
+    left out; where no row is certain, all are taken. A segment too short to show a drift takes that of the longest one that
+    does, or none. Raises `TacpipeError` for a clock that stands still, or whose rate differs from the host's by more than
+    10 %.
 
     >>> device_ns = np.arange(0, 10_000_000_000, 1_000_000)
     >>> fit = fit_clock(device_ns, 500 + device_ns + device_ns // 20_000)
@@ -99,6 +101,9 @@ def fit_clock(device_ns: Times, arrival_ns: Times) -> ClockFit:
             f"{len(device_ns)} device stamps and {len(arrival_ns)} arrivals are no clock to fit; there must be as many "
             "of both, and one at least."
         )
+    if certain is not None and certain.any() and not certain.all():
+        rows = np.flatnonzero(certain)
+        return _spread(fit_clock(device_ns[rows], arrival_ns[rows]), rows, len(device_ns))
     if len(device_ns) > 1 and not np.any(device_ns != device_ns[0]):
         raise TacpipeError(
             f"The device's clock stands still at {device_ns[0]} ns in all {len(device_ns)} rows. "
@@ -116,6 +121,13 @@ def fit_clock(device_ns: Times, arrival_ns: Times) -> ClockFit:
     late_ns = (arrival_ns - _mapped(segments, device_ns)).astype(np.float64)  # (time,)
     quantiles = tuple(float(value) for value in np.quantile(late_ns, QUANTILES))
     return ClockFit(segments, quantiles, float(np.median(np.abs(late_ns))))
+
+
+def _spread(fit: ClockFit, rows: NDArray[np.int64], count: int) -> ClockFit:
+    """Return a fit of some ``rows`` as one of all ``count``: a row that was left out belongs to the segment before it."""
+    edges = [0, *(int(rows[one.start]) for one in fit.segments[1:]), count]
+    spans = zip(fit.segments, edges[:-1], edges[1:], strict=True)
+    return replace(fit, segments=tuple(replace(one, start=start, stop=stop) for one, start, stop in spans))
 
 
 def host_times(fit: ClockFit, device_ns: Times, arrival_ns: Times) -> Times:

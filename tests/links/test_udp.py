@@ -234,3 +234,64 @@ def test_datagrams_that_came_before_the_port_refused_are_given_out_first() -> No
             peer.link.read(0)
 
     assert [data for _, data in found] == SENT
+
+
+class Crowd(socket.socket):
+    """A port at which several hosts send: three datagrams of each, in turn."""
+
+    left: list[tuple[str, bytes]]
+
+    def recvmsg(self, *_: int) -> Any:
+        """Return the next datagram, and whose it is."""
+        if not self.left:
+            raise BlockingIOError
+        host, data = self.left.pop(0)
+        return data, [], 0, (host, 4010)
+
+
+@pytest.mark.parametrize(
+    ("sender", "hosts", "foreign"),
+    [("", "abab", 0), ("first", "aa", 2), ("192.0.2.1", "aa", 2), ("192.0.2.2", "bb", 2), ("192.0.2.3", "", 4)],
+)
+def test_a_declared_sender_alone_is_read_and_others_are_counted(sender: str, hosts: str, foreign: int) -> None:
+    names = {"a": "192.0.2.1", "b": "192.0.2.2"}
+    with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.left = [(names[host], host.encode()) for host in "abab"]
+        link = udp.UdpLink("crowd", port, prompt=True, sender=sender)
+        found = link._queued()
+
+        assert b"".join(data for _, data in found).decode() == hosts
+        assert link.foreign == foreign
+        link.close()
+
+
+def test_a_flood_is_left_to_the_next_read() -> None:
+    with Crowd(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.left = [("192.0.2.1", b"x")] * (udp.MOST_QUEUED + 10)
+        link = udp.UdpLink("flood", port, prompt=True)
+
+        assert [len(link._queued()), len(link._queued())] == [udp.MOST_QUEUED, 10]
+        link.close()
+
+
+@pytest.mark.parametrize(
+    "option", ["sender=", "sender=host", "sender=1.2.3", "first", "port=4010", "sender=1.2.3.4:80"]
+)
+def test_a_sender_that_is_no_address_is_refused(option: str) -> None:
+    with pytest.raises(UsageError, match=r"is no sender; write \?sender=192\.168\.1\.20, or \?sender=first"):
+        made(f"udp::{free_port()}?{option}", Quiet())
+
+
+def test_a_sender_beside_a_host_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"only what 127\.0\.0\.1 sends is read there; leave \?sender=first out"):
+        made("udp:127.0.0.1:4010?sender=first", Quiet())
+
+
+def test_an_address_with_a_sender_listens_as_one_without() -> None:
+    port = free_port()
+    link = made(f"udp::{port}?sender=127.0.0.1", Quiet())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+        device.sendto(b"one", ("127.0.0.1", port))
+
+    assert [data for _, data in link.read(peers.SOON_S)] == [b"one"] and link.foreign == 0
+    link.close()

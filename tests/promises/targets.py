@@ -30,7 +30,7 @@ from tacpipe.codecs.pca import fit
 from tacpipe.formats import pcd, ply
 from tacpipe.hashing import digest
 from tacpipe.links import report_descriptor
-from tacpipe.recording import rig, spool
+from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
 from tacpipe.tables import from_parquet, to_parquet
 from tests.formats import grasp_files, slide_files, xela_files
@@ -147,6 +147,7 @@ def _spool(data: bytes) -> object:
         if isinstance(block, Chunks):
             assert sum(map(len, block.packets())) == len(block.data)
     assert sum(damage.bytes for damage in found.damage) <= len(data) + len(_spools()[0])
+    header.check(found.header, ["a", "b"])
     return found.tallied()
 
 

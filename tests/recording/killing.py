@@ -74,7 +74,7 @@ def kill(
     killed_ns = time.monotonic_ns()
     process.wait()
     spooled = [path for path in (folder / "store/spool").glob("*") if (path / "bytes").stat().st_size]
-    recover = [str(BIN / "tacpipe"), "acquire", "--recover", "--quiet", "--json"]
+    recover = [str(BIN / "tacpipe"), "acquire", "--recover", "-o", str(output), "--quiet", "--json"]
     told: dict[str, Any] = json.loads(subprocess.run(recover, env=environment, capture_output=True, check=True).stdout)
     assert not list((folder / "store/spool").glob("*/header.json")), "a spool was left"
     new = sorted(set(names(output)) - before)

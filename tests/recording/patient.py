@@ -23,6 +23,7 @@ HANGS_S = 600.0
 LIMITS = {
     "tacpipe.recording.recorder": ("FIRST_S", "SILENT_S"),
     "tacpipe.recording.station": ("MUTE_S", "TARE_S", "REPLY_S", "STOP_S"),
+    "tacpipe.recording.pace": ("STALL_NS",),
     "tacpipe.links.network": ("CONNECT_S",),
     "tacpipe.links.opened": ("WRITE_S",),
 }
@@ -62,6 +63,10 @@ class Samples:
         """Return the seconds of samples that every stream gave."""
         assert time.monotonic() < self.until_s, "a stream gives nothing"
         return min((count / watch.stream.sensor.rate_hz for watch, count in self.counts.items()), default=0.0)
+
+    def now_ns(self) -> int:
+        """Return the time that stamps notes, which is no other here."""
+        return time.monotonic_ns()
 
 
 def longer(ask: Ask) -> Ask:

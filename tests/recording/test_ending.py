@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -33,11 +36,11 @@ def while_sealing() -> Iterator[Interrupt]:
     """A function that has the next recording interrupted so many times while it is sealed."""
     patch, real = pytest.MonkeyPatch(), sealing.seal
 
-    def interrupt(times: int, apart_s: float = 2 * TWICE_S) -> None:
+    def interrupt(times: int, apart_s: float = 2 * TWICE_S, number: signal.Signals = signal.SIGINT) -> None:
         def seal(*given: Any) -> Any:
             patch.undo()
             for _ in range(times):
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), number)
                 time.sleep(apart_s)
             return real(*given)
 
@@ -47,7 +50,7 @@ def while_sealing() -> Iterator[Interrupt]:
     patch.undo()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_recording_and_it_is_sealed(lab: Lab, rig: Emulator, number: signal.Signals) -> None:
     process = live.started(lab.folder, "--name one --json")
     (spool,) = live.awaited(lambda: live.spools(lab.folder))
@@ -63,6 +66,35 @@ def test_a_signal_ends_a_recording_and_it_is_sealed(lab: Lab, rig: Emulator, num
         rows = live.recorded(shard, name)
         live.place(rows, live.sent(rig, name))
         assert told["rows"][name] == len(rows) and shard.attributes[f"{name}_lost"] == 0
+
+
+@pytest.mark.parametrize("options", ["", "--stop key"])
+def test_a_terminal_that_is_closed_ends_a_recording_and_it_is_sealed(lab: Lab, rig: Emulator, options: str) -> None:
+    master, slave = os.openpty()
+    process = live.started(
+        lab.folder,
+        f"--name one {options}",
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(slave)
+    os.set_blocking(master, False)
+
+    def recorded() -> bool:
+        with contextlib.suppress(BlockingIOError):
+            os.read(master, 1 << 16)  # what is shown; a terminal that nobody reads takes no more after a while
+        return any((spool / "bytes").stat().st_size > 4000 for spool in live.spools(lab.folder))
+
+    live.awaited(recorded)
+    os.close(master)  # from here on every write to the terminal is an error
+
+    assert process.wait() == 0
+    shard = live.only(lab.folder)
+    assert not live.spools(lab.folder)
+    live.place(live.recorded(shard, "force"), live.sent(rig, "force"))
 
 
 def test_a_signal_ends_the_trials_that_are_left(lab: Lab, rig: Emulator) -> None:
@@ -84,6 +116,15 @@ def test_a_signal_before_the_first_trial_records_nothing(lab: Lab, rig: Emulator
 
     assert process.returncode == 0, err
     assert not (lab.folder / "rec").exists() and not live.spools(lab.folder)
+
+
+def test_a_terminal_that_closes_and_its_shell_are_one_request_however_far_apart(
+    lab: Lab, rig: Emulator, while_sealing: Interrupt
+) -> None:
+    while_sealing(3, number=signal.SIGHUP)
+    lab.run("acquire rig.toml -o rec --duration 0.5")
+
+    live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
 
 
 def test_one_signal_while_sealing_changes_nothing(lab: Lab, rig: Emulator, while_sealing: Interrupt) -> None:

@@ -48,7 +48,7 @@ def chunks(rows: range, every: list[bytes], since_ns: int = 0) -> Chunks:
 
 
 def spooled(folder: Path, **streams: list[Chunks | Note]) -> Spooled:
-    made = Spool(folder, {"rig": RIG, "output": str(folder / "rec"), "recording": "r", "attributes": {}}, list(streams))
+    made = Spool(folder, {"rig": RIG, "output": "rec", "recording": "r", "attributes": {}}, list(streams))
     for name, blocks in streams.items():
         count = size = 0
         for block in blocks:
@@ -65,7 +65,7 @@ def spooled(folder: Path, **streams: list[Chunks | Note]) -> Spooled:
 class Link:
     """A link that gives what it is told to, and raises what it is told to."""
 
-    packets, overruns = False, 0
+    packets, overruns, foreign, kernel_stamped = False, 0, 0, False
     local: dict[str, Any] = {}  # noqa: RUF012
 
     def __init__(self, came: list[Any], closing: Exception | None = None, pace_s: float = 0.0) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
 import re
+import signal
 import struct
 import sys
 from typing import Any
@@ -26,6 +29,14 @@ PAD = live.stream("pad", "generic", "udp::4010", f"{{ rate_hz = 100, packets = t
 PROGRAM = live.stream("program", "tap", "udp::4011")
 RATE_HZ, LASTS_S = 333, 20
 REST, TOUCHED = 100, 1000  # counts
+
+
+class Closed(io.StringIO):
+    """Standard error behind which there is no terminal any more."""
+
+    def write(self, text: str) -> int:
+        """Fail as the kernel does."""
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 @pytest.fixture
@@ -179,6 +190,34 @@ def test_a_long_sealing_is_no_silence_of_the_devices(lab: Lab, script: Script, m
 
     monkeypatch.setattr(sealing, "seal", slowly)
     lab.run("acquire rig.toml -o rec --duration 1 --quiet")
+
+
+def test_a_terminal_that_closes_ends_a_recording_which_is_sealed_though_nothing_can_be_printed(
+    lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def hang_up() -> None:
+        monkeypatch.setattr(sys, "stderr", Closed())
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, lambda *_: None)  # that it would end this process too is another matter
+    script.happens.append((6.0, hang_up))
+    try:
+        lab.run("acquire rig.toml -o rec --duration 15 --name one")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    found = counts(live.only(lab.folder))
+
+    assert found == list(range(found[0], found[-1] + 1))
+    assert 5.9 <= found[-1] / RATE_HZ <= 6.11
+
+
+def test_lines_that_cannot_be_printed_end_no_recording(
+    lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", Closed())
+    lab.run("acquire rig.toml -o rec --duration 12 --name one")  # a line every five seconds
+
+    assert counts(live.only(lab.folder))[-1] >= 12 * RATE_HZ - 1
 
 
 def test_a_crash_costs_what_came_since_the_last_tick(lab: Lab, script: Script) -> None:

@@ -113,6 +113,22 @@ def test_zeros_that_a_loss_of_power_left_are_passed_over(tmp_path: Path) -> None
     assert [one.bytes for one in read.damage] == [4096]
 
 
+@pytest.mark.parametrize("first", [False, True])
+def test_a_hole_of_a_terabyte_is_passed_over_without_being_read(tmp_path: Path, first: bool) -> None:
+    folder, expected = written(tmp_path)
+    content = (folder / "bytes").read_bytes()
+    with (folder / "bytes").open("r+b") as file:
+        if first:  # blocks, a hole, and the same blocks again
+            file.seek(1 << 40)
+            file.write(content)
+        else:
+            file.truncate(1 << 40)
+    read = Spooled(folder)
+
+    assert pairs(list(read.blocks())) == expected * (2 if first else 1)
+    assert sum(one.bytes for one in read.damage) == (1 << 40) - len(content)
+
+
 def test_one_stream_is_read_alone(tmp_path: Path) -> None:
     folder, expected = written(tmp_path)
 

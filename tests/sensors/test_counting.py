@@ -97,3 +97,42 @@ def test_a_counter_that_grows_by_more_than_one_is_doubted_in_samples() -> None:
 
     assert went_on.missing.tolist() == [2_999, 0] and not went_on.reset.any()
     assert off.reset.tolist() == [True] and off.missing.tolist() == [2_999]
+
+
+FALSE = 999_999_999_999
+
+
+@pytest.mark.parametrize("rate_hz", [RATE_HZ, 0.0])
+@pytest.mark.parametrize("modulus", [1 << 62, 1 << 32, 1 << 16])
+@pytest.mark.parametrize("place", [1, 50, 99])
+@pytest.mark.parametrize("halves", [1, 2])
+def test_a_count_that_jumps_beyond_what_time_allows_is_a_reset_and_no_loss(
+    rate_hz: float, modulus: int, place: int, halves: int
+) -> None:
+    counting = Counting(modulus, rate_hz)
+    raw = np.arange(300, 400, dtype=np.int64)
+    raw[place] = FALSE % modulus if modulus > 1 << 16 else 30_000
+    t_ns = np.arange(100, dtype=np.int64) * PERIOD_NS
+    parts = [counting.feed(*part) for part in zip(np.split(raw, halves), np.split(t_ns, halves), strict=True)]
+    seq, missing, reset = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("seq", "missing", "reset")
+    )
+
+    assert seq.tolist() == list(range(300, 400))
+    assert missing.sum() == 0
+    assert np.flatnonzero(reset).tolist() == [place, place + 1][: 100 - place]
+
+
+@given(gap_s=st.floats(0.001, 3600), rate_hz=st.floats(1, 5e4))
+def test_a_program_of_unknown_rate_loses_what_its_count_says_up_to_what_time_allows(
+    gap_s: float, rate_hz: float
+) -> None:
+    gone = max(1, round(gap_s * rate_hz))
+    for reopened in (False, True):
+        counting = Counting(1 << 62, 0.0)
+        counting.feed(np.array([7]), np.array([0]))
+        if reopened:
+            counting.reopened()
+        found = counting.feed(np.array([7 + gone]), np.array([round(gap_s * 1e9)]))
+
+        assert found.missing.tolist() == [gone - 1] and not found.reset.any()

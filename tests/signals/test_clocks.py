@@ -70,6 +70,18 @@ def test_a_device_that_restarts_has_a_line_before_and_one_after() -> None:
     assert np.abs(host_times(fit, device_ns, arrival_ns) - taken_ns).max() < 0.05 * MS
 
 
+def test_arrivals_that_are_not_certain_move_nothing_and_their_rows_are_mapped_all_the_same() -> None:
+    taken_ns, device_ns, arrival_ns = link(400, 20, 0.5)
+    device_ns[5000:] -= device_ns[5000] - 1000
+    late = np.zeros(len(taken_ns), dtype=bool)
+    late[[*range(1000, 4990), *range(5200, 7900)]] = True
+    delayed_ns = np.where(late, arrival_ns + np.arange(len(late)) * 100_000, arrival_ns)
+    fit = fit_clock(device_ns, delayed_ns, ~late)
+    assert [(one.start, one.stop) for one in fit.segments] == [(0, 5000), (5000, 8000)]
+    assert np.abs(host_times(fit, device_ns, delayed_ns) - taken_ns).max() < 0.1 * MS
+    assert fit_clock(device_ns, delayed_ns, late & ~late) == fit_clock(device_ns, delayed_ns)
+
+
 def test_after_a_restart_too_short_to_show_a_drift_that_of_the_long_segment_holds() -> None:
     taken_ns, device_ns, arrival_ns = link(50, 60, 1.0, ppm=200.0)
     device_ns[-20:] -= device_ns[-20]

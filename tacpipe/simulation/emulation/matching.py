@@ -13,7 +13,13 @@ from tacpipe.sensors.sensor import Samples
 if TYPE_CHECKING:
     import pyarrow as pa
 
-STAMPS = ("t_ns", "t_device_ns", "seq", "device_seq")  # columns of a recorded stream that are no channels
+STAMPS = (
+    "t_ns",
+    "t_uncertain_ns",
+    "t_device_ns",
+    "seq",
+    "device_seq",
+)  # columns of a recorded stream that are no channels
 
 
 def sent_columns(samples: Samples) -> list[NDArray[Any]]:

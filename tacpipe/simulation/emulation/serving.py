@@ -53,7 +53,7 @@ def endpoint(stream: Stream, folder: Path) -> Endpoint:
 def _udp(stream: Stream) -> Endpoint:
     from tacpipe.simulation.emulation.udp import HOST, Udp, free_port
 
-    host, _, _ = stream.address.place.rpartition(":")
+    host, _, _ = stream.address.place.partition("?")[0].rpartition(":")
     if stream.sensor.listens or not host:
         return Udp(stream.sensor, (HOST if host else "", free_port()))
     return Udp(stream.sensor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 from collections.abc import Sequence
 from typing import Any
@@ -68,9 +69,10 @@ class Websocket(Tcp):
                 heard.append((peer, bytes(event.data)))
             elif event.opcode is Opcode.CLOSE:
                 peer.open = False
-        for piece in protocol.data_to_send():
-            if piece:
-                peer.socket.send(piece)
-            else:
-                peer.socket.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(OSError):  # of a peer that is gone: the next read says so
+            for piece in protocol.data_to_send():
+                if piece:
+                    peer.socket.send(piece)
+                else:
+                    peer.socket.shutdown(socket.SHUT_WR)
         return heard

@@ -1,0 +1,37 @@
+"""How a recording ended, and what `tacpipe show` reports of those that were cut off or whose recorder was held up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tacpipe.excerpt import plain
+
+COMPLETED, INTERRUPTED, RECOVERED = "completed", "interrupted", "recovered"  # values of the attribute `ended`
+REASONS = {
+    INTERRUPTED: "interrupted before its end",
+    RECOVERED: "recovered after a crash or a loss of power",
+}
+MOST = 20  # lines
+UNCERTAIN = "_uncertain_samples"
+
+
+def lines(attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each recording that was cut off, and for each in which arrivals are uncertain.
+
+    ``attributes`` are those of each recording, ``recordings`` the figures of its streams.
+    """
+    found = []
+    for name, values in sorted(attributes.items()):
+        if values.get("ended") in REASONS:
+            lasts_s = max(
+                (figures.get("duration_s", 0.0) for figures in recordings.get(name, {}).values()), default=0.0
+            )
+            requested_s = values.get("requested_duration_s")
+            of = f" of {requested_s:g}" if isinstance(requested_s, int | float) else ""
+            found.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}, {lasts_s:.1f}{of} s")
+        late = {stream: count for stream, count in values.items() if stream.endswith(UNCERTAIN)}
+        if late:
+            told = ", ".join(f"{count} samples of {plain(key.removesuffix(UNCERTAIN))}" for key, count in late.items())
+            found.append(f"recorder held up: {plain(name)}: the arrival of {told} is uncertain")
+    return found[:MOST] + ([f"… and {len(found) - MOST} more"] if len(found) > MOST else [])
