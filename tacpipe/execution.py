@@ -252,6 +252,8 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
             found[name] = read_roles(read(inputs[name], "split.parquet")) if inputs[name] else {}
         else:
             found[name] = store.root / "checkpoints" / digest(task.identity)
+            if found[name].is_symlink():
+                raise StorageError(f"{found[name]} is a symbolic link, and none is followed within a store. Remove it.")
             found[name].mkdir(parents=True, exist_ok=True)
     yield found
     for file, path in (task.files or {}).items():

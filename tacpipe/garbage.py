@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tacpipe import layout, replacing
 from tacpipe import manifest as manifest_of
-from tacpipe import replacing
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
 from tacpipe.files import readable_errors
 from tacpipe.hashing import DIGEST, bytes_digest
 from tacpipe.roots import PUSHED
-from tacpipe.store import ASIDE, MissingError, Store
+from tacpipe.store import MissingError, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
@@ -101,8 +101,11 @@ def _lasting(store: Store, name: str) -> bool:
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
     """Remove what nothing needs, records before the objects they name; with ``dry_run`` only count.
 
-    Raises `LockedError` if another collection runs, and `DamagedError` as `live` does.
+    Only what has the form of a store's own names is looked at, and no symbolic link is followed. Raises `LockedError` if
+    another collection runs, `DamagedError` as `live` does, and `UsageError` for a folder that is not a store.
     """
+    if not store.check():
+        return Collected()
     with store.leases.alone("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
         if not dry_run:
             _put_back(store)
@@ -123,7 +126,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
     collected.kept_recordings = len(kept - needed.replaced)
     aside = []
-    for path in store.listed("objects", "*", "*"):
+    for path in layout.entries(store.root, "objects"):
         if path.name in needed.objects or path.name in kept or _young(path):
             continue
         if dry_run:
@@ -147,22 +150,21 @@ def _remove(store: Store, aside: list[str], needed: set[str], collected: Collect
             store.has(name)  # which puts it back
             continue
         path = Path(store.aside(name))
-        with contextlib.suppress(FileNotFoundError):  # put back by who needs it
-            _count(collected, path)
-            path.unlink()
+        _count(collected, path)
+        path.unlink(missing_ok=True)
 
 
 def _put_back(store: Store) -> None:
     """Put back what a collection that was killed had moved aside."""
-    for path in store.listed("tmp", f"{ASIDE}*"):
-        with contextlib.suppress(DamagedError):
-            if store.has(path.name.removeprefix(ASIDE)):
-                path.unlink(missing_ok=True)
+    for path in layout.entries(store.root, "tmp"):
+        if path.name.startswith(layout.ASIDE) and store.has(path.name.removeprefix(layout.ASIDE)):
+            path.unlink(missing_ok=True)
 
 
 def _count(collected: Collected, path: Path) -> None:
-    collected.bytes += path.stat().st_size
-    collected.objects += 1
+    with contextlib.suppress(FileNotFoundError):  # put back by who needs it, or removed by another collection
+        collected.bytes += path.stat().st_size
+        collected.objects += 1
 
 
 def _young(path: Path) -> bool:
@@ -206,8 +208,9 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> set
 def _doubtful(store: Store) -> set[str]:
     """Return the digests that damaged records hold: nobody knows any more whether theirs were recordings."""
     found: set[str] = set()
-    for path in store.listed("quarantine", "*.json.*"):
-        if path.name.startswith("root-") or store.record(path.name.partition(".")[0]) is not None:
+    for path in layout.entries(store.root, "quarantine"):
+        name, is_record, _ = path.name.partition(".json.")
+        if not is_record or name.startswith("root-") or store.record(name) is not None:
             continue
         with contextlib.suppress(FileNotFoundError):
             found.update(DIGEST.findall(path.read_bytes().decode("latin-1")))
@@ -261,16 +264,16 @@ def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: 
 
 def _sweep(store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool) -> None:
     now_s = time.time()
-    for path in store.listed("tmp", "*"):
-        if path.name.startswith(ASIDE) or path.name.partition(".")[0] in needed.runs:
+    for path in layout.entries(store.root, "tmp"):
+        if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
             continue
         dead = path.name.startswith("run-")  # its run is over; of who told no run an old draft is swept up
         collected.drafts += _drop(path, _YOUNG_S if dead else _DRAFT_S, now_s, dry_run=dry_run)
-    for path in store.listed("quarantine", "*"):
+    for path in layout.entries(store.root, "quarantine"):
         _drop(path, grace_days * 86400, now_s, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
-    for folder in store.listed("checkpoints", "*"):
+    for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1
             if not dry_run:

@@ -30,11 +30,12 @@ from typing import Any
 
 import numpy as np
 
+from tacpipe import layout
 from tacpipe.errors import TacpipeError
-from tacpipe.files import listed, readable_errors, sync_folder, write_whole
+from tacpipe.files import readable_errors, sync_folder, write_whole
 from tacpipe.sensors.framing import Chunks
 
-FOLDER = "spool"  # within the store
+FOLDER = layout.SPOOL  # within the store
 MARK = b"tacB"
 HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
 CHUNKS, NOTE = 0, 1  # kinds of blocks
@@ -236,7 +237,7 @@ class Spooled:
 def abandoned(store: Path) -> list[Path]:
     """Return the folders of spools that no process writes or seals any more, oldest first."""
     found = []
-    for folder in listed(store / FOLDER):
+    for folder in layout.entries(store, FOLDER):
         try:
             with claimed(folder) as ours:
                 age_s = time.time() - (folder / "bytes" if ours else folder).stat().st_mtime

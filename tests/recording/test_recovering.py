@@ -172,7 +172,7 @@ def test_a_spool_without_a_sample_is_no_recording(lab: Lab) -> None:
 
 
 def test_a_spool_that_was_begun_and_has_no_header_is_removed_when_it_is_old(lab: Lab) -> None:
-    folder = lab.folder / ".tacpipe/spool/0123"
+    folder = lab.folder / ".tacpipe/spool/01230123012301230123012301230123"
     folder.mkdir(parents=True)
     (folder / "bytes").touch()
     lab.run("acquire --recover")
