@@ -11,7 +11,7 @@ What was replaced stays in the store and is listed by `tacpipe store list`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from tacpipe import execution, places
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.excerpt import listed
+from tacpipe.hashing import digest
 from tacpipe.manifest import ACQUIRE, Manifest
 from tacpipe.store import Store
 
@@ -117,6 +118,19 @@ def irreplaceable(manifest: Manifest) -> bool:
     return manifest.stage == ACQUIRE or bool(manifest.sources)
 
 
+def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield what ``manifest`` holds that cannot be computed again, in a form in which manifests can be compared.
+
+    Each is (what it is, value): a recording by name and content, and a label by that and its own name, with its value.
+    """
+    for name, entry in manifest.recordings.items():
+        content = digest({stream: shard["digest"] for stream, shard in entry["shards"].items()})
+        if irreplaceable(manifest):
+            yield (name, content), None
+        for label, value in manifest.labels.get(name, {}).items():
+            yield (name, content, label), value
+
+
 def losses(before: Manifest, after: Manifest) -> Losses:
     """Return what of ``before`` cannot be computed again and is not in ``after``."""
     gone = [] if not irreplaceable(before) else [name for name in before.recordings if _gone(name, before, after)]
@@ -129,10 +143,13 @@ def losses(before: Manifest, after: Manifest) -> Losses:
 
 
 def _gone(name: str, before: Manifest, after: Manifest) -> bool:
-    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name."""
+    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name.
+
+    An acquired recording has no raw files: its source is the rig file, which it shares with others.
+    """
     if name not in after.recordings:
         return True
-    same_files = name in before.sources and before.sources[name] == after.sources.get(name)
+    same_files = name in before.sources and before.sources[name] == after.sources.get(name) and before.stage != ACQUIRE
     return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import tacpipe
+from tacpipe.hashing import bytes_digest
 from tests.conftest import Lab
 from tests.test_garbage import age
 from tests.test_pipeline import counts
@@ -238,6 +239,25 @@ def test_labels_do_not_come_back_on_other_recordings_of_the_same_name(lab: Lab) 
     source("src", a="7")
     lab.run("ingest numbers src -o data/r")
     assert lab.manifest("data/r").labels == {"b": {"material": "cork"}}
+
+
+def test_acquired_recordings_of_one_name_and_rig_are_not_the_same(lab: Lab) -> None:
+    from tests.recording.test_recovering import spooled
+
+    spooled(lab, count=100)
+    lab.run("acquire --recover")
+    lab.run("label rec one --set material=cork")
+    old = bytes_digest(Path("rec/manifest.json").read_bytes())
+    shutil.rmtree("rec")
+    spooled(lab, count=50)
+    lab.run("acquire --recover")
+    assert lab.manifest("rec").labels == {}
+    root = lab.store.roots.get(lab.folder / "rec")
+    assert root is not None and (root["history"][0]["manifest"], root["history"][0]["lasting"]) == (old, True)
+    ran = lab.call(f"store checkout {old} -o rec")
+    assert ran.code == 2 and "1 recordings that the new dataset does not have (one)" in ran.err
+    lab.run(f"store checkout {old} -o back")
+    assert tacpipe.open("back").table("force").num_rows == 100
 
 
 # ---- what was replaced

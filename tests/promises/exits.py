@@ -20,6 +20,7 @@ from tests.conftest import tacpipe
 from tests.promises.counts import count
 
 SHOW = "show data/recordings"
+_EVERY = 50  # commands between two lines of progress
 OTHERS = (
     "show data/latents",
     "show data/split",
@@ -60,8 +61,14 @@ def ended(folder: Path, commands: list[str], jobs: int) -> Counter[tuple[str, in
             print(f"tacpipe {command}: exit code {done.returncode}: {done.stderr[-300:]}", file=sys.stderr, flush=True)
         return command, done.returncode
 
+    found: Counter[tuple[str, int]] = Counter()
     with ThreadPoolExecutor(jobs) as pool:
-        return Counter(pool.map(run, commands))
+        for number, one in enumerate(pool.map(run, commands), 1):
+            found[one] += 1
+            if number % _EVERY == 0:
+                failed = sum(times for (_, code), times in found.items() if code)
+                print(f"{number} of {len(commands)} ended, {failed} with another exit code than 0", file=sys.stderr)
+    return found
 
 
 if __name__ == "__main__":
