@@ -11,6 +11,7 @@ What was replaced stays in the store and is listed by `tacpipe store list`.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from tacpipe import execution, places
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.excerpt import listed
-from tacpipe.hashing import digest
+from tacpipe.hashing import bytes_digest, digest
 from tacpipe.manifest import ACQUIRE, Manifest
 from tacpipe.store import Store
 
@@ -203,13 +204,30 @@ def appended(before: Manifest, made: Manifest) -> Manifest:
     return replace(made, recordings=recordings, skipped=skipped, sources=sources)
 
 
-def returning_labels(known: Manifest, made: Manifest) -> dict[str, Mapping[str, Any]]:
-    """Return the hand-set labels of ``known`` whose recordings are in ``made`` again, with the same content or raw files."""
-    return {
-        name: labels
-        for name, labels in known.labels.items()
-        if name in known.recordings and known.stage == made.stage and not _gone(name, known, made)
-    }
+def returning_labels(
+    store: Store, output: Path, before: Manifest | None, made: Manifest
+) -> dict[str, Mapping[str, Any]]:
+    """Return the hand-set labels of recordings that are in ``made``, not in ``before``, and lay at ``output`` earlier.
+
+    A recording that comes back, with the same content or raw files, has the labels that it had there last.
+    """
+    there = () if before is None else before.recordings
+    coming = {one for one in made.recordings if before is None or one not in there or _gone(one, before, made)}
+    root = store.roots.get(output.absolute()) if coming else None
+    if root is None:
+        return {}
+    # what a manifest held that is not lasting, the one after it holds too
+    names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
+    found: dict[str, Mapping[str, Any]] = {}
+    for name in names if before is None else [name for name in names if name != bytes_digest(before.content)]:
+        with contextlib.suppress(TacpipeError):
+            known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
+            if known.stage != made.stage:
+                continue
+            back = {one for one in coming & set(known.recordings) if not _gone(one, known, made)}
+            found |= {one: known.labels[one] for one in back & set(known.labels)}
+            coming -= back
+    return found
 
 
 def outgoing(store: Store, directory: Path) -> Manifest | None:

@@ -26,7 +26,8 @@ def littered(lab: Lab) -> Lab:
 
 def between(monkeypatch: pytest.MonkeyPatch, folder: str, act: Callable[[], object]) -> list[int]:
     """Have ``act`` done once, after the next listing of ``folder`` and before its first name is looked at."""
-    honest, done = layout.entries, []
+    honest = layout.entries
+    done: list[int] = []
 
     def entries(root: Path, name: str) -> Iterator[Path]:
         found = list(honest(root, name))
@@ -98,7 +99,8 @@ def test_a_root_that_was_forgotten_since_it_was_listed_is_not_damaged(
 def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_missing(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest, looks = upkeep._wanted, []
+    honest = upkeep._wanted
+    looks: list[dict[str, str]] = []
 
     def wanted(store: Store) -> dict[str, str]:
         looks.append(honest(store))
