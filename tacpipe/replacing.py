@@ -207,12 +207,13 @@ def appended(before: Manifest, made: Manifest) -> Manifest:
 def returning_labels(
     store: Store, output: Path, before: Manifest | None, made: Manifest
 ) -> dict[str, Mapping[str, Any]]:
-    """Return the hand-set labels of recordings that are in ``made``, not in ``before``, and lay at ``output`` earlier.
+    """Return the hand-set labels of recordings that are in ``made``, not the same in ``before``, and lay at ``output`` earlier.
 
     A recording that comes back, with the same content or raw files, has the labels that it had there last.
     """
-    there = () if before is None else before.recordings
-    coming = {one for one in made.recordings if before is None or one not in there or _gone(one, before, made)}
+    coming = {
+        one for one in made.recordings if before is None or one not in before.recordings or _gone(one, before, made)
+    }
     root = store.roots.get(output.absolute()) if coming else None
     if root is None:
         return {}

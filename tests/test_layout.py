@@ -297,3 +297,22 @@ def test_only_drafts_of_our_own_form_are_swept_from_a_dataset(tmp_path: Path) ->
     directory.sweep_beside(tmp_path / "data/page.html")
     assert (tmp_path / "data/.page.html.old.draft").exists()
     assert not (tmp_path / "data/.page.html.0123456789ab.draft").exists()
+
+
+def test_an_emulated_port_replaces_and_removes_links_alone(tmp_path: Path) -> None:
+    from tacpipe.simulation.emulation.pty import Pty
+    from tests.recording.test_reading import SENSOR
+
+    for name in ("left", ".left"):
+        write(tmp_path, {name: "mine"})
+        with pytest.raises(UsageError, match="no emulator made it"):
+            Pty(SENSOR, tmp_path / "left")
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).unlink()
+    (tmp_path / "left").symlink_to("/dev/pts/of-an-emulator-that-was-killed")
+    port = Pty(SENSOR, tmp_path / "left")
+    assert (tmp_path / "left").readlink().parent == Path("/dev/pts")
+    (tmp_path / "left").unlink()
+    write(tmp_path, {"left": "mine"})
+    port.close()
+    assert (tmp_path / "left").read_text() == "mine"
