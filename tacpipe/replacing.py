@@ -207,7 +207,7 @@ def appended(before: Manifest, made: Manifest) -> Manifest:
 def returning_labels(
     store: Store, output: Path, before: Manifest | None, made: Manifest
 ) -> dict[str, Mapping[str, Any]]:
-    """Return the hand-set labels of recordings that are in ``made``, not the same in ``before``, and lay at ``output`` earlier.
+    """Return hand-set labels of recordings that are in ``made``, not the same in ``before``, and lay at ``output`` earlier.
 
     A recording that comes back, with the same content or raw files, has the labels that it had there last.
     """
