@@ -20,6 +20,8 @@ FORMAT = "1"
 MARK = "format"  # the file that makes a folder a store
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
 SPOOL = "spool"  # made by the first recording
+KEPT = "kept-spools"  # made by the first recording whose raw bytes are kept
+PROJECTS = "projects"  # made by the first push
 ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
 SHELF = re.compile(r"[0-9a-f]{2}")  # folders within objects/ and records/: how the names in them begin
 _DIGEST = r"[0-9a-f]{64}"
@@ -33,9 +35,11 @@ _FORMS = {  # of the path within each folder
     "quarantine": re.compile(rf"({_DIGEST}(\.json)?|root-{_DIGEST}\.json|manifest\.json)\.[0-9]+"),
     "tmp": re.compile(rf"((run-{_RANDOM})?\.)?{_RANDOM}|{ASIDE}{_DIGEST}"),
     SPOOL: re.compile(_RANDOM),
+    KEPT: re.compile(_RANDOM),
+    PROJECTS: re.compile(rf"{_DIGEST}\.json"),
 }
 _SHELVED = ("objects", "records")
-_HOLD_FOLDERS = ("checkpoints", SPOOL)  # their entries are folders, those of others files
+_HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # their entries are folders, those of others files
 _BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may hold something before there is a mark
 _BESIDE = frozenset({".gitignore", ".gitkeep", "lost+found"})  # no reason to refuse a folder that is to become a store
 

@@ -41,7 +41,7 @@ WRITE = (
     "acquire rig.toml -o data/rec --recover",
 )
 EVERY = (*READ, *WRITE)
-LINKED = (*layout.FOLDERS, layout.SPOOL)
+LINKED = (*layout.FOLDERS, layout.SPOOL, layout.KEPT, layout.PROJECTS)
 RUN = f"run-{'ab' * 16}"
 
 
