@@ -34,7 +34,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults test-power fuzz test-kernel lint types bless bench clean
+.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults test-power test-exits fuzz test-kernel lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -73,6 +73,9 @@ test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, i
 	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)
 	@$(FAULTS) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
+
+test-exits: $(VENV)/.dev ## run 2,000 times `tacpipe show` and other commands that end after reading Parquet, and count exit codes
+	@$(BIN)/python -m tests.promises.exits
 
 fuzz: $(VENV)/.fuzz ## let atheris look for bytes that a reader stumbles over: make fuzz SECONDS=60 TARGETS="pcd sensor"
 	@OMP_NUM_THREADS=1 $(BIN)/python -m fuzz --seconds $(SECONDS) $(TARGETS)

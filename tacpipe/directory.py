@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
+import re
 import uuid
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -17,6 +17,7 @@ from tacpipe.manifest import NAME, Manifest, parse
 from tacpipe.store import MissingError, Store
 
 _DRAFT = ".draft"
+_OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}{_DRAFT}", re.DOTALL)
 
 
 def publish(store: Store, manifest: Manifest, directory: Path) -> None:
@@ -81,17 +82,28 @@ def publish_alone(
 
 
 def sweep(directory: Path, *, shards: bool = True) -> None:
-    """Remove what a process left that was killed while it wrote here: drafts of the manifest, and of ``shards``."""
-    below = listed(directory) if shards else ()
-    folders = [directory, *(path for path in below if path.is_dir() and not path.is_symlink())]
-    for draft in [draft for folder in folders for draft in listed(folder, f".*{_DRAFT}")]:
-        draft.unlink(missing_ok=True)
+    """Remove what a process left that was killed while it wrote here: drafts by our names for them, and nothing else.
+
+    Without ``shards`` those of the manifest alone.
+    """
+    for folder in (directory, *(listed(directory) if shards else ())):
+        if folder == directory or (folder.is_dir() and not folder.is_symlink()):
+            for path in listed(folder, f".*{_DRAFT}"):
+                if _OURS.fullmatch(path.name):
+                    _remove_draft(path)
 
 
 def sweep_beside(path: Path) -> None:
     """Do as `sweep` for what was to become the file ``path``; what else lies in its folder is not ours."""
-    for draft in listed(path.parent, f".{glob.escape(path.name[:100])}.*{_DRAFT}"):
-        draft.unlink(missing_ok=True)
+    for draft in listed(path.parent, f".*{_DRAFT}"):
+        ours = _OURS.fullmatch(draft.name)
+        if ours and ours["name"] == path.name[:100]:
+            _remove_draft(draft)
+
+
+def _remove_draft(path: Path) -> None:
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
 
 
 def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:

@@ -66,6 +66,8 @@ def compute(task: Task) -> Done:
             stage = stage_of(task.name)
             made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
             made |= {"code": provenance.code(stage), "notes": notes}
+            if stage.source:  # the record alone would tell that this is a recording, until a dataset's manifest does
+                store.put(_manifest_of(task, stage, result).content)
             record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
             shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
             return Done(task.recording, record)
@@ -104,6 +106,18 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
     files = {name: vars(sink.put(content)) for name, content in sorted(returned.files.items())}
     notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
     return {"recordings": recordings, "files": files}, notes
+
+
+def _manifest_of(task: Task, stage: Stage, result: Mapping[str, Any]) -> Manifest:
+    """Return a manifest of one recording that was read from published files."""
+    (entry,), files = result["recordings"].values(), task.identity["inputs"][stage.argument("Files")]
+    return Manifest(
+        task.name,
+        stage.version,
+        task.identity["params"],
+        recordings={task.recording: entry},
+        sources={task.recording: files},
+    )
 
 
 def stage_of(name: str) -> Stage:
@@ -252,6 +266,8 @@ def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any
             found[name] = read_roles(read(inputs[name], "split.parquet")) if inputs[name] else {}
         else:
             found[name] = store.root / "checkpoints" / digest(task.identity)
+            if found[name].is_symlink():
+                raise StorageError(f"{found[name]} is a symbolic link, and none is followed within a store. Remove it.")
             found[name].mkdir(parents=True, exist_ok=True)
     yield found
     for file, path in (task.files or {}).items():

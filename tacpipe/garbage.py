@@ -14,14 +14,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tacpipe import layout, replacing, unnamed
 from tacpipe import manifest as manifest_of
-from tacpipe import replacing
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
 from tacpipe.files import readable_errors
 from tacpipe.hashing import DIGEST, bytes_digest
+from tacpipe.manifest import Manifest
 from tacpipe.roots import PUSHED
-from tacpipe.store import ASIDE, MissingError, Store
+from tacpipe.store import MissingError, Store
 
 GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
 _DRAFT_S = 3600.0  # a draft older than this belongs to nobody
@@ -47,6 +48,8 @@ class Live:
     objects: set[str] = field(default_factory=set)  # digests, of manifests too
     lasting: set[str] = field(default_factory=set)  # digests of what was replaced and cannot be computed again
     replaced: set[str] = field(default_factory=set)  # digests of the manifests that name it
+    manifests: list[Manifest] = field(default_factory=list)  # of recordings, among all these
+    doubtful: set[Path] = field(default_factory=set)  # files in quarantine that name what may be recordings
     runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
 
 
@@ -83,8 +86,10 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
             f"removed. `tacpipe store repair` finds those beside the store, and the commands that wrote the others write "
             f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
         )
-    found.objects |= _closure(store, wanted, contents) | _doubtful(store)
-    found.lasting = _closure(store, list(replaced), contents) - found.objects
+    doubtful = _doubtful(store)
+    found.doubtful = set(doubtful)
+    found.objects |= _closure(store, wanted, contents, found.manifests).union(*doubtful.values())
+    found.lasting = _closure(store, list(replaced), contents, found.manifests) - found.objects
     found.replaced = set(replaced)
     return found
 
@@ -101,8 +106,11 @@ def _lasting(store: Store, name: str) -> bool:
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
     """Remove what nothing needs, records before the objects they name; with ``dry_run`` only count.
 
-    Raises `LockedError` if another collection runs, and `DamagedError` as `live` does.
+    Only what has the form of a store's own names is looked at, and no symbolic link is followed. Raises `LockedError` if
+    another collection runs, `DamagedError` as `live` does, and `UsageError` for a folder that is not a store.
     """
+    if not store.check():
+        return Collected()
     with store.leases.alone("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
         if not dry_run:
             _put_back(store)
@@ -110,10 +118,11 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
+    records = list(store.records())  # before what is needed: a damaged one goes to quarantine, and counts there
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
     kept = set(needed.lasting)
-    for key, record in list(store.records()):
+    for key, record in records:
         names = set(named(record["result"]))
         if names <= needed.objects or names <= kept:
             continue
@@ -121,10 +130,14 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
             kept |= names - needed.objects
             continue
         collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
-    collected.kept_recordings = len(kept - needed.replaced)
+    objects = list(layout.entries(store.root, "objects"))
+    kept |= needed.objects
+    named_by = {} if recordings else unnamed.kept((one for one in objects if one.name not in kept), needed.manifests)
+    kept = kept.union(named_by, *named_by.values())
+    collected.kept_recordings = len(kept - needed.objects - needed.replaced - set(named_by))
     aside = []
-    for path in store.listed("objects", "*", "*"):
-        if path.name in needed.objects or path.name in kept or _young(path):
+    for path in objects:
+        if path.name in kept or _young(path):
             continue
         if dry_run:
             _count(collected, path)
@@ -136,7 +149,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         shown = {root["manifest"] for root in store.roots.all()}
         aside.sort(key=lambda name: name not in shown)  # no manifest is there that names what is gone
         _remove(store, aside, live(store, grace_days).objects, collected)
-    _sweep(store, needed, collected, grace_days, dry_run=dry_run)
+    _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
     return collected
 
 
@@ -147,22 +160,21 @@ def _remove(store: Store, aside: list[str], needed: set[str], collected: Collect
             store.has(name)  # which puts it back
             continue
         path = Path(store.aside(name))
-        with contextlib.suppress(FileNotFoundError):  # put back by who needs it
-            _count(collected, path)
-            path.unlink()
+        _count(collected, path)
+        path.unlink(missing_ok=True)
 
 
 def _put_back(store: Store) -> None:
     """Put back what a collection that was killed had moved aside."""
-    for path in store.listed("tmp", f"{ASIDE}*"):
-        with contextlib.suppress(DamagedError):
-            if store.has(path.name.removeprefix(ASIDE)):
-                path.unlink(missing_ok=True)
+    for path in layout.entries(store.root, "tmp"):
+        if path.name.startswith(layout.ASIDE) and store.has(path.name.removeprefix(layout.ASIDE)):
+            path.unlink(missing_ok=True)
 
 
 def _count(collected: Collected, path: Path) -> None:
-    collected.bytes += path.stat().st_size
-    collected.objects += 1
+    with contextlib.suppress(FileNotFoundError):  # put back by who needs it, or removed by another collection
+        collected.bytes += path.stat().st_size
+        collected.objects += 1
 
 
 def _young(path: Path) -> bool:
@@ -180,8 +192,11 @@ def _remove_record(path: Path, *, dry_run: bool) -> bool:
     return True
 
 
-def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> set[str]:
-    """Return the digests of manifests, of those they descend from, and of all objects that these name."""
+def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_recordings: list[Manifest]) -> set[str]:
+    """Return the digests of manifests, of those they descend from, and of all objects that these name.
+
+    Manifests of recordings are added to ``of_recordings``.
+    """
     objects: set[str] = set()
     manifests: set[str] = set()
     while wanted:
@@ -195,22 +210,30 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes]) -> set
             if store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
                 raise DamagedError(
                     f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is not "
-                    f"known what it needs; nothing was removed. `tacpipe store repair` may bring it back."
+                    f"known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to go on without "
+                    f"it, remove it from objects/ and quarantine/."
                 ) from error
             continue  # it never came here: of a dataset that was copied or pulled without what it descends from
         objects |= {found for _, found in manifest.objects()}
         wanted += ancestors(manifest)
+        of_recordings += [manifest] if manifest.recorded else []
     return objects | manifests
 
 
-def _doubtful(store: Store) -> set[str]:
-    """Return the digests that damaged records hold: nobody knows any more whether theirs were recordings."""
-    found: set[str] = set()
-    for path in store.listed("quarantine", "*.json.*"):
-        if path.name.startswith("root-") or store.record(path.name.partition(".")[0]) is not None:
+def _doubtful(store: Store) -> dict[Path, set[str]]:
+    """Return the digests in damaged records and manifests: nobody knows any more whether they were those of recordings.
+
+    Those that were made again, or brought back, are in doubt no longer.
+    """
+    found = {}
+    for path in layout.entries(store.root, "quarantine"):
+        name, _, kind = path.name.rpartition(".")[0].partition(".")
+        if not DIGEST.fullmatch(name) or (store.record(name) if kind else store.has(name)):
             continue
         with contextlib.suppress(FileNotFoundError):
-            found.update(DIGEST.findall(path.read_bytes().decode("latin-1")))
+            names = unnamed.digests(path.read_bytes())
+            if names:
+                found[path] = names
     return found
 
 
@@ -259,28 +282,35 @@ def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: 
     return grace_days <= 0 or now_s - since_s > grace_days * 86400
 
 
-def _sweep(store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool) -> None:
+def _sweep(
+    store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
+) -> None:
+    """Remove drafts, leases and checkpoints of runs that are over, and what was long in quarantine.
+
+    What names objects that may be recordings stays there, unless ``doubtful`` asks for it.
+    """
     now_s = time.time()
-    for path in store.listed("tmp", "*"):
-        if path.name.startswith(ASIDE) or path.name.partition(".")[0] in needed.runs:
+    for path in layout.entries(store.root, "tmp"):
+        if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
             continue
         dead = path.name.startswith("run-")  # its run is over; of who told no run an old draft is swept up
-        collected.drafts += _drop(path, _YOUNG_S if dead else _DRAFT_S, now_s, dry_run=dry_run)
-    for path in store.listed("quarantine", "*"):
-        _drop(path, grace_days * 86400, now_s, dry_run=dry_run)
+        with contextlib.suppress(FileNotFoundError):
+            old = abs(now_s - path.stat().st_mtime) >= (_YOUNG_S if dead else _DRAFT_S)
+            collected.drafts += old and _drop(path, dry_run=dry_run)
+    for path in layout.entries(store.root, "quarantine"):
+        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400  # since it was moved there
+        if old and (doubtful or path not in needed.doubtful):
+            _drop(path, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
-    for folder in store.listed("checkpoints", "*"):
+    for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1
             if not dry_run:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def _drop(path: Path, older_s: float, now_s: float, *, dry_run: bool) -> bool:
-    with contextlib.suppress(FileNotFoundError):
-        if abs(now_s - path.stat().st_mtime) >= older_s:
-            if not dry_run:
-                path.unlink()
-            return True
-    return False
+def _drop(path: Path, *, dry_run: bool) -> bool:
+    if not dry_run:
+        path.unlink()
+    return True

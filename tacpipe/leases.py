@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import progress
+from tacpipe import layout, progress
 from tacpipe.errors import LockedError, TacpipeError
-from tacpipe.files import listed, read_json, readable_errors, write_all
+from tacpipe.files import read_json, readable_errors, write_all
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
 TELL_AFTER_S = 2.0  # a shorter wait is no news
@@ -89,7 +89,9 @@ class Leases:
         A run that began and told nothing yet has made no use of anything yet.
         """
         found = []
-        for path in listed(self.folder, "run-*.lock"):
+        for path in self._files():
+            if not path.name.startswith("run-"):
+                continue
             try:
                 handle = _try_lock(path, create=False)
                 if handle is None:
@@ -106,13 +108,16 @@ class Leases:
 
     def sweep(self) -> None:
         """Remove the files that killed processes left; their locks went with them."""
-        for path in listed(self.folder, "*.lock"):
+        for path in self._files():
             with contextlib.suppress(FileNotFoundError, TacpipeError):
                 handle = _try_lock(path, create=False)
                 if handle is not None:
                     if _has_locks(handle):  # else nobody knows whose it is
                         path.unlink()
                     os.close(handle)
+
+    def _files(self) -> Iterator[Path]:
+        return layout.entries(self.folder.parent, self.folder.name)
 
     @contextlib.contextmanager
     def alone(self, what: str) -> Iterator[None]:
@@ -148,7 +153,7 @@ class Announcing:
         with readable_errors(Path(self.path).parent):
             if self._handle < 0:
                 try:
-                    self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND)
+                    self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
                 except FileNotFoundError:
                     raise TacpipeError("The process that began this run is gone; nothing more is written.") from None
             write_all(self._handle, "".join(f"{name}\n" for name in new).encode())
@@ -278,7 +283,7 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
 
 
 def _open(path: Path, *, create: bool) -> int:
-    flags = os.O_CREAT if create else 0
+    flags = os.O_NOFOLLOW | (os.O_CREAT if create else 0)
     try:
         return os.open(path, os.O_RDWR | flags, 0o666)
     except FileNotFoundError:
@@ -288,6 +293,8 @@ def _open(path: Path, *, create: bool) -> int:
         return os.open(path, os.O_RDWR | flags, 0o666)
     except PermissionError as error:
         try:
-            return os.open(path, os.O_RDONLY)  # another user's, who shares the store: it can be waited for
+            return os.open(
+                path, os.O_RDONLY | os.O_NOFOLLOW
+            )  # another user's, who shares the store: it can be waited for
         except FileNotFoundError:
             raise error from None

@@ -29,20 +29,20 @@ def shown(store: Store, request: Request, hit: Manifest) -> bool:
 def settled(store: Store, request: Request, made: Manifest) -> Manifest:
     """Return the manifest that the output shows after the command gave ``made``.
 
-    Recordings have the labels that were set on them by hand, also where their directory was deleted in the meantime;
-    ingested ones are appended to those that are there. Raises `DamagedError` if what is there cannot be read.
+    Recordings have the labels that were set on them by hand, also where they were deleted or replaced in the meantime and
+    come back; ingested ones are appended to those that are there. Raises `DamagedError` if what is there cannot be read.
     """
     if not made.recorded:
         return made
     before = replacing.occupant(store, request.output)
+    if before is not None and before.stage != made.stage:
+        before = None
+    returning = replacing.returning_labels(store, request.output, before, made)
     if before is None:
-        known = replacing.former(store, request.output)
-        return made if known is None else _labelled(made, replacing.returning_labels(known, made))
-    if before.stage != made.stage:
-        return made
+        return _labelled(made, returning)
     if replacing.irreplaceable(made) and not request.replace:
         made = replacing.appended(before, made)
-    return _labelled(made, before.labels)
+    return _labelled(made, {**returning, **before.labels})
 
 
 def _labelled(made: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:

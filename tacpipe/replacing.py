@@ -11,7 +11,8 @@ What was replaced stays in the store and is listed by `tacpipe store list`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from tacpipe import execution, places, recording_names
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.excerpt import listed, plain
+from tacpipe.hashing import bytes_digest, digest
 from tacpipe.manifest import ACQUIRE, Manifest
 from tacpipe.store import Store
 
@@ -117,6 +119,19 @@ def irreplaceable(manifest: Manifest) -> bool:
     return manifest.stage == ACQUIRE or bool(manifest.sources)
 
 
+def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield what ``manifest`` holds that cannot be computed again, in a form in which manifests can be compared.
+
+    Each is (what it is, value): a recording by name and content, and a label by that and its own name, with its value.
+    """
+    for name, entry in manifest.recordings.items():
+        content = digest({stream: shard["digest"] for stream, shard in entry["shards"].items()})
+        if irreplaceable(manifest):
+            yield (name, content), None
+        for label, value in manifest.labels.get(name, {}).items():
+            yield (name, content, label), value
+
+
 def losses(before: Manifest, after: Manifest) -> Losses:
     """Return what of ``before`` cannot be computed again and is not in ``after``."""
     gone = [] if not irreplaceable(before) else [name for name in before.recordings if _gone(name, before, after)]
@@ -129,10 +144,13 @@ def losses(before: Manifest, after: Manifest) -> Losses:
 
 
 def _gone(name: str, before: Manifest, after: Manifest) -> bool:
-    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name."""
+    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name.
+
+    An acquired recording has no raw files: its source is the rig file, which it shares with others.
+    """
     if name not in after.recordings:
         return True
-    same_files = name in before.sources and before.sources[name] == after.sources.get(name)
+    same_files = name in before.sources and before.sources[name] == after.sources.get(name) and before.stage != ACQUIRE
     return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
 
 
@@ -206,13 +224,31 @@ def appended(before: Manifest, made: Manifest) -> Manifest:
     return replace(made, recordings=recordings, skipped=skipped, sources=sources)
 
 
-def returning_labels(known: Manifest, made: Manifest) -> dict[str, Mapping[str, Any]]:
-    """Return the hand-set labels of ``known`` whose recordings are in ``made`` again, with the same content or raw files."""
-    return {
-        name: labels
-        for name, labels in known.labels.items()
-        if name in known.recordings and known.stage == made.stage and not _gone(name, known, made)
+def returning_labels(
+    store: Store, output: Path, before: Manifest | None, made: Manifest
+) -> dict[str, Mapping[str, Any]]:
+    """Return hand-set labels of recordings that are in ``made``, not the same in ``before``, and lay at ``output`` earlier.
+
+    A recording that comes back, with the same content or raw files, has the labels that it had there last.
+    """
+    coming = {
+        one for one in made.recordings if before is None or one not in before.recordings or _gone(one, before, made)
     }
+    root = store.roots.get(output.absolute()) if coming else None
+    if root is None:
+        return {}
+    # what a manifest held that is not lasting, the one after it holds too
+    names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
+    found: dict[str, Mapping[str, Any]] = {}
+    for name in names if before is None else [name for name in names if name != bytes_digest(before.content)]:
+        with contextlib.suppress(TacpipeError):
+            known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
+            if known.stage != made.stage:
+                continue
+            back = {one for one in coming & set(known.recordings) if not _gone(one, known, made)}
+            found |= {one: known.labels[one] for one in back & set(known.labels)}
+            coming -= back
+    return found
 
 
 def outgoing(store: Store, directory: Path) -> Manifest | None:

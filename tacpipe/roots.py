@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.files import read_json, readable_errors
-from tacpipe.hashing import digest
+from tacpipe.hashing import DIGEST, digest
 
 if TYPE_CHECKING:
     from tacpipe.store import Store
@@ -83,7 +83,8 @@ class Roots:
         if check is None and "kind" not in root and {"path", "manifest"} <= set(root):  # as they were once written
             return {**root, "kind": ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED}
         if check is None or check != digest(root):
-            self.store.quarantine(file)
+            if DIGEST.fullmatch(file.stem):  # another name is not one of ours
+                self.store.quarantine(file)
             return None
         beside = root["kind"] == BESIDE
         return {**root, "path": str(self.store.root.parent / root["path"])} if beside else root

@@ -12,20 +12,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe import places
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe import layout, places
+from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.files import listed, readable_errors, sentence, sync_folders, write_whole
 from tacpipe.hashing import DIGEST, bytes_digest, digest
 from tacpipe.leases import Announcing, Leases
 from tacpipe.roots import BESIDE_NAME, Roots
 
-FORMAT = "1"
-FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
-ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
-
 
 class MissingError(DamagedError):
     """An object is not in the store, or was damaged and is now in quarantine."""
+
+
+class AbsentError(MissingError):
+    """An object or a record is not in the store, which is no sign of damage: it may have been collected."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,19 @@ class Store:
         """Return where the record of ``key`` lies, whether or not it is there."""
         return f"{self._root}/records/{key[:2]}/{key}.json"
 
+    def check(self) -> bool:
+        """Return whether there is a store; False where one may be begun. Raises `UsageError` as `layout.check` does."""
+        return layout.check(self.root)
+
     def prepare(self) -> None:
-        """Create the store's folders if they are not there; refuse a store of another format."""
-        mark = self.root / "format"
+        """Create the store where there is none yet; raises as `check` does."""
+        if self.check():
+            return
         with readable_errors(self.root):
-            if not mark.exists():
-                for name in FOLDERS:
-                    (self.root / name).mkdir(parents=True, exist_ok=True)
-                self.write_file(mark, FORMAT.encode() + b"\n")
-                sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
-            found = mark.read_bytes().strip().decode(errors="replace")
-        if found != FORMAT:
-            raise TacpipeError(f"The store {self._root} has format {found[:20]}; this tacpipe reads format {FORMAT}.")
+            for name in layout.FOLDERS:
+                (self.root / name).mkdir(parents=True, exist_ok=True)
+            self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
+            sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
 
     # ---- runs
 
@@ -148,7 +149,7 @@ class Store:
         except FileNotFoundError:
             if self._put_back(name):
                 return self.read(name)
-            raise MissingError(f"Object {name[:12]} is not in the store {self._root}.") from None
+            raise AbsentError(f"Object {name[:12]} is not in the store {self._root}.") from None
         except OSError as error:
             raise MissingError(f"Object {name[:12]} in {self._root} cannot be read: {error.strerror}.") from error
         if bytes_digest(content) != name:
@@ -158,6 +159,8 @@ class Store:
 
     def quarantine(self, path: str | Path) -> bool:
         """Move a damaged file out of the way, for whoever wants to know why; return False where nothing may be moved."""
+        if layout.is_linked(self._root, path):
+            return False
         kind = "root-" if Path(path).parent.name == "roots" else ""
         target = self.root / "quarantine" / f"{kind}{Path(path).name}.{time.time_ns()}"
         try:
@@ -175,12 +178,15 @@ class Store:
 
     def aside(self, name: str) -> str:
         """Return where a collection keeps an object between its first look at what is needed and its second."""
-        return f"{self._root}/tmp/{ASIDE}{name}"
+        return f"{self._root}/tmp/{layout.ASIDE}{name}"
 
     def _put_back(self, name: str) -> bool:
         """Return whether an object was aside, of a collection that runs or was killed; it is back in its place then."""
+        path = self.object_path(name)
+        if layout.is_linked(self._root, path):
+            return False
         try:
-            os.rename(self.aside(name), self.object_path(name))  # noqa: PTH104
+            os.rename(self.aside(name), path)  # noqa: PTH104
         except OSError:
             return False
         return True
@@ -199,7 +205,14 @@ class Store:
         return found
 
     def write_file(self, path: Path | str, content: bytes, *, mode: int = 0o666, exclusive: bool = False) -> bool:
-        """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race."""
+        """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race.
+
+        Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
+        """
+        if layout.is_linked(self._root, path):
+            raise StorageError(
+                f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."
+            )
         with readable_errors(self.root):
             draft = f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
             return write_whole(str(path), content, draft, mode=mode, exclusive=exclusive)
@@ -208,12 +221,22 @@ class Store:
 
     def record(self, key: str) -> dict[str, Any] | None:
         """Return the record of ``key``, or None; a damaged one is quarantined and counts as none."""
+        try:
+            return self.read_record(key)
+        except MissingError:
+            return None
+
+    def read_record(self, key: str) -> dict[str, Any]:
+        """Return the record of ``key``.
+
+        Raises `AbsentError` where there is none, and `MissingError` where it is damaged: it is then in ``quarantine/``.
+        """
         path = self.record_path(key)
         try:
             with readable_errors(self.root):
                 content = _read(path)
         except FileNotFoundError:
-            return None
+            raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
         try:
             record: dict[str, Any] = json.loads(content)
             if _sound(record, key):
@@ -221,7 +244,7 @@ class Store:
         except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
             pass
         self.quarantine(path)
-        return None
+        raise MissingError(f"Record {key[:12]} in {self._root} was damaged.")
 
     def commit(
         self,
@@ -254,7 +277,7 @@ class Store:
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield every key and its record."""
-        for path in self.listed("records", "*", "*.json"):
+        for path in layout.entries(self.root, "records"):
             record = self.record(path.stem)
             if record is not None:
                 yield path.stem, record
@@ -275,11 +298,14 @@ def _read(path: str) -> bytes:
 
 
 def locate(start: Path | None = None) -> Store:
-    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` beside the project that ``start`` lies in."""
+    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` beside the project that ``start`` lies in.
+
+    Raises `UsageError` where something else lies there, as `layout.check` does.
+    """
     named = os.environ.get("TACPIPE_STORE")
-    if named:
-        return Store(places.local(named).absolute())
-    return Store(project(start) / BESIDE_NAME)
+    store = Store(places.local(named).absolute() if named else project(start) / BESIDE_NAME)
+    store.check()
+    return store
 
 
 def project(start: Path | None = None) -> Path:
@@ -287,6 +313,6 @@ def project(start: Path | None = None) -> Path:
     here = (start or Path.cwd()).absolute()
     for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
         for folder in (here, *here.parents):
-            if (folder / mark).exists():
+            if os.path.lexists(folder / mark):  # a link to a disk that is not mounted counts
                 return folder
     return here

@@ -6,27 +6,35 @@ import contextlib
 import os
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution, terminal
+from tacpipe import execution, layout, terminal
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError
-from tacpipe.files import walk, write_whole
+from tacpipe.excerpt import plain
+from tacpipe.files import readable_errors, walk, write_whole
 from tacpipe.hashing import bytes_digest, file_digest
 from tacpipe.roots import PUSHED
-from tacpipe.store import MissingError, Store, locate
+from tacpipe.store import AbsentError, MissingError, Store, locate
+
+_SHOWN = 10  # foreign files listed before the rest is counted
+_COUNTED = ("objects", "records", "quarantine", "tmp", "checkpoints")  # folders that the status measures
 
 
 @dataclass
 class Soundness:
     """What was looked at, what was wrong, and what could be done about it."""
 
+    there: bool = True  # False where there is no store yet
     objects: int = 0
     records: int = 0
+    foreign: list[str] = field(
+        default_factory=list
+    )  # paths in the store that are not of its form; they stay as they are
     damaged: list[str] = field(default_factory=list)  # digests and keys, now in quarantine
     missing: list[str] = field(default_factory=list)  # objects that a root's manifest names
     repaired: list[str] = field(default_factory=list)
@@ -39,7 +47,12 @@ class Soundness:
 
     def to_text(self) -> str:
         """Return the findings in words."""
+        if not self.there:
+            return "there is no store yet, so there is nothing to read"
         lines = [f"{self.objects} objects and {self.records} records read"]
+        lines += [f"not part of a store, left as it is: {plain(path, 200)}" for path in self.foreign[:_SHOWN]]
+        if len(self.foreign) > _SHOWN:
+            lines.append(f"not part of a store, left as they are: {len(self.foreign) - _SHOWN} more")
         lines += [f"damaged, now in quarantine: {name}" for name in self.damaged]
         lines += [f"missing: {name}" for name in self.missing]
         lines += [f"made again: {name}" for name in self.repaired]
@@ -52,27 +65,40 @@ class Soundness:
 
 
 def verify(store: Store) -> Soundness:
-    """Return the soundness of every object and record; damaged ones are moved to quarantine."""
-    found = Soundness()
-    for path in store.listed("objects", "*", "*"):
-        found.objects += 1
-        try:
-            store.read(path.name)
-        except MissingError:
-            found.damaged.append(path.name)
-    for path in store.listed("records", "*", "*.json"):
-        found.records += 1
-        if store.record(path.stem) is None:
-            found.damaged.append(path.stem)
-    for path in store.listed("roots", "*.json"):
-        if store.roots.at(path) is None:
-            found.damaged.append(f"root {path.stem}")
-    found.missing = sorted(set(_wanted(store)) - set(found.damaged))
+    """Return the soundness of every object and record; damaged ones are moved to quarantine.
+
+    What vanishes between listing and reading was removed by a collection, and is not counted. Raises `UsageError` for a
+    folder that is not a store.
+    """
+    if not store.check():
+        return Soundness(there=False)
+    found = Soundness(foreign=layout.foreign(store.root))
+    for path in layout.entries(store.root, "objects"):
+        found.objects += _read(store.read, path.name, found.damaged)
+    for path in layout.entries(store.root, "records"):
+        found.records += _read(store.read_record, path.stem, found.damaged)
+    store.roots.all()
+    found.damaged += [f"root {name}" for name in store.roots.damaged()]
+    missing = set(_wanted(store)) - set(found.damaged)
+    found.missing = sorted(missing & set(_wanted(store))) if missing else []  # a root may have changed meanwhile
     return found
+
+
+def _read(read: Callable[[str], object], name: str, damaged: list[str]) -> bool:
+    """Return whether something was there to read; add its name to ``damaged`` where that failed."""
+    try:
+        read(name)
+    except AbsentError:
+        return False
+    except MissingError:
+        damaged.append(name)
+    return True
 
 
 def repair(store: Store) -> Soundness:
     """Return the soundness after making again, or adopting from dataset directories, what roots name and is not there."""
+    if not store.check():
+        return Soundness(there=False)
     with store.at_work():
         found = verify(store)
         found.repaired += _roots_again(store)
@@ -153,28 +179,37 @@ def link(path: Path) -> int:
 
 def status(store: Store) -> dict[str, Any]:
     """Return where the store is, counts and bytes of what lies in it, its roots and who is at work."""
-    folders = {}
-    for name in ("objects", "records", "quarantine", "tmp", "checkpoints"):
-        sizes = list(_sizes(store.root / name))
-        folders[name] = {"files": len(sizes), "bytes": sum(sizes)}
-    roots = [{**root, "reachable": root["kind"] == PUSHED or Path(root["path"]).exists()} for root in store.roots.all()]
-    return {"store": str(store.root), **folders, "roots": roots, "running": [run.note for run in store.leases.runs()]}
+    there = store.check()
+    folders = {name: _measured(store, name) for name in _COUNTED}
+    roots = [{**root, "reachable": _reachable(root)} for root in store.roots.all()]
+    running = [run.note for run in store.leases.runs()]
+    return {"store": str(store.root), "there": there, **folders, "roots": roots, "running": running}
 
 
-def _sizes(folder: Path) -> Iterator[int]:
-    """Yield the size in bytes of each file below a folder."""
-    for place, _, names in walk(folder, links=False):
-        for name in names:
-            with contextlib.suppress(FileNotFoundError):  # a draft that became an object meanwhile
-                yield os.lstat(f"{place}/{name}").st_size
+def _measured(store: Store, name: str) -> dict[str, int]:
+    """Return how many files lie beneath a folder of the store, and their bytes; what vanishes meanwhile is not counted."""
+    sizes = []
+
+    with readable_errors(store.root):
+        for place, _, files in walk(store.root / name, links=False):
+            for file in files:
+                with contextlib.suppress(FileNotFoundError):
+                    sizes.append(os.lstat(f"{place}/{file}").st_size)
+    return {"files": len(sizes), "bytes": sum(sizes)}
+
+
+def _reachable(root: dict[str, Any]) -> bool:
+    try:
+        return root["kind"] == PUSHED or Path(root["path"]).exists()
+    except OSError:  # as behind a folder that may not be entered
+        return False
 
 
 def status_text(value: dict[str, Any]) -> str:
     """Return the status in words."""
-    lines = [value["store"]]
+    lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
     lines += [
-        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB"
-        for name in ("objects", "records", "quarantine", "tmp", "checkpoints")
+        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _COUNTED
     ]
     lines += [
         f"  root  {root['manifest'][:12]}  {root['path']}" + ("" if root["reachable"] else "  (cannot be reached)")

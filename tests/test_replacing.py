@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import tacpipe
+from tacpipe.hashing import bytes_digest
 from tests.conftest import Lab
 from tests.test_garbage import age
 from tests.test_pipeline import counts
@@ -229,6 +230,73 @@ def test_labels_come_back_with_their_recordings_when_the_directory_was_deleted(l
     assert list(lab.manifest("data/s").recordings) == ["b"]
 
 
+def test_labels_come_back_with_recordings_that_are_ingested_again_one_folder_after_the_other(lab: Lab) -> None:
+    source("monday", a="1 2")
+    source("tuesday", b="3 4", c="5 6")
+    for folder in ("monday", "tuesday"):
+        lab.run(f"ingest numbers {folder} -o data/r")
+    lab.run("label data/r b --exclude dropped")
+    lab.run("label data/r a --set material=cork")
+    before = Path("data/r/manifest.json").read_bytes()
+    shutil.rmtree("data/r")
+    for folder in ("monday", "tuesday"):
+        age(lab)
+        lab.run("store gc --grace-days 0")
+        lab.run(f"ingest numbers {folder} -o data/r")
+        assert lab.call(f"ingest numbers {folder} -o data/r --check").code == 0
+    assert Path("data/r/manifest.json").read_bytes() == before
+    lab.run("scale data/r -o data/s")
+    assert list(lab.manifest("data/s").recordings) == ["a", "c"]
+
+
+def test_labels_come_back_when_another_stage_s_dataset_was_in_their_place(lab: Lab) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --exclude dropped")
+    before = Path("data/r/manifest.json").read_bytes()
+    lab.run("simulate toy -o data/r --replace")
+    lab.run("ingest numbers src -o data/r --replace")
+    assert Path("data/r/manifest.json").read_bytes() == before
+
+
+def test_the_labels_that_come_back_are_those_that_a_recording_had_last(lab: Lab) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/r")
+    lab.run("label data/r a --exclude dropped --set material=cork")
+    shutil.rmtree("data/r")
+    source("src", a="7")
+    lab.run("ingest numbers src -o data/r")  # another recording of this name
+    source("src", a="1 2")
+    for options in ("--replace", ""):
+        lab.run(f"ingest numbers src -o data/r {options}")
+        assert lab.manifest("data/r").labels == {"a": {"excluded": "dropped", "material": "cork"}}
+    lab.run("label data/r a --include --set material=foam")
+    shutil.rmtree("data/r")
+    lab.run("ingest numbers src -o data/r")
+    assert lab.manifest("data/r").recordings["a"]["attributes"] == {"material": "foam"}
+
+
+@pytest.mark.parametrize("name", ["rec", "digest"])
+def test_an_acquired_dataset_comes_back_with_its_labels_long_after_its_directory_was_deleted(
+    lab: Lab, name: str
+) -> None:
+    from tests.recording.test_recovering import spooled
+
+    spooled(lab)
+    lab.run("acquire --recover")
+    lab.run("label rec one --exclude dropped")
+    before = content("rec")
+    named = name if name == "rec" else bytes_digest(before["rec/manifest.json"])[:12]
+    shutil.rmtree("rec")
+    for _ in range(3):
+        age(lab, 300)
+        lab.run("store gc --grace-days 0")
+    (known,) = [one for one in listed(lab) if one["state"] == "directory gone"]
+    assert (known["stage"], known["recordings"], known["labelled"]) == ("acquire", 1, 1)
+    lab.run(f"store checkout {named} -o rec")
+    assert content("rec") == before
+
+
 def test_labels_do_not_come_back_on_other_recordings_of_the_same_name(lab: Lab) -> None:
     source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
@@ -238,6 +306,25 @@ def test_labels_do_not_come_back_on_other_recordings_of_the_same_name(lab: Lab) 
     source("src", a="7")
     lab.run("ingest numbers src -o data/r")
     assert lab.manifest("data/r").labels == {"b": {"material": "cork"}}
+
+
+def test_acquired_recordings_of_one_name_and_rig_are_not_the_same(lab: Lab) -> None:
+    from tests.recording.test_recovering import spooled
+
+    spooled(lab, count=100)
+    lab.run("acquire --recover")
+    lab.run("label rec one --set material=cork")
+    old = bytes_digest(Path("rec/manifest.json").read_bytes())
+    shutil.rmtree("rec")
+    spooled(lab, count=50)
+    lab.run("acquire --recover")
+    assert lab.manifest("rec").labels == {}
+    root = lab.store.roots.get(lab.folder / "rec")
+    assert root is not None and (root["history"][0]["manifest"], root["history"][0]["lasting"]) == (old, True)
+    ran = lab.call(f"store checkout {old} -o rec")
+    assert ran.code == 2 and "1 recordings that the new dataset does not have (one)" in ran.err
+    lab.run(f"store checkout {old} -o back")
+    assert tacpipe.open("back").table("force").num_rows == 100
 
 
 # ---- what was replaced

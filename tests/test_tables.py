@@ -1,3 +1,4 @@
+import ast
 import io
 import itertools
 import weakref
@@ -13,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import DamagedError
-from tacpipe.tables import from_parquet, to_parquet, with_metadata
+from tacpipe.tables import from_parquet, owned, to_parquet, with_metadata
 from tests.any_table import bits, tables
 
 drawn = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
@@ -45,6 +46,22 @@ def test_arrow_holds_no_memory_of_python_s(monkeypatch: pytest.MonkeyPatch) -> N
     assert files and held() is None
 
 
+def test_whatever_is_read_as_parquet_lies_in_memory_of_arrow_s_own() -> None:
+    """Every reader of bytes in the program gets them from `owned`, which the test above is about."""
+    readers = {"BufferReader", "input_stream", "BytesIO"}
+    found = 0
+    for file in sorted((Path(__file__).parents[1] / "tacpipe").rglob("*.py")):
+        text = file.read_text()
+        if "pyarrow" not in text:
+            continue
+        for call in ast.walk(ast.parse(text)):
+            name = getattr(getattr(call, "func", None), "attr", "")
+            if isinstance(call, ast.Call) and name in readers:
+                assert ast.unparse(call.args[0]).startswith("owned("), f"{file}:{call.lineno}"
+                found += 1
+    assert found == 3
+
+
 @given(tables(), st.data())
 @drawn
 def test_columns_that_are_asked_for_come_alone(table: pa.Table, data: st.DataObject) -> None:
@@ -63,7 +80,7 @@ def test_the_same_values_give_the_same_bytes_however_they_lie_in_memory(table: p
     content = to_parquet(table)
     assert to_parquet(pa.concat_tables(pieces)) == content
     assert to_parquet(within) == content
-    assert to_parquet(pq.read_table(pa.BufferReader(content)).cast(table.schema)) == content
+    assert to_parquet(pq.read_table(pa.BufferReader(owned(content))).cast(table.schema)) == content
 
 
 def test_what_lies_under_a_null_does_not_count() -> None:

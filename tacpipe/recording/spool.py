@@ -39,19 +39,19 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe import regular
+from tacpipe import layout, regular
 from tacpipe.errors import TacpipeError
 from tacpipe.files import listed, readable_errors, sync_folder, write_whole
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED, RECOVERED
 from tacpipe.sensors.framing import Chunks
 
-FOLDER = "spool"  # within the store
+FOLDER = layout.SPOOL  # within the store
 MARK = b"tacB"
 HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
 CHUNKS, NOTE = 0, 1  # kinds of blocks
 WHOLE = 255  # in the place of a stream's number: a note on the recording, which has the stream ""
 ENDED = "ended"  # such a note
-KEPT = "kept-spools"  # within the store: where spools lie that are sealed and kept
+KEPT = layout.KEPT  # within the store
 TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival
 YOUNG_S = 60.0  # for which a spool without a header may be one that is being begun
 RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # after a full disk

@@ -18,6 +18,7 @@ import tacpipe
 from tacpipe.errors import DAMAGED, TacpipeError, UsageError
 from tacpipe.hashing import bytes_digest
 from tacpipe.manifest import NAME, Manifest, parse
+from tacpipe.tables import owned
 from tests.any_table import bits
 from tests.conftest import Lab, Ran
 
@@ -130,7 +131,7 @@ def held(path: Path) -> Contents:
 
 def told(content: bytes, path: str) -> Any:
     """Return what a file of a dataset says, read by other means."""
-    return bits(pq.read_table(pa.BufferReader(content))) if path.endswith(".parquet") else content
+    return bits(pq.read_table(pa.BufferReader(owned(content)))) if path.endswith(".parquet") else content
 
 
 def copy(made: Path, lab: Lab) -> Specimen:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.errors import DAMAGED, FAILED
+from tacpipe.errors import DAMAGED, FAILED, USAGE
 from tests.conftest import Lab
 from tests.promises import damages, specimen
 from tests.promises.counts import count
@@ -78,12 +78,15 @@ def test_a_store_whose_mark_is_another_is_left_alone(one: Specimen, content: byt
     (one.store / "format").write_bytes(content)
     for command in ("scale data/recordings -o data/other --factor 9", "store repair"):
         failed = one.lab.call(command)
-        assert failed.code == FAILED and "reads format 1" in failed.err, failed
+        assert failed.code == USAGE and "reads format 1" in failed.err, failed
     after = specimen.files(one.store)
     assert {path: text for path, text in after.items() if path != "format"} == {
         path: text for path, text in before.items() if path != "format"
     }
     (one.store / "format").unlink()  # as when a copier left it out
+    failed = one.lab.call("store verify")
+    assert failed.code == USAGE and f"`echo 1 > {one.store / 'format'}`" in failed.err
+    (one.store / "format").write_text("1\n")
     healed(one)
 
 

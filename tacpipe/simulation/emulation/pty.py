@@ -15,6 +15,7 @@ import tty
 from collections.abc import Sequence
 from pathlib import Path
 
+from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults, uart
@@ -59,12 +60,15 @@ class Pty:
         """Make a new terminal and have the link point to it."""
         if self._master >= 0:
             return
+        draft = self.link.with_name(f".{self.link.name}")
+        for path in (self.link, draft):
+            if not path.is_symlink() and path.exists():  # an emulator makes links alone
+                raise UsageError(f"{path} is there already and no emulator made it. Give -o another folder.")
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         name = os.ttyname(slave)
         os.close(slave)  # from now on the master tells whether anybody has it open
-        draft = self.link.with_name(f".{self.link.name}")
         draft.unlink(missing_ok=True)
         draft.symlink_to(name)
         draft.replace(self.link)
@@ -74,7 +78,8 @@ class Pty:
         """Close the terminal, which the host sees as an unplugged port."""
         if self._master >= 0:
             os.close(self._master)
-            self.link.unlink(missing_ok=True)
+            if self.link.is_symlink():
+                self.link.unlink(missing_ok=True)
         self._master, self.peers = -1, []
 
     def close(self) -> None:

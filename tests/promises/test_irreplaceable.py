@@ -1,0 +1,197 @@
+"""What marks a recording as one that cannot be made again outlasts any one file of the store."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tacpipe.hashing import bytes_digest
+from tacpipe.manifest import Manifest, parse
+from tests.conftest import Lab
+from tests.promises import damages, specimen
+from tests.promises.counts import count
+from tests.recording.test_recovering import spooled
+from tests.test_replacing import source
+
+COLLECT = "store gc --grace-days 0"
+QUICK = ("it is gone", "a bit is flipped")
+
+
+def seldom(*values: str) -> list[object]:
+    """Return values of a test's parameter that are tried by `make test-faults` alone."""
+    return [pytest.param(value, marks=pytest.mark.faults) for value in values]
+
+
+@pytest.fixture(scope="module")
+def held() -> list[Manifest]:
+    """The manifests of all recordings of the project, labels included."""
+    return []
+
+
+@pytest.fixture
+def project(lab: Lab, held: list[Manifest], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of a project whose recordings are at their path, deleted, replaced, in no dataset, acquired and deleted."""
+    held.clear()
+    source("monday", a="1 2", b="3 4")
+    lab.run("ingest numbers monday -o data/here")
+    lab.run("label data/here a --set material=foam")
+    held.append(lab.manifest("data/here"))
+    lab.run("scale data/here -o data/scaled --factor 7")
+    source("tuesday", c="5 6", d="7 8")
+    lab.run("ingest numbers tuesday -o data/gone")
+    lab.run("label data/gone c --exclude dropped")
+    held.append(lab.manifest("data/gone"))
+    shutil.rmtree("data/gone")
+    source("wednesday", e="9 1")
+    lab.run("ingest numbers wednesday -o data/over")
+    lab.run("label data/over e --set material=cork")
+    held.append(lab.manifest("data/over"))
+    source("thursday", f="2 2")
+    lab.run("ingest numbers thursday -o data/over --replace")
+    held.append(lab.manifest("data/over"))
+    source("friday", g="3 3", h="none")
+    assert lab.call("ingest numbers friday -o data/bad").code == 1  # one of them is good, and is kept
+    held.append(_read_alone(lab, "g"))
+    spooled(lab)
+    lab.run("acquire --recover")
+    lab.run("label rec one --set material=cork")
+    held.append(lab.manifest("rec"))
+    shutil.rmtree("rec")
+    made = tmp_path_factory.mktemp("made")
+    specimen.clone(lab.folder, made)
+    return made
+
+
+def _read_alone(lab: Lab, name: str) -> Manifest:
+    """Return the manifest of a recording that no dataset holds."""
+    for path in specimen.beneath(lab.store.root / "objects"):
+        if path.read_bytes().startswith(b"{\n"):
+            found = parse(path.read_bytes(), path.name)
+            if list(found.recordings) == [name]:
+                return found
+    raise AssertionError(name)
+
+
+def files(store: Path) -> Iterator[Path]:
+    return (path for path in sorted(specimen.beneath(store)) if path.stat().st_size)
+
+
+def lost(lab: Lab, held: list[Manifest], spoiled: Path) -> list[str]:
+    """Return what of the recordings and their labels is not in the store; what was spoiled itself is not looked for."""
+    objects = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
+    there = [parse(content, name) for name, content in objects.items() if content.startswith(b"{\n") and _is(content)]
+    missing = []
+    for manifest in held:
+        for path, name in manifest.objects():
+            if name != spoiled.name and bytes_digest(objects.get(name, b"")) != name:
+                missing.append(path)
+        known = any(one.labels == manifest.labels and one.recordings == manifest.recordings for one in there)
+        if not known and spoiled.name != bytes_digest(manifest.content):
+            missing.append(f"labels {manifest.labels}")
+    return missing
+
+
+def _is(content: bytes) -> bool:
+    return b'"recordings"' in content and b'"digest"' in content
+
+
+def fresh(made: Path, lab: Lab) -> None:
+    for path in lab.folder.iterdir():
+        shutil.rmtree(path)
+    specimen.clone(made, lab.folder)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("look", ["store verify", *seldom("store repair", "store status")])
+@pytest.mark.parametrize("damage", [*QUICK, *seldom(*sorted({*damages.ALL} - {*QUICK}))])
+def test_no_recording_is_collected_whichever_one_file_of_the_store_is_damaged_or_gone(
+    project: Path, lab: Lab, held: list[Manifest], damage: str, look: str
+) -> None:
+    tried = 0
+    for spoiled in [path.relative_to(project) for path in files(project / ".tacpipe")]:
+        fresh(project, lab)
+        damages.ALL[damage](lab.folder / spoiled)
+        for command in (look, COLLECT, COLLECT, COLLECT):
+            specimen.age(lab.store.root)
+            lab.call(command)
+        assert lost(lab, held, spoiled) == [], spoiled
+        tried += 1
+    assert tried > 30
+    count("corruptions found", tried)
+
+
+@pytest.mark.long
+def test_a_bit_flipped_anywhere_in_a_record_of_a_recording_costs_no_recording(
+    project: Path, lab: Lab, held: list[Manifest]
+) -> None:
+    fresh(project, lab)
+    keys = [key for key, record in lab.store.records() if record["provenance"].get("irreplaceable")]
+    assert len(keys) == 8
+    for number, key in enumerate(sorted(keys) * 3):
+        fresh(project, lab)
+        path = Path(lab.store.record_path(key))
+        damages.flip(path, (number + 0.5) / (3 * len(keys)))
+        for command in ("store verify", COLLECT, COLLECT, COLLECT):
+            specimen.age(lab.store.root)
+            lab.call(command)
+        assert lost(lab, held, path) == []
+
+
+@pytest.mark.parametrize("left", ["records", "roots", "objects"])
+def test_records_roots_or_manifests_alone_keep_every_recording(
+    project: Path, lab: Lab, held: list[Manifest], left: str
+) -> None:
+    fresh(project, lab)
+    shutil.rmtree(lab.folder / "data")
+    if left != "records":
+        shutil.rmtree(lab.store.root / "records")
+    if left != "roots":
+        shutil.rmtree(lab.store.root / "roots")
+    if left == "records":
+        for path in specimen.beneath(lab.store.root / "objects"):
+            if path.read_bytes().startswith(b"{\n"):
+                path.unlink()
+    for _ in range(3):
+        specimen.age(lab.store.root)
+        lab.run(COLLECT)
+    missing = lost(lab, held, Path())
+    assert [one for one in missing if left != "records" or not one.startswith("labels")] == []
+    specimen.age(lab.store.root)
+    lab.run(f"{COLLECT} --recordings")  # asked for by name, all of it goes
+    assert list(specimen.beneath(lab.store.root / "objects")) == [] or left == "roots"
+
+
+def test_a_manifest_whose_recordings_are_all_in_a_later_one_is_collected(lab: Lab) -> None:
+    for number in range(4):
+        source(f"day{number}", **{f"r{number}": f"{number} 1"})
+        lab.run(f"ingest numbers day{number} -o data/rec")
+        lab.run(f"label data/rec r{number} --set material=foam")
+    lab.run("label data/rec r0 --set material=cork")  # said anew, by hand
+    before = [path for path in specimen.beneath(lab.store.root / "objects") if path.read_bytes().startswith(b"{\n")]
+    specimen.age(lab.store.root)
+    lab.run("store gc")
+    after = [path for path in specimen.beneath(lab.store.root / "objects") if path.read_bytes().startswith(b"{\n")]
+    assert len(before) > 8 and after == [Path(lab.store.object_path(bytes_digest(lab.manifest("data/rec").content)))]
+    shutil.rmtree(lab.store.root / "roots")
+    shutil.rmtree("data")
+    specimen.age(lab.store.root)
+    lab.run("store gc")
+    assert after[0].exists()
+
+
+def test_quarantine_is_kept_for_the_grace_since_it_was_filled(lab: Lab) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/rec")
+    lab.run("scale data/rec -o data/s")
+    name = lab.manifest("data/s").recordings["a"]["shards"][""]["digest"]
+    damages.flip(Path(lab.store.object_path(name)))
+    specimen.age(lab.store.root)  # the shard was written long ago
+    lab.call("store verify")
+    lab.run("store gc")
+    (kept,) = (lab.store.root / "quarantine").iterdir()
+    lab.run("store gc --grace-days 0")
+    assert not kept.exists()
+    assert list((lab.store.root / "quarantine").iterdir()) == []

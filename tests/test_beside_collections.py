@@ -1,0 +1,153 @@
+"""What looks at a store while a collection removes things from it: what vanished is not damaged."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tacpipe import garbage, layout, upkeep
+from tacpipe.store import Store
+from tests.conftest import Lab
+from tests.test_garbage import age
+
+
+@pytest.fixture
+def littered(lab: Lab) -> Lab:
+    """A project with objects and records that nothing needs."""
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s --factor 2")
+    lab.run("scale data/r -o data/s --factor 5")
+    age(lab)
+    return lab
+
+
+def between(monkeypatch: pytest.MonkeyPatch, folder: str, act: Callable[[], object]) -> list[int]:
+    """Have ``act`` done once, after the next listing of ``folder`` and before its first name is looked at."""
+    honest = layout.entries
+    done: list[int] = []
+
+    def entries(root: Path, name: str) -> Iterator[Path]:
+        found = list(honest(root, name))
+        if name == folder and not done:
+            done.append(len(found))
+            act()
+        return iter(found)
+
+    monkeypatch.setattr(layout, "entries", entries)
+    return done
+
+
+@pytest.mark.parametrize("folder", ["objects", "records"])
+def test_what_a_collection_removed_since_it_was_listed_is_not_damaged(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    collected: list[garbage.Collected] = []
+    store = littered.store
+    done = between(monkeypatch, folder, lambda: collected.append(garbage.collect(Store(store.root), dry_run=False)))
+    found = upkeep.verify(store)
+    gone = collected[0].objects if folder == "objects" else collected[0].records
+    assert gone > 0 and done[0] - gone == (found.objects if folder == "objects" else found.records)
+    assert found.clean and found.damaged == found.missing == []
+
+
+def test_what_a_collection_has_moved_aside_is_sound(littered: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = littered.store
+    path = next(layout.entries(store.root, "objects"))
+    between(monkeypatch, "objects", lambda: path.rename(store.aside(path.name)))
+    assert upkeep.verify(store).clean
+
+
+def test_what_was_damaged_once_and_is_collected_now_is_not_damaged_again(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = littered.store
+    path = next(layout.entries(store.root, "objects"))
+    shutil.copy(path, store.root / "quarantine" / f"{path.name}.1")
+    between(monkeypatch, "objects", path.unlink)
+    assert path.name not in upkeep.verify(store).damaged
+
+
+def test_what_is_there_and_does_not_hash_to_its_name_is_damaged_beside_a_collection_too(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = littered.store
+    path = Path(store.object_path(littered.manifest("data/s").recordings["trial-000"]["shards"][""]["digest"]))
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    age(littered)
+    between(monkeypatch, "objects", lambda: garbage.collect(Store(store.root), dry_run=False))
+    assert upkeep.verify(store).damaged == [path.name]
+
+
+def test_a_root_that_was_forgotten_since_it_was_listed_is_not_damaged(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = littered.store
+    honest = store.roots.at
+
+    def at(file: Path) -> Any:
+        file.unlink(missing_ok=True)
+        return honest(file)
+
+    monkeypatch.setattr(store.roots, "at", at)
+    assert upkeep.verify(store).clean
+
+
+def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_missing(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest = upkeep._wanted
+    looks: list[dict[str, str]] = []
+
+    def wanted(store: Store) -> dict[str, str]:
+        looks.append(honest(store))
+        return {**looks[-1], **({"ab" * 32: "manifest.json"} if len(looks) == 1 else {})}
+
+    monkeypatch.setattr(upkeep, "_wanted", wanted)
+    assert upkeep.verify(littered.store).clean and len(looks) == 2
+
+
+def test_a_status_beside_a_collection_counts_what_it_still_finds(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, honest = littered.store, os.walk
+    draft = store.root / "tmp" / f".{'ab' * 16}"
+    draft.write_bytes(b"touch")
+    gone: list[Path] = []
+
+    def walk(folder: Path, **given: Any) -> Iterator[Any]:
+        for place, folders, files in honest(folder, **given):
+            if place.endswith("objects"):  # a shelf goes after it was listed
+                gone.append(Path(place) / folders[0])
+                shutil.rmtree(gone[-1])
+            for file in files if place.endswith("tmp") else ():
+                gone.append(Path(place) / file)
+                gone[-1].unlink()
+            yield place, folders, files
+
+    before = upkeep.status(store)
+    monkeypatch.setattr(os, "walk", walk)
+    found = upkeep.status(store)
+    assert draft in gone and len(gone) == 2
+    assert found["tmp"]["files"] == 0 < found["objects"]["files"] < before["objects"]["files"]
+
+
+def test_a_dry_run_beside_a_collection_counts_what_it_still_finds(
+    littered: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = littered.store
+    honest = garbage._young
+    done: list[garbage.Collected] = []
+
+    def young(path: Path) -> bool:
+        if not done and "/objects/" in str(path):
+            monkeypatch.setattr(garbage, "_young", honest)
+            done.append(garbage.collect(Store(store.root), dry_run=False))
+            return False
+        return honest(path)
+
+    monkeypatch.setattr(garbage, "_young", young)
+    assert garbage.collect(store, dry_run=True).objects == 0 < done[0].objects
