@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution, replacing
+from tacpipe import execution, regular, replacing
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.hashing import bytes_digest
@@ -68,8 +68,8 @@ def _state(root: dict[str, Any], name: str) -> str:
     if path.is_file():
         return SHOWN
     try:
-        there = bytes_digest((path / manifest_of.NAME).read_bytes())
-    except OSError:
+        there = bytes_digest(regular.content(path / manifest_of.NAME, regular.JSON_BYTES))
+    except (OSError, regular.IrregularError):
         return GONE
     return SHOWN if there == name else REPLACED
 
@@ -106,7 +106,7 @@ def checkout(name: str, output: Path, *, replace: bool = False) -> Manifest:
         directory_of.check_output(store, output)
         if not replace:
             replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
-        read = execution.reader(store, (str(output.absolute()),))
+        read = execution.reader(store, (str(output.absolute()),), dict(manifest.sizes()))
         for first in (True, False):
             try:
                 directory_of.publish(store, manifest, output)

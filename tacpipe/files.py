@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from tacpipe import regular
 from tacpipe.errors import StorageError
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
 
 
-def write_whole(path: str, content: bytes, draft: str, *, mode: int = 0o666, exclusive: bool = False) -> bool:
-    """Write ``content`` to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost the race.
+def write_whole(
+    path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
+) -> bool:
+    """Write ``content``, whole or in blocks, to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost.
 
     Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made. ``mode`` is less
     what the umask takes.
@@ -71,11 +73,11 @@ def listed(folder: Path, pattern: str = "*") -> list[Path]:
     return [folder / name for name in sorted(names) if fnmatchcase(name, pattern)]
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """Return the mapping that a file holds; None if it is not there or holds none."""
+def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | None:
+    """Return the mapping that a file of a store holds; None if it is not there, holds none, or more than ``most`` bytes."""
     try:
-        value = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError, RecursionError):
+        value = regular.json_value(path, most)
+    except (FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
         return None
     return value if isinstance(value, dict) else None
 
@@ -117,14 +119,15 @@ def told(error: OSError) -> str:
     )
 
 
-def _write_synced(path: str, content: bytes, mode: int) -> None:
+def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int) -> None:
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     except FileNotFoundError:
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
-        write_all(handle, content)
+        for block in [content] if isinstance(content, bytes) else content:
+            write_all(handle, block)
         os.fsync(handle)
     finally:
         os.close(handle)

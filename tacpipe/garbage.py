@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import manifest as manifest_of
-from tacpipe import replacing
+from tacpipe import regular, replacing
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
 from tacpipe.files import readable_errors
@@ -209,8 +209,8 @@ def _doubtful(store: Store) -> set[str]:
     for path in store.listed("quarantine", "*.json.*"):
         if path.name.startswith("root-") or store.record(path.name.partition(".")[0]) is not None:
             continue
-        with contextlib.suppress(FileNotFoundError):
-            found.update(DIGEST.findall(path.read_bytes().decode("latin-1")))
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError):
+            found.update(DIGEST.findall(regular.content(path, regular.JSON_BYTES, follow=False).decode("latin-1")))
     return found
 
 
@@ -225,11 +225,11 @@ def _content(path: Path) -> tuple[bytes | None, bool]:
     A path of which the system tells no more than that it failed counts as there: an error is no absence.
     """
     try:
-        return (path / manifest_of.NAME).read_bytes(), True
+        return regular.content(path / manifest_of.NAME, regular.JSON_BYTES), True
     except (FileNotFoundError, NotADirectoryError):
         with contextlib.suppress(OSError):
             return None, path.is_file()  # a report: its manifest lies in the store alone
-    except OSError:
+    except (OSError, regular.IrregularError):
         pass
     return None, True
 

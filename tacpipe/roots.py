@@ -19,6 +19,7 @@ BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
 # {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach
 Root = dict[str, Any]
+ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
 HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
 
 
@@ -76,9 +77,9 @@ class Roots:
     def at(self, file: Path) -> Root | None:
         """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
         with readable_errors(self.store.root):
-            if not file.exists():
+            if not os.path.lexists(file):
                 return None
-            root = read_json(file) or {}
+            root = read_json(file, ROOT_BYTES) or {}
         check = root.pop("check", None)
         if check is None and "kind" not in root and {"path", "manifest"} <= set(root):  # as they were once written
             return {**root, "kind": ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED}
