@@ -22,7 +22,6 @@ from tacpipe.leases import Announcing, Leases
 from tacpipe.roots import BESIDE_NAME, Roots
 
 FORMAT = "1"
-MARK_BYTES = 1 << 12  # the largest file ``format`` that is read
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
 ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
 
@@ -76,7 +75,7 @@ class Store:
                     (self.root / name).mkdir(parents=True, exist_ok=True)
                 self.write_file(mark, FORMAT.encode() + b"\n")
                 sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
-            found = regular.content(mark, MARK_BYTES, follow=False).strip().decode(errors="replace")
+            found = mark.read_bytes().strip().decode(errors="replace")
         if found != FORMAT:
             raise TacpipeError(f"The store {self._root} has format {found[:20]}; this tacpipe reads format {FORMAT}.")
 
