@@ -73,7 +73,9 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
-        if lasting:
+        if root["kind"] == PUSHED:  # each push is a snapshot, kept until it is forgotten
+            wanted += [one["manifest"] for one in root.get("history", [])]
+        elif lasting:
             replaced += [one["manifest"] for one in root.get("history", []) if one["lasting"]]
             replaced += [root["manifest"]] if here is None and expired and _lasting(store, root["manifest"]) else []
     damaged = store.roots.damaged()

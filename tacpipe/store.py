@@ -141,6 +141,16 @@ class Store:
             self.sync(path)
         return Object(name, len(content))
 
+    def take(self, name: str, blocks: Iterable[bytes]) -> None:
+        """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
+
+        What was there is replaced.
+        """
+        self.announce([name])
+        path = self.object_path(name)
+        self.write_file(path, blocks, mode=0o444)
+        self.sync(path)
+
     def read(self, name: str, size: int | None = None) -> bytes:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
 
@@ -232,7 +242,9 @@ class Store:
                 found = [path for folder in found for path in listed(folder, pattern)]
         return found
 
-    def write_file(self, path: Path | str, content: bytes, *, mode: int = 0o666, exclusive: bool = False) -> bool:
+    def write_file(
+        self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
+    ) -> bool:
         """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race."""
         with readable_errors(self.root):
             draft = f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
@@ -319,8 +331,13 @@ def locate(start: Path | None = None) -> Store:
 def project(start: Path | None = None) -> Path:
     """Return the folder of the project: the nearest one upwards with a store, a ``dvc.yaml`` or a git repository."""
     here = (start or Path.cwd()).absolute()
+    return marked(here) or here
+
+
+def marked(here: Path) -> Path | None:
+    """Return the nearest folder upwards that has the mark of a project, None where none has."""
     for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
         for folder in (here, *here.parents):
             if (folder / mark).exists():
                 return folder
-    return here
+    return None
