@@ -333,6 +333,16 @@ def test_what_was_pushed_before_projects_is_pulled_and_succeeded_by_whoever_has_
     ]
 
 
+def test_one_push_of_a_name_waits_for_another(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    remote = Store(two.folder / "remote")
+    (root,) = remote.roots.all()
+    monkeypatch.setenv("TACPIPE_LOCK_TIMEOUT_S", "0.05")
+    with remote.leases.hold(values_digest(["pushed", root["project"]["id"], "data/r"]), "by another computer"):
+        assert two.call("store push ../remote data/r").code == 6
+
+
 def test_a_damaged_identity_is_not_replaced_by_another(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     enter(two, "one", monkeypatch)
     two.run("store push ../remote data/r")
