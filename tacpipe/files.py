@@ -13,6 +13,7 @@ from typing import Any
 from tacpipe import regular
 from tacpipe.errors import StorageError
 
+_READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
 
 
@@ -93,6 +94,11 @@ def readable_errors(root: Path) -> Iterator[None]:
         raise sentence(root, error) from error
 
 
+def may_not_write(error: StorageError) -> bool:
+    """Return whether a store failed because nothing may be written there, and not because its disk is full or broken."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _READ_ONLY
+
+
 def sentence(root: Path | str, error: OSError) -> StorageError:
     """Return in words what the file system said of something under the store ``root``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -100,7 +106,7 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
             f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
             f"shows what the store could give back) and run the same command again."
         )
-    if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+    if error.errno in _READ_ONLY:
         return StorageError(
             f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
             f"TACPIPE_STORE."

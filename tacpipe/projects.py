@@ -9,13 +9,13 @@ import uuid
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from tacpipe import regular
 from tacpipe.errors import DamagedError, StorageError
-from tacpipe.files import read_json, readable_errors
+from tacpipe.files import may_not_write, readable_errors
 from tacpipe.hashing import digest
 from tacpipe.store import Store, marked
 
 FOLDER = "projects"  # within the store
-ID_DIGITS = 32
 _FILE_BYTES = 1 << 16  # the largest identity that is read
 _NAME_LETTERS = 60
 
@@ -47,12 +47,15 @@ def known(store: Store, folder: Path) -> Project | None:
     Raises `DamagedError` for one that is damaged: under a new one it would be another project.
     """
     file = _file(store, folder)
-    with readable_errors(store.root):
-        if not os.path.lexists(file):
-            return None
-        value = read_json(file, _FILE_BYTES) or {}
-    check = value.pop("check", None)
-    if check != digest(value) or not {"id", "name"} <= set(value):
+    try:
+        with readable_errors(store.root):
+            value = regular.json_value(file, _FILE_BYTES)
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError, regular.IrregularError):
+        value = None
+    sound = isinstance(value, dict) and value.pop("check", None) == digest(value)
+    if not (sound and all(isinstance(value.get(key), str) for key in ("id", "name"))):
         raise DamagedError(
             f"{file}, the identity of the project {folder}, is damaged. Restore it, or remove it and name with "
             f"`tacpipe store push --project NAME` the project that this one is in the other store."
@@ -60,23 +63,30 @@ def known(store: Store, folder: Path) -> Project | None:
     return Project(value["id"], value["name"])
 
 
-def identify(store: Store, folder: Path) -> Project:
+def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
     """Return the identity of the project in ``folder``, made now if it has none.
 
-    In a store that cannot be written it is derived from the computer and the paths.
+    In a store that is not ``writable`` it is derived from the computer and the paths.
     """
     found = known(store, folder)
     if found is not None:
         return found
     try:
         store.prepare()
-        _write(store, folder, Project(uuid.uuid4().hex, _name(folder)), exclusive=True)
-    except StorageError:
-        derived = digest([platform.node(), str(store.root.absolute()), str(folder)])[:ID_DIGITS]
+        _write(store, folder, Project(new_id(), _name(folder)), exclusive=True)
+    except StorageError as error:
+        if writable or not may_not_write(error):
+            raise
+        derived = digest([platform.node(), str(store.root.absolute()), str(folder)])[:32]
         return Project(derived, _name(folder))
     made = known(store, folder)  # the first to write it wins
     assert made is not None
     return made
+
+
+def new_id() -> str:
+    """Return an id that no other project has."""
+    return uuid.uuid4().hex
 
 
 def join(store: Store, folder: Path, project: Project) -> None:

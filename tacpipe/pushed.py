@@ -50,7 +50,7 @@ def label(root: Root, every: Iterable[Root]) -> str:
     """Return how a root of a store is named among all ``every`` of them: by its path, behind its project if pushed."""
     if root["kind"] != PUSHED:
         return str(root["path"])
-    return labels(one for one in every if one["kind"] == PUSHED)[project_id(root), root["path"]]
+    return labels([*(one for one in every if one["kind"] == PUSHED), root])[project_id(root), root["path"]]
 
 
 def _of_project(wanted: str, every: Iterable[Root]) -> list[Root]:

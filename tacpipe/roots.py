@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.files import read_json, readable_errors
+from tacpipe import regular
+from tacpipe.files import readable_errors
 from tacpipe.hashing import digest
 
 if TYPE_CHECKING:
@@ -93,10 +94,14 @@ class Roots:
 
     def at(self, file: Path) -> Root | None:
         """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
-        with readable_errors(self.store.root):
-            if not os.path.lexists(file):
-                return None
-            root = read_json(file, ROOT_BYTES) or {}
+        try:
+            with readable_errors(self.store.root):
+                value = regular.json_value(file, ROOT_BYTES)
+        except FileNotFoundError:
+            return None
+        except (ValueError, RecursionError, regular.IrregularError):
+            value = None
+        root: Root = value if isinstance(value, dict) else {}
         check = root.pop("check", None)
         if check is None and "kind" not in root and isinstance(root.get("path"), str):  # as they were once written
             root["kind"] = ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED

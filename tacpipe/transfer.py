@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution, garbage, places, progress, projects, pushed, regular, replacing
+from tacpipe import execution, garbage, places, projects, pushed, regular, replacing
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.excerpt import plain
+from tacpipe.files import may_not_write
 from tacpipe.hashing import digest
 from tacpipe.projects import Project
 from tacpipe.roots import Root, project_id
@@ -72,8 +73,8 @@ def push(
         folder, name = projects.place(found.directory)
         if project:
             projects.join(here, folder, pushed.project_in(there, project))
-        owner = projects.identify(here, folder)
         with _announced(here, found.digest) as writable, there.at_work([found.digest]):
+            owner = projects.identify(here, folder, writable=writable)
             if writable:
                 replacing.outgoing(here, found.directory.absolute())
             lock = digest(["pushed", owner.id, name])
@@ -130,18 +131,27 @@ def bring(there: Store, here: Store, found: manifest_of.Found, done: Transferred
 
 @contextlib.contextmanager
 def _announced(store: Store, manifest: str) -> Iterator[bool]:
-    """Hold off `gc` in a store that is read and yield True; False where it cannot be written, which is no need."""
+    """Hold off `gc` in a store that is read and yield True; False where it may not be written, which a push does not need.
+
+    Then a collection at the same time is not held off: what it removes before it was copied ends the push.
+    """
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(store.at_work([manifest]))
             writable = True
-        except StorageError:
-            progress.say(
-                f"{store.root} cannot be written, so the push is not announced there: a `tacpipe store gc` by somebody who "
-                f"can write may remove what is being pushed. The push ends with an error then, and can be repeated."
-            )
+        except StorageError as error:
+            if not may_not_write(error):
+                raise
             writable = False
-        yield writable
+        try:
+            yield writable
+        except DamagedError as error:
+            if writable:
+                raise
+            raise DamagedError(
+                f"{error} The store may not be written, so the push could not be announced there: a `tacpipe store gc` "
+                f"at the same time may have removed this."
+            ) from error
 
 
 def _before(
