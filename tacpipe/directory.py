@@ -180,7 +180,7 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
 def _link(source: str, target: Path) -> bool:
     import fcntl
 
-    with open(source, "rb") as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
+    with regular.opened(source, follow=False) as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
         fcntl.ioctl(writing.fileno(), 0x40049409, reading.fileno())  # FICLONE
         return True
     target.unlink()

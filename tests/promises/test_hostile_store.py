@@ -134,6 +134,21 @@ def test_no_command_waits_for_a_manifest(lab: Lab, command: str, attack: str) ->
     count("hostile inputs refused")
 
 
+@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize(
+    "command", ["show given", "total given -o scaled", "store link given", "store push remote given"]
+)
+def test_no_command_waits_for_a_shard(lab: Lab, command: str, attack: str) -> None:
+    lab.run("simulate toy -o data/q --trials 1 --rows 3")
+    lab.run("scale data/q -o given")
+    (lab.folder / "given/trial-000.parquet").unlink()
+    ATTACKS[attack](lab.folder / "given/trial-000.parquet")
+    with bounded(GIB):
+        ran = lab.call(command)
+    assert ran.code in (DONE, FAILED) and (ran.code == DONE or is_sentence(ran.err)), ran
+    count("hostile inputs refused")
+
+
 SHAPES: tuple[dict[str, Any], ...] = (
     {"path": 5},
     {"path": "a\0b"},
