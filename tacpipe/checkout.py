@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import directory as directory_of
-from tacpipe import execution, replacing, terminal
+from tacpipe import execution, projects, pushed, regular, replacing, terminal, transfer
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.excerpt import plain
 from tacpipe.hashing import bytes_digest
 from tacpipe.manifest import Manifest
 from tacpipe.roots import PUSHED
 from tacpipe.store import MissingError, Store, locate
 
-SHOWN, REPLACED, GONE, IN_STORE = "at its path", "replaced", "directory gone", "pushed here"
+SHOWN, REPLACED, GONE = "at its path", "replaced", "directory gone"
+IN_STORE, EARLIER = "pushed here", "pushed earlier"
 SHORTEST = 6  # hex digits by which a manifest may be named
 _HEX = re.compile(rf"[0-9a-f]{{{SHORTEST},64}}")
 
@@ -34,20 +36,24 @@ class Known:
     labelled: int  # recordings with labels that were set by hand
     path: str
     state: str
+    project: str = ""  # of what was pushed: the name of the project, or digits of its id; then ":" and the path name it
 
 
 def known(store: Store) -> list[Known]:
     """Return the manifests that roots of the store name or named before, newest first."""
     found: dict[tuple[str, str], Known] = {}
-    for root in store.roots.all():
+    roots = store.roots.all()
+    for root in roots:
+        name_of = pushed.label(root, roots)
         for entry in [root, *root.get("history", [])]:
             name, path = entry["manifest"], str(root["path"])
             try:
-                manifest = manifest_of.parse(store.read(name), name, verified=True)
+                manifest = manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
             except TacpipeError:
                 continue  # collected, or damaged
-            state = _state(root, name) if entry is root else REPLACED
-            found[name, path] = Known(
+            earlier = EARLIER if root["kind"] == PUSHED else REPLACED
+            state = _state(root, name) if entry is root else earlier
+            found[name, name_of] = Known(
                 name,
                 manifest.digest,
                 manifest.stage,
@@ -56,8 +62,9 @@ def known(store: Store) -> list[Known]:
                 len(manifest.labels),
                 path,
                 state,
+                name_of.removesuffix(f":{path}") if root["kind"] == PUSHED else "",
             )
-    return sorted(found.values(), key=lambda one: (-one.written_s, one.path, one.manifest))
+    return sorted(found.values(), key=lambda one: (-one.written_s, one.path))  # of a path, as its history has them
 
 
 def _state(root: dict[str, Any], name: str) -> str:
@@ -68,8 +75,8 @@ def _state(root: dict[str, Any], name: str) -> str:
     if path.is_file():
         return SHOWN
     try:
-        there = bytes_digest((path / manifest_of.NAME).read_bytes())
-    except OSError:
+        there = bytes_digest(regular.content(path / manifest_of.NAME, regular.JSON_BYTES))
+    except (OSError, regular.IrregularError):
         return GONE
     return SHOWN if there == name else REPLACED
 
@@ -86,27 +93,37 @@ def to_text(listed: list[Known]) -> str:
         written = time.strftime("%Y-%m-%d %H:%M", time.localtime(one.written_s))
         state = "" if one.state == SHOWN else f"  ({one.state})"
         lines.append(
-            f"{one.manifest[:12]}  {written}  {one.stage:<20}  {one.recordings:>10}  {one.labelled:>8}  {one.path}{state}"
+            f"{one.manifest[:12]}  {written}  {plain(one.stage):<20}  {one.recordings:>10}  {one.labelled:>8}  "
+            f"{plain(_place(one), 200)}{state}"
         )
     return terminal.lines(lines)
 
 
-def checkout(name: str, output: Path, *, replace: bool = False) -> Manifest:
-    """Write the dataset ``name`` to ``output``, with its labels.
+def _place(one: Known) -> str:
+    """Return the path of a manifest, behind its project where it was pushed."""
+    return f"{one.project}:{one.path}" if one.state in (IN_STORE, EARLIER) else one.path
 
-    ``name`` is the digest of its manifest or of the dataset, or how it begins, or the path at which it was last written.
+
+def checkout(name: str, output: Path, *, replace: bool = False, source: Store | None = None) -> Manifest:
+    """Write the dataset ``name`` to ``output``, with its labels; from the store ``source`` if it is given.
+
+    ``name`` is the digest of its manifest or of the dataset, or how it begins, or the path at which it was last written, or
+    the name under which it was pushed. What comes from another store is copied into this one.
 
     Raises `UsageError` if none or several have it, and if ``output`` holds a dataset that would be replaced without
     ``replace``; `DamagedError` if something of it is damaged and cannot be computed again.
     """
     store = locate()
-    wanted = _named(store, name)
+    wanted = _named(source or store, name)
     with store.at_work([wanted]):
-        manifest = manifest_of.parse(store.read(wanted), wanted, verified=True)
+        content = (source or store).read(wanted, regular.JSON_BYTES)
+        manifest = manifest_of.parse(content, wanted, verified=source is None)
         directory_of.check_output(store, output)
         if not replace:
             replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
-        read = execution.reader(store, (str(output.absolute()),))
+        read = execution.reader(store, (str(output.absolute()),), dict(manifest.sizes()))
+        if source is not None:
+            transfer.bring(source, store, manifest_of.Found(output, content), transfer.Transferred())
         for first in (True, False):
             try:
                 directory_of.publish(store, manifest, output)
@@ -125,10 +142,14 @@ def _named(store: Store, name: str) -> str:
     if root is not None:
         return str(root["manifest"])
     if not _HEX.fullmatch(name):
-        raise UsageError(
-            f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which {store.root} "
-            f"has seen a dataset; `tacpipe store list` names both."
-        )
+        folder, _ = projects.place(Path.cwd())
+        try:
+            return str(pushed.find(store, name, name, projects.known(locate(), folder))["manifest"])
+        except UsageError as error:
+            raise UsageError(
+                f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which "
+                f"{store.root} has seen a dataset; `tacpipe store list` names both. {error}"
+            ) from None
     matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
     if len(matching) > 1:
         raise UsageError(f"{len(matching)} manifests of {store.root} begin with {name}; give more of its hex digits.")

@@ -9,7 +9,7 @@ import uuid
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
-from tacpipe import replacing
+from tacpipe import regular, replacing
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.files import listed, sync_folder, sync_folders, walk, write_whole
 from tacpipe.hashing import bytes_digest, digest, file_digest
@@ -195,7 +195,7 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
 def _link(source: str, target: Path) -> bool:
     import fcntl
 
-    with open(source, "rb") as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
+    with regular.opened(source, follow=False) as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
         fcntl.ioctl(writing.fileno(), 0x40049409, reading.fileno())  # FICLONE
         return True
     target.unlink()
@@ -209,7 +209,7 @@ def _matches(path: Path, store: Store, name: str) -> bool:
     """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
     try:
         there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
-        stored = os.stat(store.object_path(name))  # noqa: PTH116
+        stored = os.lstat(store.object_path(name))
     except (FileNotFoundError, NotADirectoryError):
         return False
     same = (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino)
@@ -218,7 +218,7 @@ def _matches(path: Path, store: Store, name: str) -> bool:
 
 def _current(directory: Path, content: bytes) -> bool:
     try:
-        return (directory / NAME).read_bytes() == content
+        return regular.content(directory / NAME, regular.JSON_BYTES) == content
     except (FileNotFoundError, NotADirectoryError):
         return False
 
@@ -226,6 +226,7 @@ def _current(directory: Path, content: bytes) -> bool:
 def _named(directory: Path) -> set[str]:
     """Return the paths that the manifest in ``directory`` names; none if there is no readable one."""
     try:
-        return {path for path, _ in parse((directory / NAME).read_bytes(), str(directory)).objects()}
+        content = regular.content(directory / NAME, regular.JSON_BYTES)
+        return {path for path, _ in parse(content, str(directory)).objects()}
     except (FileNotFoundError, TacpipeError):
         return set()

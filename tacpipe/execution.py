@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from tacpipe import extras, failures, memory, provenance, registry
+from tacpipe import extras, failures, memory, provenance, registry, regular
 from tacpipe import params as params_of
 from tacpipe.dataset import Dataset, Shard
 from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
@@ -161,25 +162,29 @@ def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -
     return sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
 
 
-def reader(store: Store, beside: tuple[str, ...] = ()) -> Callable[[str, str], bytes]:
+def reader(
+    store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] = MappingProxyType({})
+) -> Callable[[str, str], bytes]:
     """Return a function (digest, path within its dataset) -> content that heals what it finds damaged.
 
     It reads from the store; what is missing there is adopted from the directories ``beside``, or made again from its
-    record. Raises `DamagedError` where neither can be done.
+    record. ``sizes`` are those in bytes that a manifest declares, by digest: nothing much larger is read. Raises
+    `DamagedError` where neither can be done.
     """
 
     def read(name: str, path: str) -> bytes:
+        size = sizes.get(name)
         try:
-            return store.read(name)
+            return store.read(name, size)
         except MissingError as error:
-            content = _adopt(store, name, path, beside)
-            return _remake(store, name, path, str(error)) if content is None else content
+            content = _adopt(store, name, path, beside, size)
+            return _remake(store, name, path, str(error), size) if content is None else content
 
     return read
 
 
-def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...]) -> bytes | None:
-    content = beside(name, path, beside_of)
+def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
+    content = beside(name, path, beside_of, size)
     if content is not None:
         with contextlib.suppress(TacpipeError):  # of a store that may only be read the sound copy is as good
             store.prepare()
@@ -187,17 +192,20 @@ def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...]) -> by
     return content
 
 
-def beside(name: str, path: str, directories: tuple[str, ...]) -> bytes | None:
-    """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it."""
+def beside(name: str, path: str, directories: tuple[str, ...], size: int | None = None) -> bytes | None:
+    """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it.
+
+    It may be a link, as DVC and git-annex make them: its digest is what counts. ``size`` is what its manifest declares.
+    """
     for directory in directories:
-        with contextlib.suppress(OSError):
-            content = (Path(directory) / path).read_bytes()
+        with contextlib.suppress(OSError, regular.IrregularError, StorageError):
+            content = regular.content(Path(directory) / path, size)
             if bytes_digest(content) == name:
                 return content
     return None
 
 
-def _remake(store: Store, name: str, path: str, why: str) -> bytes:
+def _remake(store: Store, name: str, path: str, why: str, size: int | None = None) -> bytes:
     other = ""
     for identity, made_by in _makers(store, name):
         acquired = identity["stage"] == ACQUIRE
@@ -212,14 +220,14 @@ def _remake(store: Store, name: str, path: str, why: str) -> bytes:
             continue
         try:
             with store.leases.hold(digest(identity), f"{identity['stage']}, for {path}"):
-                if not store.has(name):  # else another process has made it again
+                if not store.has(name, size):  # else another process has made it again
                     execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
         except TacpipeError as error:
             if error.exit_code != FAILED:
                 raise
             raise DamagedError(f"{why} It cannot be made again here: {error}") from error
-        if store.has(name):
-            return store.read(name)
+        if store.has(name, size):
+            return store.read(name, size)
         unlike = "; ".join(provenance.unlike(made_by, provenance.of(0.0)))
         other = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
     reason = other or f"nothing in the store says how {path} was made"

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from tacpipe import regular
 from tacpipe.errors import StorageError
 
+_READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
 
 
-def write_whole(path: str, content: bytes, draft: str, *, mode: int = 0o666, exclusive: bool = False) -> bool:
-    """Write ``content`` to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost the race.
+def write_whole(
+    path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
+) -> bool:
+    """Write ``content``, whole or in blocks, to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost.
 
     Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made. ``mode`` is less
     what the umask takes.
@@ -119,11 +122,11 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
         return False
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """Return the mapping that a file holds; None if it is not there or holds none."""
+def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | None:
+    """Return the mapping that a file of a store holds; None if it is not there, holds none, or more than ``most`` bytes."""
     try:
-        value = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError, RecursionError):
+        value = regular.json_value(path, most)
+    except (FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
         return None
     return value if isinstance(value, dict) else None
 
@@ -139,6 +142,11 @@ def readable_errors(root: Path) -> Iterator[None]:
         raise sentence(root, error) from error
 
 
+def may_not_write(error: StorageError) -> bool:
+    """Return whether a store failed because nothing may be written there, and not because its disk is full or broken."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _READ_ONLY
+
+
 def sentence(root: Path | str, error: OSError) -> StorageError:
     """Return in words what the file system said of something under the store ``root``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -146,7 +154,7 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
             f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
             f"shows what the store could give back) and run the same command again."
         )
-    if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+    if error.errno in _READ_ONLY:
         return StorageError(
             f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
             f"TACPIPE_STORE."
@@ -165,14 +173,15 @@ def told(error: OSError) -> str:
     )
 
 
-def _write_synced(path: str, content: bytes, mode: int) -> None:
+def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int) -> None:
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     except FileNotFoundError:
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
-        write_all(handle, content)
+        for block in [content] if isinstance(content, bytes) else content:
+            write_all(handle, block)
         os.fsync(handle)
     finally:
         os.close(handle)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import layout, replacing, unnamed
+from tacpipe import layout, regular, replacing, unnamed
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.execution import named
@@ -76,7 +76,9 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
-        if lasting:
+        if root["kind"] == PUSHED:  # each push is a snapshot, kept until it is forgotten
+            wanted += [one["manifest"] for one in root.get("history", [])]
+        elif lasting:
             replaced += [one["manifest"] for one in root.get("history", []) if one["lasting"]]
             replaced += [root["manifest"]] if here is None and expired and _lasting(store, root["manifest"]) else []
     damaged = store.roots.damaged()
@@ -248,11 +250,11 @@ def _content(path: Path) -> tuple[bytes | None, bool]:
     A path of which the system tells no more than that it failed counts as there: an error is no absence.
     """
     try:
-        return (path / manifest_of.NAME).read_bytes(), True
+        return regular.content(path / manifest_of.NAME, regular.JSON_BYTES), True
     except (FileNotFoundError, NotADirectoryError):
         with contextlib.suppress(OSError):
             return None, path.is_file()  # a report: its manifest lies in the store alone
-    except OSError:
+    except (OSError, regular.IrregularError):
         pass
     return None, True
 

@@ -17,12 +17,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import layout, progress
+from tacpipe import layout, progress, regular
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.files import read_json, readable_errors, write_all
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
 TELL_AFTER_S = 2.0  # a shorter wait is no news
+LEASE_BYTES = 1 << 30  # the largest lease that is read: it names 16 million objects
 _POLL_S = 0.02
 _UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts where the file system has no locks
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
@@ -175,7 +176,7 @@ def _release(path: Path, handle: int) -> None:
 
 
 def _told(path: Path) -> Run:
-    first, _, rest = path.read_text().partition("\n")
+    first, _, rest = regular.content(path, LEASE_BYTES, follow=False).decode("latin-1").partition("\n")
     try:
         note = json.loads(first)
     except ValueError:

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe import places
+from tacpipe import places, regular
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.excerpt import excerpt, plain
 from tacpipe.hashing import DIGEST, bytes_digest, digest
@@ -109,6 +109,7 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
 
     Raises `DamagedError` if they are no manifest, or if what they name does not give their digest.
     """
+    regular.expect_parsed(where, len(content))
     try:
         value = json.loads(content)
         found, stored = value.pop("format"), value.pop("digest")
@@ -235,9 +236,9 @@ def find(path: Path | str) -> Found:
     given = places.local(path)
     file = given if given.name == NAME else given / NAME
     try:
-        if file.exists() and not file.is_file():
-            raise UsageError(f"{file} is no regular file, so there is no dataset.")
-        return Found(file.parent, file.read_bytes())
+        return Found(file.parent, regular.content(file, regular.JSON_BYTES))
+    except regular.IrregularError as error:
+        raise UsageError(f"{error} There is no dataset.") from None
     except PermissionError as error:
         raise UsageError(f"{file} cannot be read ({error.strerror}). Ask its owner for leave to read it.") from None
     except (FileNotFoundError, NotADirectoryError):

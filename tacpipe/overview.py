@@ -32,7 +32,8 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     """
     found = manifest_of.find(path)
     store = locate(found.directory)
-    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),)))
+    sizes = dict(found.manifest.sizes())
+    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),), sizes))
     about = _about(opened)
     if model_overview.is_result(opened):
         return {"kind": "result", **about, **model_overview.of_result(opened, found, store)}

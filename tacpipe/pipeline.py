@@ -35,7 +35,8 @@ from tacpipe.store import MissingError, Store, locate
 def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
     found = manifest.find(path)
-    return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),)))
+    sizes = dict(found.manifest.sizes())
+    return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),), sizes))
 
 
 def run(request: Request) -> Outcome:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import execution, places, recording_names
+from tacpipe import execution, places, recording_names, regular
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.excerpt import listed, plain
@@ -77,7 +77,7 @@ def refuse_foreign(path: Path, mark: bytes) -> None:
         return
     found = b""
     if path.is_file():
-        with path.open("rb") as file:
+        with regular.opened(path) as file:
             found = file.read(2**16)
     if mark not in found:
         raise UsageError(f"{path} is there already and this command did not write it. Give -o another place.")
@@ -271,8 +271,9 @@ def outgoing(store: Store, directory: Path) -> Manifest | None:
 
 def adopt(store: Store, directory: Path, manifest: Manifest) -> None:
     """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
+    sizes = dict(manifest.sizes())
     for path, name in manifest.objects():
-        content = None if store.has(name) else execution.beside(name, path, (str(directory),))
+        content = None if store.has(name) else execution.beside(name, path, (str(directory),), sizes[name])
         if content is not None:
             store.put(content, durable=True)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
+import stat
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe import layout, places
+from tacpipe import layout, memory, places, regular
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.files import listed, readable_errors, sentence, sync_folders, write_whole
 from tacpipe.hashing import DIGEST, bytes_digest, digest
@@ -109,12 +111,15 @@ class Store:
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
         try:
-            found = os.stat(self.object_path(name)).st_size  # noqa: PTH116  (called once a shard: os.path is 5x faster)
+            found = os.lstat(self.object_path(name))  # called once a shard: os is 5 times faster than pathlib
         except FileNotFoundError:
             return self._put_back(name)
         except OSError as error:
             raise sentence(self.root, error) from error
-        return size is None or found == size
+        if not stat.S_ISREG(found.st_mode):
+            self.quarantine(self.object_path(name))
+            return self._put_back(name)
+        return size is None or found.st_size == size
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         """Store ``content`` and return its digest and size.
@@ -129,7 +134,7 @@ class Store:
         there = False
         with contextlib.suppress(MissingError):
             if durable:
-                self.read(name)
+                self.read(name, len(content))
             there = self.has(name, len(content))
         if not there:
             self.write_file(path, content, mode=0o444)
@@ -137,25 +142,64 @@ class Store:
             self.sync(path)
         return Object(name, len(content))
 
-    def read(self, name: str) -> bytes:
-        """Return the content of an object, verified.
+    def take(self, name: str, blocks: Iterable[bytes]) -> None:
+        """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
 
-        Raises `MissingError` if it is not there, or if its bytes do not hash to its name: those are then moved to
-        ``quarantine/``.
+        What was there is replaced.
+        """
+        self.announce([name])
+        path = self.object_path(name)
+        self.write_file(path, blocks, mode=0o444)
+        self.sync(path)
+
+    def read(self, name: str, size: int | None = None) -> bytes:
+        """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
+
+        Raises `MissingError` if it is not there, if it is so much larger than declared that it is not read, or if its bytes
+        do not hash to its name: those are then moved to ``quarantine/``.
         """
         path = self.object_path(name)
         try:
-            content = _read(path)
+            content = regular.content(path, None if size is None else _most(size), follow=False)
         except FileNotFoundError:
             if self._put_back(name):
-                return self.read(name)
-            raise AbsentError(f"Object {name[:12]} is not in the store {self._root}.") from None
-        except OSError as error:
-            raise MissingError(f"Object {name[:12]} in {self._root} cannot be read: {error.strerror}.") from error
+                return self.read(name, size)
+            raise self._missing(name) from None
+        except (OSError, regular.IrregularError, StorageError) as error:
+            raise self._unreadable(name, error) from error
         if bytes_digest(content) != name:
-            where = f"is now in {self._root}/quarantine" if self.quarantine(path) else "cannot be moved out of the way"
-            raise MissingError(f"Object {name[:12]} was damaged and {where}.")
+            raise self._damaged(name)
         return content
+
+    def blocks(self, name: str, size: int) -> Iterator[bytes]:
+        """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
+        hashed = hashlib.sha256()
+        try:
+            self.has(name)  # puts back what a collection moved aside
+            for block in regular.blocks(self.object_path(name), _most(size), follow=False):
+                hashed.update(block)
+                yield block
+        except FileNotFoundError:
+            raise self._missing(name) from None
+        except (OSError, regular.IrregularError) as error:
+            raise self._unreadable(name, error) from error
+        if hashed.hexdigest() != name:
+            raise self._damaged(name)
+
+    def _missing(self, name: str) -> AbsentError:
+        return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
+
+    def _unreadable(self, name: str, error: Exception) -> MissingError:
+        """Return what to say of an object that cannot be read; what is not a regular file is moved to quarantine."""
+        with contextlib.suppress(TacpipeError):
+            self.has(name)
+        why = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {why.rstrip('.')}.")
+
+    def _damaged(self, name: str) -> MissingError:
+        moved = self.quarantine(self.object_path(name))
+        where = f"is now in {self._root}/quarantine" if moved else "cannot be moved out of the way"
+        return MissingError(f"Object {name[:12]} was damaged and {where}.")
 
     def quarantine(self, path: str | Path) -> bool:
         """Move a damaged file out of the way, for whoever wants to know why; return False where nothing may be moved."""
@@ -204,7 +248,9 @@ class Store:
                 found = [path for folder in found for path in listed(folder, pattern)]
         return found
 
-    def write_file(self, path: Path | str, content: bytes, *, mode: int = 0o666, exclusive: bool = False) -> bool:
+    def write_file(
+        self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
+    ) -> bool:
         """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race.
 
         Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
@@ -234,13 +280,13 @@ class Store:
         path = self.record_path(key)
         try:
             with readable_errors(self.root):
-                content = _read(path)
-        except FileNotFoundError:
-            raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
-        try:
-            record: dict[str, Any] = json.loads(content)
+                record: dict[str, Any] = regular.json_value(path)
             if _sound(record, key):
                 return record
+        except FileNotFoundError:
+            raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
+        except StorageError:  # the disk failed, which says nothing of the record
+            raise
         except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
             pass
         self.quarantine(path)
@@ -292,9 +338,9 @@ def _sound(record: dict[str, Any], key: str) -> bool:
     return whole and digest(identity) == key and digest(body) == record["digest"]
 
 
-def _read(path: str) -> bytes:
-    with open(path, "rb", buffering=0) as file:
-        return file.readall()
+def _most(size: int) -> int:
+    """Return how many bytes of an object of this declared size are read: a small one that has grown is quarantined."""
+    return max(size, memory.AT_HAND)
 
 
 def locate(start: Path | None = None) -> Store:
@@ -311,8 +357,13 @@ def locate(start: Path | None = None) -> Store:
 def project(start: Path | None = None) -> Path:
     """Return the folder of the project: the nearest one upwards with a store, a ``dvc.yaml`` or a git repository."""
     here = (start or Path.cwd()).absolute()
+    return marked(here) or here
+
+
+def marked(here: Path) -> Path | None:
+    """Return the nearest folder upwards that has the mark of a project, None where none has."""
     for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
         for folder in (here, *here.parents):
             if os.path.lexists(folder / mark):  # a link to a disk that is not mounted counts
                 return folder
-    return here
+    return None

@@ -10,11 +10,15 @@ import typer
 
 from tacpipe import garbage, terminal
 from tacpipe.errors import DAMAGED, UsageError
+from tacpipe.excerpt import plain
+from tacpipe.roots import PUSHED
 from tacpipe.store import Store, locate
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
 Remote = Annotated[Path, typer.Argument(help="The other store, a directory.")]
+OtherStore = Annotated[Path | None, typer.Option("--store", help="Another store than the project's, as one pushed to.")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")]
 Ancestors = Annotated[bool, typer.Option("--ancestors", help="With the shards of all that the datasets descend from.")]
 
 
@@ -37,14 +41,15 @@ def status(as_json: AsJson = False) -> None:
     _print(value, as_json=as_json, text=upkeep.status_text(value))
 
 
-def list_(as_json: AsJson = False) -> None:
+def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
     """List the datasets that the store knows: stage, time, recordings, labels, last path. Replaced ones are among them.
 
     Example: tacpipe store list
     """
     from tacpipe import checkout as checkouts
+    from tacpipe import transfer
 
-    listed = checkouts.known(locate())
+    listed = checkouts.known(locate() if store is None else transfer.remote_store(store))
     _print(checkouts.to_json(listed), as_json=as_json, text=checkouts.to_text(listed))
 
 
@@ -53,7 +58,8 @@ def checkout(
         str, typer.Argument(help="Digest, its first digits, or last path, as `store list` prints them.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")],
-    replace: Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")] = False,
+    store: OtherStore = None,
+    replace: Replace = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a dataset that the store knows to a directory, with the labels that were set by hand.
@@ -61,8 +67,10 @@ def checkout(
     Example: tacpipe store checkout 3f2a91c0d4e5 -o data/recordings
     """
     from tacpipe import checkout as checkouts
+    from tacpipe import transfer
 
-    made = checkouts.checkout(dataset, output, replace=replace)
+    source = None if store is None else transfer.remote_store(store)
+    made = checkouts.checkout(dataset, output, replace=replace, source=source)
     value = {"schema_version": 1, "output": str(output), "stage": made.stage, "recordings": len(made.recordings)}
     _print({**value, "labelled": len(made.labels)}, as_json=as_json, text=str(output))
 
@@ -123,12 +131,16 @@ def gc(
 
 
 def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
-    known = {str(root["path"]) for root in store.roots.all()}
+    from tacpipe import pushed
+
     for name in names:
-        if not {name, str(Path(name).absolute())} & known:
-            raise UsageError(f"{store.root} keeps no dataset {name}; it keeps {', '.join(sorted(known)) or 'nothing'}.")
-        if not dry_run:
-            store.roots.forget(name)
+        roots = store.roots.all()
+        local = [root for root in roots if root["kind"] != PUSHED and str(root["path"]) == str(Path(name).absolute())]
+        for root in local if not dry_run else ():
+            store.roots.remove(root)
+        if not pushed.forget(store, name, dry_run=dry_run) and not local:
+            known = sorted(pushed.label(root, roots) for root in roots)
+            raise UsageError(f"{store.root} keeps no dataset {name}; it keeps {', '.join(known) or 'nothing'}.")
 
 
 def link(datasets: Paths) -> None:
@@ -143,30 +155,53 @@ def link(datasets: Paths) -> None:
         terminal.result(f"{path}: {count} linked anew")
 
 
-def push(remote: Remote, datasets: Paths, ancestors: Ancestors = False, as_json: AsJson = False) -> None:
-    """Copy what datasets need to another store.
+def push(
+    remote: Remote,
+    datasets: Paths,
+    ancestors: Ancestors = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Also read what is there already, not only its size.")
+    ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option("--replace", help="Push although another computer pushed there since; that stays in the history."),
+    ] = False,
+    project: Annotated[
+        str, typer.Option("--project", metavar="NAME", help="Push as this project of the other store, now and later.")
+    ] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Copy what datasets need to another store, as snapshots of this project. Those before stay there.
 
     Example: tacpipe store push /mnt/lab/store models/forward data/latents data/split
     """
     from tacpipe import transfer
 
-    done = transfer.push(remote, datasets, ancestors=ancestors)
+    done = transfer.push(remote, datasets, ancestors=ancestors, verify=verify, replace=replace, project=project)
     _print(asdict(done), as_json=as_json, text=_moved("pushed", done))
 
 
-def pull(remote: Remote, datasets: Paths, ancestors: Ancestors = False, as_json: AsJson = False) -> None:
+def pull(
+    remote: Remote,
+    datasets: Annotated[list[Path], typer.Argument(help="Datasets; PROJECT:PATH is that of another project.")],
+    ancestors: Ancestors = False,
+    replace: Replace = False,
+    as_json: AsJson = False,
+) -> None:
     """Copy what datasets need from another store: those whose manifest is here, else what was pushed from that path.
 
     Example: tacpipe store pull /mnt/lab/store models/forward data/latents data/split
     """
     from tacpipe import transfer
 
-    done = transfer.pull(remote, datasets, ancestors=ancestors)
+    done = transfer.pull(remote, datasets, ancestors=ancestors, replace=replace)
     _print(asdict(done), as_json=as_json, text=_moved("pulled", done))
 
 
 def _moved(verb: str, done: Any) -> str:
-    return f"{verb} {done.objects} objects ({done.bytes / 1e6:.1f} MB); {done.there} were there already"
+    names = plain(", ".join(done.datasets), 1000)
+    text = f"{verb} {names}: {done.objects} objects ({done.bytes / 1e6:.1f} MB); {done.there} were there already"
+    return f"{text}; replaced {done.replaced} that were damaged there" if done.replaced else text
 
 
 def _print(value: Any, *, as_json: bool, text: str) -> None:

@@ -159,10 +159,12 @@ def link(path: Path) -> int:
     manifest, directory = found.manifest, found.directory
     store = locate(directory)
     with store.at_work([found.digest]), directory_of.changing(store, directory):
-        read = execution.reader(store, (str(directory.absolute()),))
+        sizes = dict(manifest.sizes())
+        read = execution.reader(store, (str(directory.absolute()),), sizes)
         stale = []
         for name, digest in manifest.objects():
-            matches = (directory / name).is_file() and file_digest(directory / name) == digest
+            there = directory / name
+            matches = there.is_file() and there.stat().st_size == sizes[digest] and file_digest(there) == digest
             if not (matches and store.has(digest)):
                 read(digest, name)  # heals the store first
             if not matches:

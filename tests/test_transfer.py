@@ -1,12 +1,16 @@
 import json
+import os
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 
 import tacpipe
-from tacpipe import upkeep
-from tacpipe.store import Store
+from tacpipe import projects, regular, upkeep
+from tacpipe.hashing import digest as values_digest
+from tacpipe.roots import HISTORY
+from tacpipe.store import MissingError, Store
 from tests.conftest import Lab
 from tests.test_pipeline import counts
 
@@ -84,3 +88,319 @@ def test_recordings_go_along_with_ancestors(lab: Lab, clone: Path, monkeypatch: 
     lab.run(f"store push {remote_of(lab)} data/c --ancestors")
     names = {name for _, name in lab.manifest("data/r").objects()}
     assert all(Store(remote_of(lab)).has(name) for name in names)
+
+
+# ---- names and snapshots
+
+
+@pytest.fixture
+def two(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Lab:
+    """Two projects, ``one`` and ``two``, each with other recordings at ``data/r``."""
+    for name, trials in (("one", 2), ("two", 3)):
+        (lab.folder / name / ".tacpipe").mkdir(parents=True)
+        enter(lab, name, monkeypatch)
+        lab.run(f"simulate toy -o data/r --trials {trials} --rows 3")
+    return lab
+
+
+def enter(lab: Lab, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(lab.folder / name)
+
+
+def age(store: Path) -> None:
+    """Let all that lies in a store have been written long ago, for `gc`."""
+    for path in store.rglob("*"):
+        os.utime(path, (1_500_000_000, 1_500_000_000))
+
+
+def collect(lab: Lab, store: Path, options: str = "") -> None:
+    age(store)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TACPIPE_STORE", str(store))
+        lab.run(f"store gc {options}")
+
+
+def snapshots(lab: Lab) -> list[tuple[str, str, str]]:
+    """Return project, path and state of all that was pushed, newest first where a project pushed."""
+    listed = json.loads(lab.run(f"store list --store {lab.folder}/remote --json").out)["manifests"]
+    return [(one["project"], one["path"], one["state"]) for one in listed]
+
+
+def test_two_projects_push_the_same_path_and_each_pulls_its_own(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    contents = {}
+    for name in ("one", "two"):
+        enter(two, name, monkeypatch)
+        assert f"pushed {name}:data/r: " in two.run("store push ../remote data/r").out
+        contents[name] = Path("data/r/manifest.json").read_bytes()
+    collect(two, two.folder / "remote", "--recordings")
+    for name in ("one", "two"):
+        enter(two, name, monkeypatch)
+        shutil.rmtree("data/r")
+        shutil.rmtree(".tacpipe/objects")
+        two.run("store pull ../remote data/r")
+        assert Path("data/r/manifest.json").read_bytes() == contents[name]
+        assert upkeep.verify(Store(".tacpipe")).clean
+
+
+def test_another_projects_dataset_is_pulled_by_its_name_which_the_refusal_gives(
+    two: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("one", "two"):
+        enter(two, name, monkeypatch)
+        two.run("store push ../remote data/r")
+    (two.folder / "third/.tacpipe").mkdir(parents=True)
+    enter(two, "third", monkeypatch)
+    failed = two.call("store pull ../remote data/r")
+    assert failed.code == 2 and "but of others: one:data/r, two:data/r" in failed.err
+    two.run("store pull ../remote two:data/r")
+    assert Path("data/r/manifest.json").read_bytes() == (two.folder / "two/data/r/manifest.json").read_bytes()
+    failed = two.call("store pull ../remote one:data/r")
+    assert failed.code == 2 and "--replace" in failed.err
+    two.run("store pull ../remote one:data/r --replace")
+    assert Path("data/r/manifest.json").read_bytes() == (two.folder / "one/data/r/manifest.json").read_bytes()
+
+
+def test_projects_of_the_same_name_are_told_apart_by_their_ids(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("one", "two"):
+        (two.folder / name / "same/.tacpipe").mkdir(parents=True)
+        enter(two, f"{name}/same", monkeypatch)
+        two.run(f"simulate toy -o r --trials {len(name)} --rows {len(name) + (name == 'two')}")
+        two.run("store push ../../remote r")
+    named = [f"{project}:{path}" for project, path, _ in snapshots(two)]
+    assert all(re.fullmatch(r"[0-9a-f]{8}:r", one) for one in named) and len(set(named)) == 2
+    (two.folder / "third/.tacpipe").mkdir(parents=True)
+    enter(two, "third", monkeypatch)
+    assert two.call("store pull ../remote same:r").code == 2
+    two.run(f"store pull ../remote {named[0]}")
+
+
+def test_a_push_onto_what_somebody_else_pushed_since_is_refused_and_erases_nothing(
+    two: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    shutil.copytree(two.folder / "one", two.folder / "rig", ignore=shutil.ignore_patterns("leases"))
+    enter(two, "rig", monkeypatch)
+    two.run("label data/r trial-000 --set material=foam")
+    two.run("store push ../remote data/r")
+    enter(two, "one", monkeypatch)
+    two.run("label data/r trial-001 --set material=cork")
+    failed = two.call("store push ../remote data/r")
+    assert failed.code == 2 and "holds another one:data/r" in failed.err and "--replace" in failed.err
+    assert [state for *_, state in snapshots(two)].count("pushed here") == 1
+    two.run("store push ../remote data/r --replace")
+    collect(two, two.folder / "remote", "--recordings")
+    assert len(snapshots(two)) == 3
+    digests = [one["manifest"] for one in json.loads(two.run("store list --store ../remote --json").out)["manifests"]]
+    labelled = set()
+    for digest in digests:
+        two.run(f"store checkout {digest} --store ../remote -o back/{digest}")
+        labelled.add(json.dumps(dict(two.manifest(f"one/back/{digest}").labels)))
+    assert len(labelled) == 3, "each snapshot came back with its own labels"
+
+
+def test_a_dataset_that_was_made_again_and_again_is_pushed_without_a_question(
+    two: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    for rows in range(4, 4 + HISTORY + 3):
+        two.run(f"simulate toy -o data/r --trials 1 --rows {rows} --jobs 1")
+    two.run("store push ../remote data/r")
+    assert [state for *_, state in snapshots(two)] == ["pushed here", "pushed earlier"]
+
+
+def test_what_was_pushed_earlier_is_kept_by_the_stated_rule(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(two, "one", monkeypatch)
+    Path("src").mkdir()
+    for count in range(1, 4):  # recordings of each
+        Path(f"src/{count}.txt").write_text("1 2 3")
+        two.run("ingest numbers src -o data/i")
+        two.run("store push ../remote data/i")
+    for rows in range(1, HISTORY + 5):
+        two.run(f"simulate toy -o data/r --trials 1 --rows {rows} --jobs 1")
+        two.run("store push ../remote data/r")
+    collect(two, two.folder / "remote", "--recordings")
+    assert [path for _, path, _ in snapshots(two)].count("data/i") == 3
+    assert [path for _, path, _ in snapshots(two)].count("data/r") == 1 + HISTORY
+    newest, middle, oldest = (
+        one["manifest"]
+        for one in json.loads(two.run("store list --store ../remote --json").out)["manifests"]
+        if one["path"] == "data/i"
+    )
+    collect(two, two.folder / "remote", f"--recordings --forget {newest} --forget {oldest[:12]}")
+    left = json.loads(two.run("store list --store ../remote --json").out)["manifests"]
+    assert [(one["manifest"], one["state"]) for one in left if one["path"] == "data/i"] == [(middle, "pushed here")]
+    collect(two, two.folder / "remote", "--recordings --forget one:data/i --forget data/r")
+    assert snapshots(two) == [] and not list((two.folder / "remote/objects").glob("*/*"))
+
+
+def test_a_second_computer_joins_a_project_by_its_name(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    (two.folder / "clone/.tacpipe").mkdir(parents=True)
+    enter(two, "clone", monkeypatch)
+    two.run("store pull ../remote data/r")
+    failed = two.call("store push ../remote data/r --project three")
+    assert failed.code == 2 and "no project is called three" in failed.err and "one (" in failed.err
+    two.run("label data/r trial-000 --set material=foam")
+    two.run("store push ../remote data/r --project one")
+    two.run("store push ../remote data/r")
+    assert snapshots(two) == [("one", "data/r", "pushed here"), ("one", "data/r", "pushed earlier")]
+
+
+def test_a_store_elsewhere_serves_projects_without_a_mark_and_no_dataset_is_a_dot(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("unmarked")
+    monkeypatch.setenv("TACPIPE_STORE", str(folder / "store"))
+    remote = folder / "remote"
+    for number, name in enumerate(("a", "b")):
+        (folder / name).mkdir()
+        monkeypatch.chdir(folder / name)
+        for path in ("data/r", "data/s"):
+            lab.run(f"simulate toy -o {path} --trials {len(path)} --rows {number + 1}")
+        lab.run(f"store push {remote} data/r data/s")
+    monkeypatch.chdir(folder / "a/data/r")
+    lab.run(f"store push {remote} .")
+    listed = json.loads(lab.run(f"store list --store {remote} --json").out)["manifests"]
+    names = sorted(f"{one['project']}:{one['path']}" for one in listed)
+    assert names == ["a:data/r", "a:data/s", "b:data/r", "b:data/s", "data:r"]
+
+
+@pytest.mark.parametrize(
+    ("mark", "where", "given", "name"),
+    [
+        (".git", "", "data/r", "data/r"),
+        (".git", "data", "r", "data/r"),
+        (".git", "", "data/../data/r", "data/r"),
+        (".git", "data/r", ".", "data/r"),
+        ("data/r/.git", "", "data/r", "r"),
+        ("", "", "data/r", "data/r"),
+        ("", "data/r", ".", "r"),
+        ("", "elsewhere", "../data/r", "r"),
+        ("", "elsewhere", "not/there", "not/there"),
+    ],
+)
+def test_a_dataset_is_named_by_its_path_within_its_project(
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    mark: str,
+    where: str,
+    given: str,
+    name: str,
+) -> None:
+    folder = tmp_path_factory.mktemp("named")
+    for made in ("data/r", "elsewhere", *([mark] if mark else [])):
+        (folder / made).mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(folder / where)
+    assert projects.place(Path(given))[1] == name
+
+
+def as_before_projects(remote: Path, name: str) -> None:
+    """Write the only root of a remote store as pushes did before projects had an identity."""
+    store = Store(remote)
+    (root,) = store.roots.all()
+    store.roots.remove(root)
+    store.roots.write({key: value for key, value in root.items() if key != "project"} | {"path": name})
+    (file,) = remote.glob("roots/*.json")
+    assert file.stem == values_digest(["pushed", name]), "which is where these lie"
+
+
+def test_what_was_pushed_before_projects_is_pulled_and_succeeded_by_whoever_has_had_it(
+    two: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    as_before_projects(two.folder / "remote", "data/r")
+    shutil.rmtree(".tacpipe/projects")
+    assert snapshots(two) == [("", "data/r", "pushed here")]
+    enter(two, "two", monkeypatch)
+    two.run("store push ../remote data/r")  # has never had it: it stays
+    assert sorted(snapshots(two)) == [("", "data/r", "pushed here"), ("two", "data/r", "pushed here")]
+    for name, wanted in (("one", ":data/r"), ("two", "data/r")):
+        (two.folder / f"of-{name}/.tacpipe").mkdir(parents=True)
+        enter(two, f"of-{name}", monkeypatch)
+        two.run(f"store pull ../remote {wanted if name == 'one' else 'two:data/r'}")
+        assert Path("data/r/manifest.json").read_bytes() == (two.folder / name / "data/r/manifest.json").read_bytes()
+    enter(two, "one", monkeypatch)
+    two.run("label data/r trial-000 --set material=foam")
+    two.run("store push ../remote data/r")
+    assert sorted(snapshots(two)) == [
+        ("one", "data/r", "pushed earlier"),
+        ("one", "data/r", "pushed here"),
+        ("two", "data/r", "pushed here"),
+    ]
+
+
+def test_one_push_of_a_name_waits_for_another(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    remote = Store(two.folder / "remote")
+    (root,) = remote.roots.all()
+    monkeypatch.setenv("TACPIPE_LOCK_TIMEOUT_S", "0.05")
+    with remote.leases.hold(values_digest(["pushed", root["project"]["id"], "data/r"]), "by another computer"):
+        assert two.call("store push ../remote data/r").code == 6
+
+
+def test_a_damaged_identity_is_not_replaced_by_another(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(two, "one", monkeypatch)
+    two.run("store push ../remote data/r")
+    (file,) = Path(".tacpipe/projects").iterdir()
+    file.write_text(file.read_text().replace('"name": "one"', '"name": "owe"'))
+    failed = two.call("store push ../remote data/r")
+    assert failed.code == 4 and "--project" in failed.err
+    two.run("store push ../remote data/r --project one")
+    assert snapshots(two) == [("one", "data/r", "pushed here")]
+
+
+# ---- damage in the other store
+
+
+@pytest.mark.parametrize("size", [0, 100, 10**6])
+def test_a_push_replaces_what_has_another_size_there(
+    lab: Lab, clone: Path, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    monkeypatch.chdir(lab.folder)
+    manifest = lab.manifest("data/s")
+    name = manifest.recordings["trial-003"]["shards"][""]["digest"]
+    path = Path(Store(remote_of(lab)).object_path(name))
+    content = path.read_bytes()
+    path.chmod(0o644)
+    os.truncate(path, size)
+    done = json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)
+    assert (done["objects"], done["replaced"], path.read_bytes()) == (1, 1, content)
+
+
+def test_a_push_that_verifies_replaces_what_has_other_bytes_there(
+    lab: Lab, clone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(lab.folder)
+    name = lab.manifest("data/s").recordings["trial-003"]["shards"][""]["digest"]
+    path = Path(Store(remote_of(lab)).object_path(name))
+    content = path.read_bytes()
+    path.chmod(0o644)
+    path.write_bytes(content[:-1] + b"?")
+    assert json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)["replaced"] == 0
+    assert "replaced 1 that were damaged there" in lab.run(f"store push {remote_of(lab)} data/s --verify").out
+    assert path.read_bytes() == content
+    assert upkeep.verify(Store(remote_of(lab))).clean
+
+
+def test_an_object_of_many_blocks_goes_over_without_being_held_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = Store(tmp_path / "one"), Store(tmp_path / "two")
+    for store in (one, two):
+        store.prepare()
+    content = os.urandom(5 * regular.BLOCK_BYTES + 3)
+    name = one.put(content).digest
+    blocks = list(one.blocks(name, len(content)))
+    assert max(map(len, blocks)) == regular.BLOCK_BYTES
+    two.take(name, blocks)
+    assert two.read(name) == content
+    Path(one.object_path(name)).chmod(0o644)
+    Path(one.object_path(name)).write_bytes(content[:-1])
+    with pytest.raises(MissingError, match="damaged"):
+        Store(tmp_path / "two").take(name, one.blocks(name, len(content)))
+    assert two.read(name) == content and not list((tmp_path / "two/tmp").iterdir())

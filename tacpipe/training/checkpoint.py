@@ -16,6 +16,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from tacpipe import regular
+from tacpipe.errors import TacpipeError
 from tacpipe.files import readable_errors, sync_folder, write_whole
 from tacpipe.hashing import bytes_digest
 
@@ -39,11 +41,12 @@ def read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     """Return tensors and state of the checkpoint in ``folder``; None where there is none or it is damaged."""
     path = folder / FILE
     try:
-        signed = path.read_bytes()
+        signed = regular.content(path, follow=False)
     except FileNotFoundError:
         return None
-    except OSError as error:
-        log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, error.strerror)
+    except (OSError, TacpipeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, why)
         return None
     stored, _, content = signed.partition(b"\n")
     try:

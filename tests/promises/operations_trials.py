@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import cli, execution, hashing, upkeep
+from tacpipe import cli, execution, hashing, projects, upkeep
 from tacpipe.errors import DAMAGED
 from tacpipe.store import Store
 from tests.promises.operations import Call, Shim
@@ -67,6 +67,7 @@ def main() -> None:
     os.environ.pop("TACPIPE_STORE", None)
     os.environ["TACPIPE_LOCK_TIMEOUT_S"] = "10"
     hashing.SETTLED_NS = 0  # calls must not depend on what time it is
+    projects.new_id = lambda: "ab" * 16  # nor what is written on chance
     os.fsync = os.fdatasync = lambda handle: None  # type: ignore[assignment]  # nobody takes the power away here
     for name in given.cases:
         lab = given.folder.absolute() / name.replace(" ", "-")

@@ -6,6 +6,7 @@ import builtins
 import ctypes
 import errno
 import fcntl
+import json
 import os
 import shutil
 import subprocess
@@ -16,7 +17,9 @@ from typing import Any
 
 import pytest
 
+from tacpipe import upkeep
 from tacpipe.errors import DAMAGED, FAILED, USAGE
+from tacpipe.store import Store
 from tests.conftest import Lab
 from tests.promises import damages, specimen
 from tests.promises.counts import count
@@ -248,6 +251,24 @@ def test_a_store_that_may_only_be_read_answers_and_says_in_a_sentence_what_it_ca
         assert failed.stderr.count("\n") == 1 and "TACPIPE_STORE" in failed.stderr
     assert specimen.files(locked.store) == before
     assert locked.shown() == dict(locked.sound)
+
+
+def test_a_store_that_may_only_be_read_is_pushed_from(
+    locked: Specimen, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    before, remote = specimen.files(locked.store), tmp_path_factory.mktemp("remote")
+    for verb in ("pushed", "repeated"):
+        ran = as_ordinary_user(locked, f"store push {remote} data/recordings data/total --json")
+        assert ran.returncode == 0 and not ran.stderr, (verb, ran.stderr)
+    assert json.loads(ran.stdout)["objects"] == 0
+    assert specimen.files(locked.store) == before
+    assert upkeep.verify(Store(remote)).clean
+    assert {root["path"] for root in Store(remote).roots.all()} == {"data/recordings", "data/total"}
+    for path in (locked.object("total", "metrics.json"), locked.folder / "data/total/metrics.json"):
+        path.chmod(0o644)
+        path.write_bytes(b"damaged")
+    failed = as_ordinary_user(locked, f"store push {remote.with_name('other')} data/total")
+    assert failed.returncode == DAMAGED and "a `tacpipe store gc` at the same time may have removed" in failed.stderr
 
 
 def test_damage_in_a_store_that_may_only_be_read_is_found_and_never_served(locked: Specimen) -> None:
