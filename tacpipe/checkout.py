@@ -13,7 +13,7 @@ from tacpipe import execution, projects, pushed, regular, replacing, terminal, t
 from tacpipe import manifest as manifest_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.excerpt import plain
-from tacpipe.hashing import bytes_digest
+from tacpipe.hashing import DIGEST, bytes_digest
 from tacpipe.manifest import Manifest
 from tacpipe.roots import PUSHED
 from tacpipe.store import MissingError, Store, locate
@@ -136,6 +136,17 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: Store | 
     raise AssertionError
 
 
+def _is_manifest(store: Store, name: str) -> bool:
+    """Return whether ``name`` is the whole digest of a manifest in the store."""
+    if not DIGEST.fullmatch(name) or not store.has(name):
+        return False
+    try:
+        manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+    except TacpipeError:
+        return False
+    return True
+
+
 def _named(store: Store, name: str) -> str:
     """Return the digest of the manifest that is meant: by its digest, or by the path at which it was last written."""
     root = store.roots.get(Path(name).absolute())
@@ -153,6 +164,8 @@ def _named(store: Store, name: str) -> str:
     matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
     if len(matching) > 1:
         raise UsageError(f"{len(matching)} manifests of {store.root} begin with {name}; give more of its hex digits.")
+    if not matching and _is_manifest(store, name):  # that no root names any more
+        return name
     if not matching:
         raise UsageError(f"{store.root} knows no manifest {name}; `tacpipe store list` names those that it knows.")
     return matching.pop()

@@ -232,8 +232,8 @@ def _doubtful(store: Store) -> dict[Path, set[str]]:
         name, _, kind = path.name.rpartition(".")[0].partition(".")
         if not DIGEST.fullmatch(name) or (store.record(name) if kind else store.has(name)):
             continue
-        with contextlib.suppress(FileNotFoundError):
-            names = unnamed.digests(path.read_bytes())
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError):  # what is larger was a shard
+            names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
             if names:
                 found[path] = names
     return found

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tacpipe import manifest as manifest_of
-from tacpipe import replacing
+from tacpipe import regular, replacing
 from tacpipe.errors import TacpipeError
 from tacpipe.hashing import DIGEST, bytes_digest
 from tacpipe.manifest import Manifest
@@ -58,7 +58,8 @@ def digests(content: bytes) -> set[str]:
 def _candidates(objects: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
     """Yield digest and content of the objects that begin as a manifest does."""
     for path in objects:
-        with contextlib.suppress(FileNotFoundError), open(path, "rb") as file:
-            begins = file.read(len(_BEGINS))
-            if begins == _BEGINS:
-                yield path.name, begins + file.read()
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError):
+            with regular.opened(path, follow=False) as file:
+                if file.read(len(_BEGINS)) != _BEGINS:
+                    continue
+            yield path.name, regular.content(path, regular.JSON_BYTES, follow=False)

@@ -343,21 +343,21 @@ SHA = hashlib.sha256
 TRIAL = '{"inputs":{"trial":0},"params":{"offset":0,"rows":3,"trials":1},"stage":"simulate.toy","version":1}'
 SCALE = (
     '{"inputs":{"recording":{"attributes":{},"shards":{"left":{"digest":"%s"},"right":{"digest":"%s"}}}},'
-    '"params":{"factor":2,"pause_s":0.0,"refuse":-1},"stage":"scale","version":1}'
+    '"params":{"factor":2,"gate":"","pause_s":0.0,"refuse":-1},"stage":"scale","version":1}'
 )
 NAMED = (
     '{"inputs":{"recording":{"attributes":{"material":"cork"},"shards":{"left":{"digest":"%s"},"right":{"digest":"%s"}}}},'
     '"params":{},"stage":"named","version":1}'
 )
 TOTAL = (
-    '{"inputs":{"recordings":{"files":{},"lineage":{"chain":[{"fitted":null,"params":{"factor":2,"pause_s":0.0,'
-    '"refuse":-1},"stage":"scale","version":1}],"params":{"factor":2,"pause_s":0.0,"refuse":-1},"stage":"scale",'
+    '{"inputs":{"recordings":{"files":{},"lineage":{"chain":[{"fitted":null,"params":{"factor":2,"gate":"","pause_s":0.0,'
+    '"refuse":-1},"stage":"scale","version":1}],"params":{"factor":2,"gate":"","pause_s":0.0,"refuse":-1},"stage":"scale",'
     '"version":1},"recordings":{"trial-000":{"attributes":{"material":"cork","trial":0},"shards":{"":{"digest":"%s"}}}}}},'
     '"params":{},"stage":"total","version":1}'
 )
 INGEST = '{"inputs":{"files":{"a.txt":"%s"}},"params":{},"stage":"ingest.numbers","version":1}'
 RUN = (
-    '{"datasets":["%s"],"fold":0,"named":{},"params":{"factor":2,"pause_s":0.0,"refuse":-1},"role":null,"run":"scale",'
+    '{"datasets":["%s"],"fold":0,"named":{},"params":{"factor":2,"gate":"","pause_s":0.0,"refuse":-1},"role":null,"run":"scale",'
     '"sources":{},"version":[1,null]}'
 )
 ENTRY = '{"attributes":{"material":"cork","trial":0},"shards":{"left":"%s","right":"%s"}}'

@@ -388,6 +388,21 @@ def _shards(manifest: dict[str, dict[str, dict[str, dict[str, dict[str, str]]]]]
     return [shard["digest"] for one in manifest["recordings"].values() for shard in one["shards"].values()]
 
 
+def test_a_manifest_that_no_root_names_any_more_is_checked_out_by_its_digest(lab: Lab) -> None:
+    source("src", a="1 2")
+    lab.run("ingest numbers src -o data/r")
+    before, name = content("data/r"), bytes_digest(Path("data/r/manifest.json").read_bytes())
+    shard = next(digest for _, digest in lab.manifest("data/r").objects())
+    for path in lab.store.root.glob("roots/*"):
+        path.unlink()
+    shutil.rmtree("data")
+    assert listed(lab) == []
+    lab.run(f"store checkout {name} -o data/r")
+    assert content("data/r") == before
+    ran = lab.call(f"store checkout {shard} -o data/again")  # an object, but not a manifest
+    assert ran.code == 2 and "knows no manifest" in ran.err
+
+
 def test_a_checkout_replaces_recordings_only_when_it_is_asked_to(lab: Lab) -> None:
     source("one", a="1 2")
     source("two", b="3 4")

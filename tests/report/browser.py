@@ -5,9 +5,9 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -89,6 +89,8 @@ class Browser:
         """Return the next message that is wanted; others are events that nobody asked for."""
         while True:
             while b"\0" not in self._unread:
+                ready, _, _ = select.select([self._answers], [], [], LIMIT_S)
+                assert ready, f"Chromium hangs: it has not answered for {LIMIT_S:g} s"
                 some = self._answers.read(1 << 16)
                 if not some:
                     raise AssertionError("Chromium ended before it answered")
@@ -101,7 +103,7 @@ class Browser:
 
 @contextmanager
 def browser(folder: Path) -> Iterator[Browser]:
-    """Start Chromium with an empty profile in ``folder``, and end it; one that hangs for `LIMIT_S` is killed."""
+    """Start Chromium with an empty profile in ``folder``, and end it; one that does not answer for `LIMIT_S` is killed."""
     assert PROGRAM is not None
     commands, answers = os.pipe(), os.pipe()
     # Chromium reads commands from file 3 and writes to file 4; the shell puts them there before it becomes Chromium
@@ -113,15 +115,11 @@ def browser(folder: Path) -> Iterator[Browser]:
         )
     for end in (commands[0], answers[1]):
         os.close(end)
-    watch = threading.Timer(LIMIT_S, process.kill)
-    watch.daemon = True
-    watch.start()
     try:
         opened = Browser(commands[1], answers[0], folder)
         yield opened
         opened.close()
         process.wait(timeout=LIMIT_S)
     finally:
-        watch.cancel()
         process.kill()
         process.wait()

@@ -8,6 +8,9 @@ from typing import Any
 
 import pyarrow as pa
 
+from tacpipe.columns import Columns
+from tacpipe.tables import to_parquet
+
 
 @dataclass
 class StreamShard:
@@ -23,3 +26,6 @@ class StreamShard:
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
         return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
+
+    def columns(self, stream: str = "") -> Columns:
+        return Columns(to_parquet(self.tables[stream]))
