@@ -218,14 +218,21 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
         if stage.version != identity["version"]:
             other = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
             continue
+        key = digest(identity)
+        if key in _remaking:  # a stage that gives what it was given: another one made that first
+            continue
+        _remaking.add(key)
         try:
-            with store.leases.hold(digest(identity), f"{identity['stage']}, for {path}"):
+            with store.leases.hold(key, f"{identity['stage']}, for {path}"):
                 if not store.has(name, size):  # else another process has made it again
                     execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
         except TacpipeError as error:
             if error.exit_code != FAILED:
                 raise
-            raise DamagedError(f"{why} It cannot be made again here: {error}") from error
+            other = str(error)
+            continue
+        finally:
+            _remaking.discard(key)
         if store.has(name, size):
             return store.read(name, size)
         unlike = "; ".join(provenance.unlike(made_by, provenance.of(0.0)))
@@ -236,6 +243,7 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
     )
 
 
+_remaking: set[str] = set()  # keys that this process makes again, one because another one lacks its input
 _known: dict[str, dict[str, list[tuple[Any, Any]]]] = {}  # store, digest, identities of what gave it and provenance
 
 
