@@ -1,6 +1,5 @@
 """What looks at a store while a collection removes things from it: what vanished is not damaged."""
 
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tacpipe import files as files_of
 from tacpipe import garbage, layout, upkeep
 from tacpipe.store import Store
 from tests.conftest import Lab
@@ -113,7 +113,7 @@ def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_mi
 def test_a_status_beside_a_collection_counts_what_it_still_finds(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, honest = littered.store, os.walk
+    store, honest = littered.store, files_of.walk
     draft = store.root / "tmp" / f".{'ab' * 16}"
     draft.write_bytes(b"touch")
     gone: list[Path] = []
@@ -129,7 +129,7 @@ def test_a_status_beside_a_collection_counts_what_it_still_finds(
             yield place, folders, files
 
     before = upkeep.status(store)
-    monkeypatch.setattr(os, "walk", walk)
+    monkeypatch.setattr(upkeep, "walk", walk)
     found = upkeep.status(store)
     assert draft in gone and len(gone) == 2
     assert found["tmp"]["files"] == 0 < found["objects"]["files"] < before["objects"]["files"]

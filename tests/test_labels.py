@@ -27,7 +27,12 @@ def read(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """A function that returns how many objects were read since it was called last."""
     names: list[str] = []
     real = Store.read
-    monkeypatch.setattr(Store, "read", lambda store, name: names.append(name) or real(store, name))  # type: ignore[func-returns-value]
+
+    def read(store: Store, name: str, size: int | None = None) -> bytes:
+        names.append(name)
+        return real(store, name, size)
+
+    monkeypatch.setattr(Store, "read", read)
 
     def count() -> int:
         found = len(names)

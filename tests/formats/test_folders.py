@@ -270,8 +270,16 @@ def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
             raise error
         return io.BufferedReader(Failing(error))
 
+    whole = regular.content
+
+    def content(path: Path | str, *given: Any, **named: Any) -> bytes:
+        if str(path).endswith(file) and hashed:
+            raise OSError(number, os.strerror(number), str(path))
+        return whole(path, *given, **named)
+
     monkeypatch.setattr(execution, "compute", computing)
     monkeypatch.setattr(regular, "opened", opened)
+    monkeypatch.setattr(regular, "content", content)
     ran = lab.call(f"ingest {name} raw -o data/r --skip-bad")
     assert ran.code == 1, ran
     assert f"{file} cannot be read: {os.strerror(number)}. The recording may be sound" in ran.err

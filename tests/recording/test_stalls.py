@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from tacpipe import registry
+from tacpipe.columns import Columns
 from tacpipe.links import udp
 from tacpipe.recording import clock, sealing, station
 from tacpipe.recording import rig as rig_of
@@ -19,6 +19,7 @@ from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
 from tacpipe.recording.spool import Note, Spool, Spooled
 from tacpipe.recording.station import READ_S, Station
+from tacpipe.tables import to_parquet
 from tests.conftest import Lab
 from tests.recording import live
 from tests.recording.scripted import Script
@@ -174,8 +175,8 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
     class Shard:
         name, attributes, streams = "r", {"master": "pad"}, ("pad",)
 
-        def columns(self, stream: str) -> pa.Table:
-            return table
+        def columns(self, stream: str) -> Columns:
+            return Columns(to_parquet(table))
 
     stage = registry.load("synchronize")
     made_of: Any = stage(stage.params(), Shard())
