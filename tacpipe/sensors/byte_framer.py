@@ -48,6 +48,7 @@ class ByteFramer:
         self._usual = framing.size or 0  # size of the last good frame
         self._marked: tuple[int, list[tuple[int, bytes]]] = (0, [])  # marks of frames of the last size, see `_marks`
         self._told = (b"", 0)  # the last header whose size was asked for, and the size
+        self._behind = False  # whether the bytes at hand begin right behind a tail, which was cut off
         self._ruined: set[int] = set()  # where no chain begins, counted from the first byte: not looked at once more
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
@@ -86,6 +87,9 @@ class ByteFramer:
             if not broken:
                 break
             self._locked, self._broken_at, self._barred = False, self._text.base + stop, self._text.base + place
+        if place:
+            tail = self.framing.tail
+            self._behind = bool(tail) and self._text.data[max(0, place - len(tail)) : place] == tail
         self._text.cut(place)
         return runs, losses
 
@@ -243,6 +247,8 @@ class ByteFramer:
         mark = framing.marker or framing.tail
         shift = 0 if framing.marker else len(mark)
         barred = self._barred - self._text.base
+        if shift and self._behind and place == 0 != barred:
+            yield 0
         found = text.find(mark, max(0, place - shift))
         while found >= 0:
             if found + shift >= place and found + shift != barred:
