@@ -323,7 +323,9 @@ def test_a_lock_needs_as_many_frames_as_the_framing_says() -> None:
 
 
 def test_the_first_frame_behind_garbage_is_found_wherever_the_bytes_are_cut() -> None:
-    framing = Framing(tail=b"\r\n", size=10, most=64, check=lambda rows: (rows[:, :8] > 100).all(axis=1), lock=3)
+    framing = Framing(
+        tail=b"\r\n", size=10, most=64, check=lambda rows: np.asarray((rows[:, :8] > 100).all(axis=1)), lock=3
+    )
     frames = b"".join(bytes([101 + number]) * 8 + b"\r\n" for number in range(6))
     data = b"x" * (framing.most + 50) + b"\r\n" + frames
     for cut in range(1, len(data)):
