@@ -68,7 +68,7 @@ def compute(task: Task) -> Done:
             made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
             made |= {"code": provenance.code(stage), "notes": notes}
             if stage.source:  # the record alone would tell that this is a recording, until a dataset's manifest does
-                store.put(_manifest_of(task, stage, result).content)
+                store.put(_manifest_of(task, stage, result).content, durable=True)
             record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
             shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
             return Done(task.recording, record)

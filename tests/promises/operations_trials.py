@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import cli, execution, hashing, projects, upkeep
-from tacpipe.errors import DAMAGED
+from tacpipe.errors import DAMAGED, TacpipeError
 from tacpipe.store import Store
 from tests.promises.operations import Call, Shim
 from tests.promises.operations_cases import CASES, Case
@@ -231,7 +231,10 @@ def _wrong(ran: Ran) -> list[str]:
 
 
 def _unsound(where: str, store: Store) -> list[str]:
-    found = upkeep.verify(store)
+    try:
+        found = upkeep.verify(store)
+    except TacpipeError as error:  # it is a store no more
+        return [f"{where} is damaged: {error}"]
     return [] if found.clean else [f"{where} is damaged: {found.to_text()}"]
 
 
