@@ -194,6 +194,7 @@ except ImportError as error:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("call", "needed_by"),
     [('tacpipe.load("models/forward")', "forward"), ('tacpipe.open("data/split").to_torch()', "to_torch")],

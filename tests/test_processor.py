@@ -39,6 +39,7 @@ def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatc
     assert processor.here()["model"] and processor.here()["instructions"] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
     program = (

@@ -46,6 +46,7 @@ def refused(lab: Lab, folder: Path) -> str:
     return ran.err.removeprefix(said)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "output",
     ["{outside}/rec", "../rec", "sub/../../rec", "{project}/../rec", "link/rec", ".git/rec", "", "a\0b", 5, None],

@@ -40,6 +40,7 @@ def column(table: pa.Table, name: str) -> np.ndarray:
     return np.asarray(table.column(name).to_numpy() > 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "least"),
     [

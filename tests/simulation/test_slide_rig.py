@@ -54,6 +54,7 @@ def middle(sensor: str, index: int, rig: Rig, seed: int = 0) -> np.ndarray:
     return kept
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sensor", "least"), [("biotac", 1.0), ("roboskin", 0.95)])
 @pytest.mark.parametrize("speed_m_s", [0.0125, 0.025, 0.05])
 def test_the_dominant_peak_is_the_speed_over_the_wavelength_that_is_felt_most(

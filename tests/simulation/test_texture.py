@@ -67,6 +67,7 @@ def test_two_tracks_of_a_material_differ_and_the_same_numbers_give_the_same_trac
     np.testing.assert_array_equal(first, again)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sensor", "least"), [(0, 0.98), (1, 0.9)])
 @pytest.mark.parametrize("noise_scale", [0.0, 1.0])
 def test_known_spectra_tell_most_materials(sensor: int, least: float, noise_scale: float) -> None:

@@ -86,6 +86,7 @@ def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> Non
     assert abs(shares["among"].mean() - CHANCE_AMONG_HELD) <= margin(shares["among"], CHANCE_AMONG_HELD)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("spectra", SPECTRA)
 def test_each_sensor_names_what_it_was_told_whatever_the_other_feels(spectra: str) -> None:
     params = fitting("train.material", {}, architecture="spectra", baselines=False)

@@ -309,6 +309,7 @@ def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Shard) -> No
         slips(slips.params(on_sigma=1.0), shard({"": looked_at(np.ones(9))}))
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
 def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard: Shard) -> None:

@@ -188,6 +188,7 @@ def published() -> dict[str, Any]:
     return {name: ingest(ingest.params(), files) for name, files in found.items()}
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "biotac_slide_20_50").is_dir(), reason="the published recordings are not here")
 def test_in_published_slides_nothing_but_glitches_is_mended(published: dict[str, Any], shard: Shard) -> None:

@@ -248,6 +248,7 @@ def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shar
     assert "xela1_wrapped_channels" not in attributes
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
 def test_nothing_wraps_in_the_published_trials(shard: Shard) -> None:

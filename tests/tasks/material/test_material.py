@@ -129,6 +129,7 @@ def whole() -> dict[str, bytes]:
         return trained(Path(folder), **{**RAEC, "epochs": 12})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("calls", [1, 16, 34])
 def test_a_joint_run_killed_at_any_epoch_ends_with_the_same_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int

@@ -68,6 +68,7 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(changed: 
     assert one[WEIGHTS] != other[WEIGHTS]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "changed",
     [{**PATCHES, "networks": 2}, {**POINTNET, "together": False, "targets": "pdc_th,e_th", "rotation_deg": 45.0}],
