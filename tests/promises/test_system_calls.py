@@ -29,6 +29,7 @@ def nothing(lab: Lab) -> None:
 def emptied(lab: Lab) -> None:
     """Leave what was recorded, and nothing of tacpipe's."""
     shutil.rmtree(lab.folder / ".tacpipe")
+    (lab.folder / ".tacpipe").mkdir()
     shutil.rmtree(lab.folder / "data")
 
 
@@ -42,6 +43,7 @@ def pushed(lab: Lab) -> None:
     """Leave manifests alone, whose objects lie in another store."""
     lab.run("store push remote data/recordings")
     shutil.rmtree(lab.folder / ".tacpipe")
+    (lab.folder / ".tacpipe").mkdir()  # the project's mark
     for path in specimen.beneath(lab.folder / "data"):
         if path.parts[-2] != "recordings" or path.name != "manifest.json":
             path.unlink()
