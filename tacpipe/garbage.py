@@ -102,7 +102,7 @@ def _lasting(store: Store, name: str) -> bool:
         manifest = manifest_of.parse(store.read(name), name, verified=True)
     except MissingError:
         return False
-    return replacing.irreplaceable(manifest) or bool(manifest.labels)
+    return replacing.lasting(manifest)
 
 
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:

@@ -136,7 +136,7 @@ def lasting(store: Store, manifest: str) -> bool:
         found = manifest_of.parse(store.read(manifest), manifest, verified=True)
     except TacpipeError:
         return True
-    return replacing.irreplaceable(found) or bool(found.labels)
+    return replacing.lasting(found)
 
 
 def forget(store: Store, wanted: str, *, dry_run: bool = False) -> bool:

@@ -119,6 +119,11 @@ def irreplaceable(manifest: Manifest) -> bool:
     return manifest.stage == ACQUIRE or bool(manifest.sources)
 
 
+def lasting(manifest: Manifest) -> bool:
+    """Return whether a dataset holds recordings or labels set by hand, which no stage can compute again."""
+    return irreplaceable(manifest) or bool(manifest.labels)
+
+
 def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield what ``manifest`` holds that cannot be computed again, in a form in which manifests can be compared.
 
