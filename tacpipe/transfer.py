@@ -39,10 +39,10 @@ def remote_store(path: Path) -> Store:
         regular.content(store.root / "format", regular.BLOCK_BYTES, follow=False)
     except (FileNotFoundError, NotADirectoryError):
         raise UsageError(
-            f"{path} is no store: it has no file `format`. Give a directory that `store push` wrote."
+            f"{path} is not a store: it has no file `format`. Give a directory that `store push` wrote."
         ) from None
     except regular.IrregularError as error:
-        raise UsageError(f"{path} is no store: {error}") from None
+        raise UsageError(f"{path} is not a store: {error}") from None
     store.prepare()  # refuses one of another format
     return store
 

@@ -65,7 +65,7 @@ def _declared(option: str, name: str) -> str:
             return str(ipaddress.ip_address(sender))
     except ValueError:
         pass
-    raise UsageError(f"{name}: ?{plain(option)} is no sender; write ?sender=192.168.1.20, or ?sender={FIRST}.")
+    raise UsageError(f"{name}: ?{plain(option)} is not a sender; write ?sender=192.168.1.20, or ?sender={FIRST}.")
 
 
 def bound(host: str, port: int, name: str) -> socket.socket:

@@ -278,7 +278,7 @@ def test_a_flood_is_left_to_the_next_read() -> None:
     "option", ["sender=", "sender=host", "sender=1.2.3", "first", "port=4010", "sender=1.2.3.4:80"]
 )
 def test_a_sender_that_is_no_address_is_refused(option: str) -> None:
-    with pytest.raises(UsageError, match=r"is no sender; write \?sender=192\.168\.1\.20, or \?sender=first"):
+    with pytest.raises(UsageError, match=r"is not a sender; write \?sender=192\.168\.1\.20, or \?sender=first"):
         made(f"udp::{free_port()}?{option}", Quiet())
 
 

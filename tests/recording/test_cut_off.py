@@ -14,9 +14,8 @@ import pytest
 from tacpipe.recording import appending
 from tacpipe.recording.spool import Note, Spool, Spooled
 from tests.conftest import Lab
-from tests.recording import live
+from tests.recording import force_rig, live
 from tests.recording.scripted import Script
-from tests.recording.test_reading import frames
 from tests.recording.test_recovering import spooled
 from tests.recording.test_schedule import FORCE, RATE_HZ, counts
 from tests.test_garbage import age
@@ -25,10 +24,7 @@ from tests.test_garbage import age
 @pytest.fixture
 def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
     """A rig whose force sensor sends for 20 s."""
-    made = Script(monkeypatch)
-    made.send("force", frames(RATE_HZ * 20), RATE_HZ)
-    (lab.folder / "rig.toml").write_text(FORCE)
-    return made
+    return force_rig.sending(lab, monkeypatch, 20)
 
 
 def told(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:

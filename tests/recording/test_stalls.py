@@ -21,10 +21,10 @@ from tacpipe.recording.spool import Note, Spool, Spooled
 from tacpipe.recording.station import READ_S, Station
 from tacpipe.tables import to_parquet
 from tests.conftest import Lab
-from tests.recording import live
+from tests.recording import force_rig, live
 from tests.recording.scripted import Script
 from tests.recording.test_reading import frames
-from tests.recording.test_schedule import FORCE, RATE_HZ, counts
+from tests.recording.test_schedule import RATE_HZ, counts
 from tests.sensors import made
 
 MS, S = 1_000_000, 1_000_000_000
@@ -189,10 +189,7 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
 @pytest.fixture
 def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
     """A rig whose force sensor sends for 20 s."""
-    made_of = Script(monkeypatch)
-    made_of.send("force", frames(RATE_HZ * 20), RATE_HZ)
-    (lab.folder / "rig.toml").write_text(FORCE)
-    return made_of
+    return force_rig.sending(lab, monkeypatch, 20)
 
 
 def slow_to_finish(script: Script, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,11 +14,10 @@ import pytest
 
 from tacpipe.recording import spool
 from tests.conftest import Lab
-from tests.recording import live
+from tests.recording import force_rig, live
 from tests.recording.scripted import Script
-from tests.recording.test_reading import frames
 from tests.recording.test_recovering import spooled
-from tests.recording.test_schedule import FORCE, RATE_HZ
+from tests.recording.test_schedule import FORCE
 
 LONG_AGO_S = time.time() - 3600
 
@@ -95,10 +94,7 @@ def test_a_header_that_makes_no_sense_is_refused_with_what_is_wrong(lab: Lab, va
 @pytest.fixture
 def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
     """A rig whose force sensor sends for 5 s."""
-    made = Script(monkeypatch)
-    made.send("force", frames(RATE_HZ * 5), RATE_HZ)
-    (lab.folder / "rig.toml").write_text(FORCE)
-    return made
+    return force_rig.sending(lab, monkeypatch, 5)
 
 
 def _no_json(folder: Path) -> None:
