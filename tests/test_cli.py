@@ -45,7 +45,7 @@ def test_help_lists_every_command(lab: Lab) -> None:
         ("label data/r trial-000", 2, "Nothing to change"),
         ("label data/s trial-000 --set a=1", 2, "next run would undo"),
         ("explain nowhere", 2, "nowhere"),
-        ("store pull nowhere data/r", 2, "no store"),
+        ("store pull nowhere data/r", 2, "is not a store"),
     ],
 )
 def test_a_mistake_is_a_sentence_with_the_documented_code_and_leaves_nothing_behind(

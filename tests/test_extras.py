@@ -67,7 +67,7 @@ LACK = {  # and for each that does need one, with that extra
     "train forward data/segments --split data/split -o {o}": "learn",
     "train material data/slides --split data/slides-split -o {o}": "learn",
     "train touch data/grasps --split data/grasps-split -o {o}": "learn",
-    "evaluate models/forward data/latents -o {o}": "learn",
+    "evaluate models/forward data/latents --rerun -o {o}": "learn",
     "predict models/forward data/latents -o {o}": "learn",
     "report results/forward -o {o}.html --traces 1": "learn",
     "candidates bottle.ply": "clouds",
