@@ -92,9 +92,10 @@ test-power: $(VENV)/.dev ## replay a loss of power at each write on ext4, xfs an
 	fi
 	@TACPIPE_TEST_POWER=$(EVERY) $(PYTEST) tests/power
 
-lint: $(VENV)/.dev ## check style
+lint: $(VENV)/.dev ## check style, and that imports follow the layers
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/lint-imports --no-logo
 
 types: $(VENV)/.dev ## check types
 	@$(BIN)/mypy

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.stage import Recording, Trial, stage
+from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ class Long:
 
 
 @stage(version=1)
-def make(params: Long, trial: Trial) -> Recording:
+def make(params: Long, trial: Trial) -> RecordingOutput:
     """Make a recording in which every channel drifts under noise, as that of a magnetic skin."""
     import numpy as np
     import pyarrow as pa
@@ -30,7 +30,7 @@ def make(params: Long, trial: Trial) -> Recording:
     draw = np.random.default_rng(trial)
     t_ns = np.arange(params.rows, dtype=np.int64) * 10_000_000  # (time,)
     channels = {f"c{number:02d}": _channel(params, draw) for number in range(params.channels)}
-    return Recording(pa.table({"t_ns": t_ns, **channels}), {"trial": trial})
+    return RecordingOutput(pa.table({"t_ns": t_ns, **channels}), {"trial": trial})
 
 
 def _channel(params: Long, draw: np.random.Generator) -> np.ndarray:

@@ -23,11 +23,12 @@ import numpy as np
 import pyarrow as pa
 
 import tacpipe
+from tacpipe.cli.emulate import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import matching, rig_file
-from tacpipe.simulation.emulation.emulate_command import SWITCH_S
+from tacpipe.simulation.emulation import rig_file
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
+from tacpipe.testing import matching
 
 BIN = Path(sys.executable).parent
 TICKS = os.sysconf("SC_CLK_TCK")

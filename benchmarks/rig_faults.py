@@ -23,11 +23,12 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
-from tacpipe.simulation.emulation import byte_faults, matching, serving
+from tacpipe.simulation.emulation import byte_faults, serving
 from tacpipe.simulation.emulation.byte_faults import Faults, Item
 from tacpipe.simulation.emulation.emulator import UNPACED_HZ, Emulator, pace
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.transmission import Plan
+from tacpipe.testing import matching
 
 RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"
 USUAL = Faults(

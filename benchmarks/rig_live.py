@@ -20,11 +20,12 @@ from pathlib import Path
 import pyarrow as pa
 
 import tacpipe
+from tacpipe.cli.emulate import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import byte_faults, matching, rig_file
-from tacpipe.simulation.emulation.emulate_command import SWITCH_S
+from tacpipe.simulation.emulation import byte_faults, rig_file
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
+from tacpipe.testing import matching
 
 BIN = Path(sys.executable).parent
 RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import small_stages
-from tacpipe.tables import from_parquet, to_parquet
+from tacpipe.io.parquet import from_parquet, to_parquet
 
 source, target, count = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 target.mkdir(parents=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.stage import Recording, Trial, stage
+from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,14 @@ class Make:
 
 
 @stage(version=1)
-def make(params: Make, trial: Trial) -> Recording:
+def make(params: Make, trial: Trial) -> RecordingOutput:
     """Make a small table."""
     import numpy as np
     import pyarrow as pa
 
     t_ns = np.arange(params.rows, dtype=np.int64) * 10_000_000  # (time,)
     channels = {f"x{i}": ((t_ns // 10_000_000 + trial * i) % 4093).astype(np.uint16) for i in range(8)}
-    return Recording(pa.table({"t_ns": t_ns, **channels}), {"trial": trial})
+    return RecordingOutput(pa.table({"t_ns": t_ns, **channels}), {"trial": trial})
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Add:
 
 
 @stage(version=1)
-def add(params: Add, recording: Shard) -> pa.Table:
+def add(params: Add, recording: Recording) -> pa.Table:
     """Add a count to the first channel."""
     import pyarrow as pa
     import pyarrow.compute as pc

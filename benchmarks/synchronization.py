@@ -16,7 +16,7 @@ import pyarrow as pa
 import timing
 from numpy.typing import NDArray
 
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
 from tacpipe.signals import holds, resampling
 from tacpipe.signals.clocks import fit_clock
 

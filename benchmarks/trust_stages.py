@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import trust_steps
 
-from tacpipe.stage import Files, Result, stage
+from tacpipe.plugins.stage import Files, Result, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def load(params: Nothing, files: Files) -> pa.Table:
 
 
 @stage(version=1)
-def scale(params: Factor, recording: Shard) -> pa.Table:
+def scale(params: Factor, recording: Recording) -> pa.Table:
     """Scale a table."""
     import pyarrow as pa
 

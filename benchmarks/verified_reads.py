@@ -23,8 +23,8 @@ import run
 import timing
 
 import tacpipe
-from tacpipe.dataset import Dataset
-from tacpipe.store import locate
+from tacpipe.datasets.dataset import Dataset
+from tacpipe.store.store import locate
 
 BAR = 0.8
 SHARD_MB = 10

@@ -11,15 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from tacpipe.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.errors import UsageError
-from tacpipe.stage import stage
+from tacpipe.plugins.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed
+from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
-    from tacpipe.stage import Fitted, Result, Workspace
+    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.plugins.stage import Fitted, Result, Workspace
 
 Representation = Literal["levels", "increments"]
 
@@ -64,7 +64,7 @@ class AutoencoderParams:
 def fit(params: Params, train: Dataset) -> Result:
     """Return the principal components of the training recordings' rows in contact that no gap touches."""
     from tacpipe.codecs import pca, training_rows
-    from tacpipe.stage import Result
+    from tacpipe.plugins.stage import Result
 
     rows = training_rows.read(train.shards, params.of)
     codec = pca.fit_and_measure(rows, components=params.components, variance=params.variance, of=params.of)
@@ -75,7 +75,7 @@ def fit(params: Params, train: Dataset) -> Result:
 def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
     """Return the autoencoder trained on the training recordings' rows in contact that no gap touches."""
     from tacpipe.codecs import autoencoder_fit, training_rows
-    from tacpipe.stage import Result
+    from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
 
     tried = autoencoder_fit.networks(
@@ -95,7 +95,7 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
 
 
 @stage(version=2, fit=fit)
-def pca(params: Params, recording: Shard, codec: Fitted) -> pa.Table:
+def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
     """Add the principal components of the tactile channels as columns ``z00``, ``z01``, ….
 
     Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
@@ -104,7 +104,7 @@ def pca(params: Params, recording: Shard, codec: Fitted) -> pa.Table:
 
 
 @stage(version=1, fit=fit_autoencoder)
-def autoencoder(params: AutoencoderParams, recording: Shard, codec: Fitted) -> pa.Table:
+def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) -> pa.Table:
     """Add what an autoencoder makes of the tactile channels as columns ``z00``, ``z01``, ….
 
     Of the training recordings 15 % are held out to say when its training ends. Raises `TacpipeError` where the
@@ -113,19 +113,19 @@ def autoencoder(params: AutoencoderParams, recording: Shard, codec: Fitted) -> p
     return _encoded(recording, codec)
 
 
-def _encoded(recording: Shard, codec: Fitted) -> pa.Table:
+def _encoded(recording: Recording, codec: Fitted) -> pa.Table:
     """Return the recording's table with its latents."""
     import pyarrow as pa
 
     from tacpipe.codecs import codec as codecs
-    from tacpipe.codecs import stretches, tactile
+    from tacpipe.codecs import frame_stacking, stored, tactile
     from tacpipe.errors import TacpipeError
 
-    fitted, table = codecs.load(codec), recording.table()
+    fitted, table = stored.load(codec), recording.table()
     channels = tactile.columns(table.schema, "tactile")
     try:
         codecs.check_channels(fitted.channels, channels)
-        begins = stretches.breaks(tactile.times(table))
+        begins = frame_stacking.breaks(tactile.times(table))
         latents = fitted.encode(tactile.above_rest(table, channels), channels, begins)  # (time, latent)
     except TacpipeError as error:
         raise TacpipeError(f"{recording.name}: {error}") from error

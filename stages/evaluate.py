@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe import headline
-from tacpipe.stage import stage
+from tacpipe.metrics import headline
+from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
-    from tacpipe.stage import Result
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.plugins.stage import Result
 
     Model = Dataset
 
@@ -29,7 +29,7 @@ class Params:
 @stage(version=3, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Judge a model on recordings, by the measures of the task it was trained for."""
-    from tacpipe import model_files
+    from tacpipe.datasets import model_files
 
     task = model_files.task(model.files)
     with model_files.believed("the model"):

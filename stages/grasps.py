@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed
 from tacpipe.errors import TacpipeError
-from tacpipe.stage import Recording, stage
+from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed
+from tacpipe.plugins.stage import RecordingOutput, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
 FINISHED = ("cloud", "grasp")
 
@@ -45,7 +45,7 @@ class Params:
 
 
 @stage(version=2)
-def grasps(params: Params, recording: Shard) -> Recording:
+def grasps(params: Params, recording: Recording) -> RecordingOutput:
     """Find the grasped object in the camera's view, and what the fingers felt once they had closed on it.
 
     Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
@@ -59,7 +59,7 @@ def grasps(params: Params, recording: Shard) -> Recording:
 
     given = {name: recording.table(name) for name in recording.streams}
     if set(FINISHED) <= set(given) and "biotac_sp" not in given:
-        return Recording(given)
+        return RecordingOutput(given)
     missing = [name for name in ("scene", "grasp") if name not in given and not (name == "scene" and "cloud" in given)]
     if missing:
         raise TacpipeError(
@@ -90,15 +90,14 @@ def grasps(params: Params, recording: Shard) -> Recording:
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     kept = {name: table for name, table in given.items() if table.num_rows == 1 or name == "cloud"}
-    return Recording({**kept, **felt}, told)
+    return RecordingOutput({**kept, **felt}, told)
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     """Return the row that the fingers felt when they had closed, and when both first touched."""
     import numpy as np
 
-    from tacpipe import biotac_sp
-    from tacpipe.formats import channels
+    from tacpipe.channels import biotac_sp, schema
     from tacpipe.signals.contact_moment import Limits, contact_row, settled_rows
 
     fields = biotac_sp.fields()
@@ -123,4 +122,4 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
                 f"the grasp out."
             )
         felt.append(np.rint(np.nanmedian(values, keepdims=True)))
-    return channels.stream(t_ns[rows.start : rows.start + 1], felt, fields), int(t_ns[contact])
+    return schema.stream(t_ns[rows.start : rows.start + 1], felt, fields), int(t_ns[contact])

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from tacpipe.constraints import CommaList, PositiveInt
-from tacpipe.stage import stage
+from tacpipe.plugins.constraints import CommaList, PositiveInt
+from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
-    from tacpipe.stage import Result
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.plugins.stage import Result
 
     Model = Dataset
 
@@ -27,7 +27,7 @@ class Params:
 @stage(version=1)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     """Write what a model expects of each recording, with the time at which it was known."""
-    from tacpipe import model_files
+    from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))
     task = model_files.task(model.files)

@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.constraints import NonNegativeInt
-from tacpipe.stage import stage
+from tacpipe.plugins.constraints import NonNegativeInt
+from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
-    from tacpipe.stage import Result
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.plugins.stage import Result
 
     Datasets = tuple[Dataset, ...]
 
@@ -31,7 +31,7 @@ class Params:
 @stage(version=4)
 def report(params: Params, results: Datasets) -> Result:
     """Put results on one page: headline, figures, tables, and where every number comes from."""
+    from tacpipe.plugins.stage import Result
     from tacpipe.report import page
-    from tacpipe.stage import Result
 
     return Result(files={"report.html": page.render(results, title=params.title, traces=params.traces)})

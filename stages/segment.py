@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.params import added
-from tacpipe.stage import Attribute, Recording, stage
+from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tacpipe.plugins.params import added
+from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
     from tacpipe.signals.contact import Thresholds
 
 COUNT = "count"
@@ -64,7 +64,7 @@ class Params:
 
 
 @stage(version=2)
-def contacts(params: Params, recording: Shard) -> Recording:
+def contacts(params: Params, recording: Recording) -> RecordingOutput:
     """Mark the rows in which either finger touches something, numbered from 0 in ``contact``; -1 in all others.
 
     Each tactile channel's level without load is written into its field metadata ``rest``. Contact is told from the
@@ -76,8 +76,8 @@ def contacts(params: Params, recording: Shard) -> Recording:
     import numpy as np
     import pyarrow as pa
 
+    from tacpipe.io.parquet import with_metadata
     from tacpipe.signals.contact import Thresholds, contact_intervals, load, noise_thresholds, rest_level
-    from tacpipe.tables import with_metadata
 
     table = recording.table()
     t_ns = table.column("t_ns").to_numpy()  # (time,)
@@ -110,7 +110,7 @@ def contacts(params: Params, recording: Shard) -> Recording:
     largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
     notes = [] if len(intervals) else [_no_contact(params, units, limits, largest)]
     marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
-    return Recording(marked, _thresholds_told(units, limits), notes)
+    return RecordingOutput(marked, _thresholds_told(units, limits), notes)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class SlipParams:
 
 
 @stage(version=1)
-def slips(params: SlipParams, recording: Shard) -> pa.Table:
+def slips(params: SlipParams, recording: Recording) -> pa.Table:
     """Mark where the held object slips, and from where on it is dropped, by its distance from the wrist.
 
     Adds the labels ``slip``, told with all of the recording at hand, ``slip_online``, told from the rows so far, and
@@ -237,7 +237,7 @@ class SlideParams:
 
 
 @stage(version=1)
-def slides(params: SlideParams, recording: Shard) -> Recording:
+def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     """Cut a recording down to its slide, all of the same number of frames, with single wrong tactile readings mended.
 
     The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure goes
@@ -245,10 +245,10 @@ def slides(params: SlideParams, recording: Shard) -> Recording:
     its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
     ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
     """
-    from tacpipe import arm
-    from tacpipe.finger import finger, mended
+    from tacpipe.channels import arm
+    from tacpipe.channels.finger import finger, mended
+    from tacpipe.channels.streams import of_quantity, streams_of
     from tacpipe.signals import slides as found
-    from tacpipe.streams import of_quantity, streams_of
 
     streams = streams_of(recording)
     table = finger(recording.name, streams)
@@ -256,7 +256,7 @@ def slides(params: SlideParams, recording: Shard) -> Recording:
     table, spikes = mended(table, params.spike_frames, params.spike_deviations, params.spike_count)
     pressures = of_quantity(table, "static_pressure")
     if not pressures:
-        return Recording(
+        return RecordingOutput(
             {"slide": table}, {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
         )
     pressure = table.column(pressures[0]).to_numpy()
@@ -281,7 +281,7 @@ def slides(params: SlideParams, recording: Shard) -> Recording:
     tables = {"slide": table.slice(first, stop - first).combine_chunks()}
     if profile:
         tables["profile"] = arm.profile_table(t_ns, pressure, profile, found.phases(len(t_ns), slide))
-    return Recording(tables, attributes)
+    return RecordingOutput(tables, attributes)
 
 
 def _tared(tare: str, values: NDArray[Any], level: NDArray[np.float64], axes: int) -> NDArray[np.float64]:

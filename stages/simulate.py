@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
-from tacpipe.constraints import (
+from tacpipe.errors import UsageError
+from tacpipe.plugins.constraints import (
     CommaList,
     Fraction,
     NonNegativeFloat,
@@ -15,8 +16,7 @@ from tacpipe.constraints import (
     Range,
     Seed,
 )
-from tacpipe.errors import UsageError
-from tacpipe.stage import Recording, Trial, stage
+from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
 Families = Annotated[str, CommaList(Literal["all", "box", "cylinder", "sphere", "ellipsoid", "cone", "bow"], least=1)]
 
@@ -53,7 +53,7 @@ class Params:
 
 
 @stage(version=2)
-def forward(params: Params, trial: Trial) -> Recording:
+def forward(params: Params, trial: Trial) -> RecordingOutput:
     """Return one grasp-lift-move trial: xela1, xela2, robot, proximity and, with ground truth, truth."""
     from tacpipe.simulation.pick_and_move import Rig, simulate_trial
 
@@ -90,7 +90,7 @@ class MaterialParams:
 
 
 @stage(version=1)
-def material(params: MaterialParams, trial: Trial) -> Recording:
+def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
     """Return one slide of a BioTac or of RoboSkin over a material, and, with ground truth, truth."""
     from tacpipe.simulation.slide import Rig, simulate_trial
 
@@ -127,7 +127,7 @@ class TouchParams:
 
 
 @stage(version=2)
-def touch(params: TouchParams, trial: Trial) -> Recording:
+def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
     """Return one grasp of an object on a table: cloud, grasp, reading and, with ground truth, truth."""
     from tacpipe.simulation.grasp import simulate_trial
     from tacpipe.simulation.grasp_scene import Rig

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.constraints import Names, NonNegativeInt, PositiveInt, Range, Seed
 from tacpipe.errors import UsageError
-from tacpipe.stage import Recording, Result, stage
+from tacpipe.plugins.constraints import Names, NonNegativeInt, PositiveInt, Range, Seed
+from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tacpipe.dataset import Dataset
-    from tacpipe.stage import Roles
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.plugins.stage import Roles
 
 SHOWN = 5  # folds that a note lists before it counts the rest
 
@@ -114,7 +114,7 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
     """
     import pyarrow as pa
 
-    from tacpipe.splits import Scheme, assign, sufficient_val, without_val
+    from tacpipe.datasets.splits import Scheme, assign, sufficient_val, without_val
 
     values = asdict(params)
     scheme = Scheme(name=values.pop("scheme"), **values)
@@ -130,7 +130,7 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
         }
     )
     notes = [_note(bare, len({fold for _, fold in roles}), len(attributes), params.val, enough)] if bare else []
-    return Result(recordings={"split": Recording(table)}, notes=notes)
+    return Result(recordings={"split": RecordingOutput(table)}, notes=notes)
 
 
 def _note(bare: Sequence[int], folds: int, recordings: int, val: float, enough: float | None) -> str:

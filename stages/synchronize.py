@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.constraints import PositiveFloat, Rate
 from tacpipe.errors import TacpipeError
-from tacpipe.stage import Attribute, Recording, stage
+from tacpipe.plugins.constraints import PositiveFloat, Rate
+from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from tacpipe.columns import Columns
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
 
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
@@ -84,7 +84,7 @@ class _Stream:
 
 
 @stage(version=2, reads=("master",))
-def synchronize(params: Params, recording: Shard) -> Recording:
+def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     """Return one table on one clock, over the time that all streams cover, with masks of holds and gaps."""
     import pyarrow as pa
 
@@ -114,7 +114,7 @@ def synchronize(params: Params, recording: Shard) -> Recording:
             attributes |= stream.attributes
         stream.columns.forget()
     arrays = [pa.array(values, kind.type) for kind, values in columns]
-    return Recording(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
+    return RecordingOutput(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
 
 
 def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:
@@ -229,7 +229,7 @@ def _unwrapped(stream: _Stream) -> tuple[_Stream, int]:
     """Return the stream with the wrap-around of its tactile counts undone, and in how many channels there was any."""
     import pyarrow as pa
 
-    from tacpipe.signals.wraps import unwrapped
+    from tacpipe.signals.unwrap import unwrapped
 
     changed: dict[str, NDArray[np.int32]] = {}
     for kind in stream.columns.schema:

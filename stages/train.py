@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from tacpipe.constraints import (
+from tacpipe.errors import UsageError
+from tacpipe.plugins.constraints import (
     Assignments,
     CommaList,
     Names,
@@ -20,12 +21,11 @@ from tacpipe.constraints import (
     Range,
     Seed,
 )
-from tacpipe.errors import UsageError
-from tacpipe.stage import stage
+from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset, Model
-    from tacpipe.stage import Result, Workspace
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.plugins.stage import Result, Workspace
 
 Presets = Mapping[str, Mapping[str, object]]
 Dropout = Annotated[float, Range(0, below=1)]
@@ -100,8 +100,8 @@ def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace, 
     """
     from dataclasses import asdict
 
-    from tacpipe.stage import Result
-    from tacpipe.tasks import forward as task
+    from tacpipe.plugins.stage import Result
+    from tacpipe.tasks.forward import task
 
     return Result(files=task.train(asdict(params), train, val, workspace, init.files if init else None))
 
@@ -245,8 +245,8 @@ def material(
     """
     from dataclasses import asdict
 
-    from tacpipe.stage import Result
-    from tacpipe.tasks import material as task
+    from tacpipe.plugins.stage import Result
+    from tacpipe.tasks.material import task
 
     return Result(files=task.train(asdict(params), train, val, workspace, init.files if init else None))
 
@@ -352,7 +352,7 @@ def touch(params: TouchParams, train: Dataset, val: Dataset | None, workspace: W
     """Train a model that predicts touch before a grasp, from a point cloud and two contact points."""
     from dataclasses import asdict
 
-    from tacpipe.stage import Result
-    from tacpipe.tasks import touch as task
+    from tacpipe.plugins.stage import Result
+    from tacpipe.tasks.touch import task
 
     return Result(files=task.train(asdict(params), train, val, workspace))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.stage import Recording, Result, Stage, stage
+from tacpipe.plugins.stage import RecordingOutput, Result, Stage, stage
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
-__all__ = ["Recording", "Result", "Stage", "load", "open", "stage"]
+__all__ = ["RecordingOutput", "Result", "Stage", "load", "open", "stage"]
 
 
 def open(path: Any) -> Dataset:
     """Return the dataset whose directory or manifest is ``path``; shards are read and verified when asked for."""
-    from tacpipe.pipeline import open_dataset
+    from tacpipe.engine.pipeline import open_dataset
 
     return open_dataset(path)
 
@@ -27,7 +27,8 @@ def load(path: Any) -> Any:
     `tacpipe.tasks.material.classifier.Classifier` or a `tacpipe.tasks.touch.predictor.Predictor`, whose ``predict`` also
     reads arrays. Raises `UsageError` if ``path`` holds no model.
     """
-    from tacpipe import extras, model_files
+    from tacpipe.datasets import model_files
+    from tacpipe.plugins import extras
 
     model = open(path)
     with extras.named("A model"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from tacpipe import terminal
+from tacpipe import printable
 
 LONGEST_WORD = 250  # letters: more is no path or name that a person gave
 DONE, FAILED, USAGE, WOULD_CHANGE, DAMAGED, DEVICE, LOCKED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
@@ -20,7 +20,7 @@ class TacpipeError(Exception):
         text = super().__str__()
         if len(text) > LONGEST_WORD:
             text = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][:100]}…{word[0][-100:]}", text)
-        return terminal.lines(text.split("\n"))
+        return printable.lines(text.split("\n"))
 
 
 class UsageError(TacpipeError):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tacpipe import params as params_of
-from tacpipe import registry
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 
 
 def asked(name: str, preset: str | None = None, /, **options: Any) -> Any:

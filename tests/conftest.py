@@ -18,9 +18,10 @@ from types import FrameType
 import pytest
 from hypothesis import settings
 
-from tacpipe import cli, registry
-from tacpipe.manifest import Manifest, parse
-from tacpipe.store import Store
+from tacpipe.cli import main
+from tacpipe.datasets.manifest import Manifest, parse
+from tacpipe.plugins import registry
+from tacpipe.store.store import Store
 
 ENTRY_POINTS = """
 [tacpipe.stages]
@@ -139,7 +140,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     def run(command: str) -> Ran:
         capsys.readouterr()
         monkeypatch.setattr(sys, "argv", ["tacpipe", *shlex.split(command)])
-        code = cli.answer(sys.argv[1:])
+        code = main.answer(sys.argv[1:])
         out, err = capsys.readouterr()
         return Ran(code, out, err)
 
@@ -192,7 +193,7 @@ def forget() -> None:
 def tacpipe(folder: Path, command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a command in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "tacpipe.cli", *shlex.split(command)],
+        [sys.executable, "-m", "tacpipe", *shlex.split(command)],
         cwd=folder,
         env={**os.environ, **environment},
         capture_output=True,

@@ -31,7 +31,7 @@ def values_digest(path: Path) -> str:
     import numpy as np
 
     import tacpipe
-    from tacpipe.hashing import bytes_digest, digest
+    from tacpipe.io.hashing import bytes_digest, digest
 
     found: dict[str, Any] = {}
     for name, shard in tacpipe.open(path).shards.items():
@@ -50,7 +50,7 @@ def values_digest(path: Path) -> str:
 
 def current() -> dict[str, dict[str, Any]]:
     """Return version and digest of each stage as the code stands."""
-    from tacpipe import registry
+    from tacpipe.plugins import registry
     from tests.conftest import tacpipe
 
     with tempfile.TemporaryDirectory() as folder:

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
-from tacpipe import files as files_of
-from tacpipe import garbage, layout, upkeep
-from tacpipe.store import Store
+from tacpipe.io import files as files_of
+from tacpipe.maintenance import garbage, repair
+from tacpipe.store import layout
+from tacpipe.store.store import Store
 from tests.conftest import Lab
 from tests.test_garbage import age
 
@@ -47,7 +48,7 @@ def test_what_a_collection_removed_since_it_was_listed_is_not_damaged(
     collected: list[garbage.Collected] = []
     store = littered.store
     done = between(monkeypatch, folder, lambda: collected.append(garbage.collect(Store(store.root), dry_run=False)))
-    found = upkeep.verify(store)
+    found = repair.verify(store)
     gone = collected[0].objects if folder == "objects" else collected[0].records
     assert gone > 0 and done[0] - gone == (found.objects if folder == "objects" else found.records)
     assert found.clean and found.damaged == found.missing == []
@@ -57,7 +58,7 @@ def test_what_a_collection_has_moved_aside_is_sound(littered: Lab, monkeypatch: 
     store = littered.store
     path = next(layout.entries(store.root, "objects"))
     between(monkeypatch, "objects", lambda: path.rename(store.aside(path.name)))
-    assert upkeep.verify(store).clean
+    assert repair.verify(store).clean
 
 
 def test_what_was_damaged_once_and_is_collected_now_is_not_damaged_again(
@@ -67,7 +68,7 @@ def test_what_was_damaged_once_and_is_collected_now_is_not_damaged_again(
     path = next(layout.entries(store.root, "objects"))
     shutil.copy(path, store.root / "quarantine" / f"{path.name}.1")
     between(monkeypatch, "objects", path.unlink)
-    assert path.name not in upkeep.verify(store).damaged
+    assert path.name not in repair.verify(store).damaged
 
 
 def test_what_is_there_and_does_not_hash_to_its_name_is_damaged_beside_a_collection_too(
@@ -79,7 +80,7 @@ def test_what_is_there_and_does_not_hash_to_its_name_is_damaged_beside_a_collect
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     age(littered)
     between(monkeypatch, "objects", lambda: garbage.collect(Store(store.root), dry_run=False))
-    assert upkeep.verify(store).damaged == [path.name]
+    assert repair.verify(store).damaged == [path.name]
 
 
 def test_a_root_that_was_forgotten_since_it_was_listed_is_not_damaged(
@@ -93,21 +94,21 @@ def test_a_root_that_was_forgotten_since_it_was_listed_is_not_damaged(
         return honest(file)
 
     monkeypatch.setattr(store.roots, "at", at)
-    assert upkeep.verify(store).clean
+    assert repair.verify(store).clean
 
 
 def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_missing(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest = upkeep._wanted
+    honest = repair._wanted
     looks: list[dict[str, str]] = []
 
     def wanted(store: Store) -> dict[str, str]:
         looks.append(honest(store))
         return {**looks[-1], **({"ab" * 32: "manifest.json"} if len(looks) == 1 else {})}
 
-    monkeypatch.setattr(upkeep, "_wanted", wanted)
-    assert upkeep.verify(littered.store).clean and len(looks) == 2
+    monkeypatch.setattr(repair, "_wanted", wanted)
+    assert repair.verify(littered.store).clean and len(looks) == 2
 
 
 def test_a_status_beside_a_collection_counts_what_it_still_finds(
@@ -128,9 +129,9 @@ def test_a_status_beside_a_collection_counts_what_it_still_finds(
                 gone[-1].unlink()
             yield place, folders, files
 
-    before = upkeep.status(store)
-    monkeypatch.setattr(upkeep, "walk", walk)
-    found = upkeep.status(store)
+    before = repair.status(store)
+    monkeypatch.setattr(repair, "walk", walk)
+    found = repair.status(store)
     assert draft in gone and len(gone) == 2
     assert found["tmp"]["files"] == 0 < found["objects"]["files"] < before["objects"]["files"]
 

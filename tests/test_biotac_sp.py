@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 
 
 def test_electrodes_lie_on_the_pad_and_mirror_each_other() -> None:

@@ -11,8 +11,8 @@ import pytest
 
 import tacpipe
 from tacpipe import errors as tacpipe_errors
-from tacpipe import upkeep
-from tacpipe.store import Store
+from tacpipe.maintenance import repair
+from tacpipe.store.store import Store
 from tests import chain
 from tests.conftest import Lab, Ran, sample_data
 
@@ -99,7 +99,7 @@ def test_an_empty_clone_pulls_a_model_and_its_data_and_evaluates(
     done = lab.call("evaluate models/forward data/latents --split data/split -o results/forward")
     assert done.code == 0, done.err
     assert metrics(clone) == metrics(lab.folder)
-    assert upkeep.verify(Store(clone / ".tacpipe")).clean
+    assert repair.verify(Store(clone / ".tacpipe")).clean
 
 
 def test_a_model_can_begin_with_another_and_remembers_what_that_has_seen(lab: Lab) -> None:
@@ -228,7 +228,7 @@ def test_training_that_was_killed_resumes_and_ends_with_the_same_weights(
         if b'"train.forward"' in path.read_bytes() and b'"seed": 5' in path.read_bytes():
             path.unlink()
     script = (
-        "import os, sys; from tacpipe.training import checkpoint; from tacpipe import cli;"
+        "import os, sys; from tacpipe.training import checkpoint; from tacpipe.cli import main as cli;"
         f"sys.argv = ['tacpipe', *'{train} -o models/again'.split()];"
         "honest = checkpoint.write\n"
         "def write(*given, **named):\n    honest(*given, **named); os._exit(9)\n"

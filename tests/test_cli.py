@@ -3,8 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import commands, registry
-from tacpipe.manifest import parse
+from tacpipe.cli import commands
+from tacpipe.datasets.manifest import parse
+from tacpipe.plugins import registry
 from tests.conftest import Lab
 
 COMMANDS = [*(name.replace(".", " ") for name in registry.stages()), *commands.NAMES]

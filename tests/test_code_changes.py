@@ -15,7 +15,7 @@ STAGES = '''
 
 from __future__ import annotations
 from dataclasses import dataclass
-from tacpipe.stage import Recording, stage
+from tacpipe import RecordingOutput, stage
 
 
 @dataclass(frozen=True)
@@ -25,21 +25,21 @@ class Params:
 
 
 @stage(version=1)
-def made(params: Params, trial: Trial) -> Recording:
+def made(params: Params, trial: Trial) -> RecordingOutput:
     """Return three numbers."""
     import pyarrow as pa
 
-    return Recording({"left": pa.table({"x": [trial, 2, 3]})})
+    return RecordingOutput({"left": pa.table({"x": [trial, 2, 3]})})
 
 
 @stage(version=1)
-def times(params: Params, recording: Shard) -> Recording:
+def times(params: Params, recording: Recording) -> RecordingOutput:
     """Return the numbers, multiplied."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     table = recording.table("left")
-    return Recording(pa.table({"x": pc.multiply(table["x"], params.factor)}), notes=NOTES)
+    return RecordingOutput(pa.table({"x": pc.multiply(table["x"], params.factor)}), notes=NOTES)
 
 
 @stage(version=1)
@@ -120,7 +120,8 @@ def test_new_recordings_do_not_hide_that_others_are_of_older_code(own: Path) -> 
 
 
 def test_a_change_of_a_built_in_stage_is_not_named_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    from tacpipe import provenance, registry
+    from tacpipe.engine import provenance
+    from tacpipe.plugins import registry
 
     stage = registry.load("split")
     assert provenance.code(stage) is not None  # of a checkout
@@ -218,7 +219,7 @@ def test_a_recording_that_lost_a_stream_is_one_object_with_the_error_in_it(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("rig.toml").write_text('[[stream]]\nname = "f"\nsensor = "pulse"\ntransport = "serial:/dev/ttyACM0"\n')
-    monkeypatch.setattr("tacpipe.acquire_command._record", lambda *given, **more: ([], ["f was lost."]))
+    monkeypatch.setattr("tacpipe.cli.acquire._record", lambda *given, **more: ([], ["f was lost."]))
     failed = lab.call("acquire rig.toml -o rec --json")
     value = json.loads(failed.out)
     assert failed.code == value["exit_code"] == 5 and value["error"].endswith("f was lost.")
@@ -261,8 +262,8 @@ def test_an_address_is_refused_wherever_a_path_is_wanted_and_no_folder_is_made(l
 
 def test_an_address_is_refused_as_the_store_and_from_python(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     import tacpipe as library
-    from tacpipe import transfer
     from tacpipe.errors import UsageError
+    from tacpipe.maintenance import transfer
 
     lab.run("simulate toy -o data/r")
     with pytest.raises(UsageError, match="s3://bucket/r is an address"):

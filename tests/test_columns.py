@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.columns import Columns
 from tacpipe.errors import DamagedError
-from tacpipe.tables import from_parquet, to_parquet
+from tacpipe.io.columns import Columns
+from tacpipe.io.parquet import from_parquet, to_parquet
 from tests.any_table import bits, tables
 
 

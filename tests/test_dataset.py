@@ -19,12 +19,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe import directory
+from tacpipe.datasets import directory
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import UsageError
-from tacpipe.hashing import bytes_digest
-from tacpipe.manifest import Manifest
-from tacpipe.store import Store
-from tacpipe.tables import to_parquet
+from tacpipe.io.hashing import bytes_digest
+from tacpipe.io.parquet import to_parquet
+from tacpipe.store.store import Store
 from tests.any_table import bits, tables
 
 drawn = settings(

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import cli, commands, registry
+from tacpipe.cli import commands, main
+from tacpipe.plugins import registry
 from tests.conftest import Lab, tacpipe
 
 ROOT = Path(__file__).parents[1]
@@ -74,7 +75,7 @@ def test_every_stage_has_a_summary_that_is_a_sentence(name: str) -> None:
 
 
 def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> None:
-    told = {**cli.SUMMARIES, **commands.SUMMARIES}
+    told = {**main.SUMMARIES, **commands.SUMMARIES}
 
     assert set(commands.NAMES) <= set(commands.SUMMARIES)
     assert {name.partition(".")[0] for name in BUILT_IN if "." in name} <= set(told)

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 import tacpipe
-from tacpipe import registry
+from tacpipe.plugins import registry
 from tests.conftest import Lab, made_once
 
 HERE = Path(__file__).parents[1]

@@ -11,20 +11,20 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pytest
 
-from tacpipe import fields, registry
-from tacpipe import params as params_of
 from tacpipe.clouds.normalisation import NORMALISATIONS
 from tacpipe.codecs.autoencoder_fit import FRAMES, MOST
-from tacpipe.constraints import CommaList, Range
+from tacpipe.datasets.splits import SCHEMES
 from tacpipe.errors import UsageError
 from tacpipe.models.forecasts import ARCHITECTURES
 from tacpipe.models.patches import BACKBONES
 from tacpipe.models.pointnet import HEADS
 from tacpipe.models.recurrent_autoencoder import DECODERS
+from tacpipe.plugins import fields, registry
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins.constraints import CommaList, Range
 from tacpipe.simulation.household import FAMILIES, MODULI_PA
 from tacpipe.simulation.slide import SPECTRA
 from tacpipe.simulation.trajectory import PROTOCOLS
-from tacpipe.splits import SCHEMES
 from tacpipe.tasks.forward.rows import ACTIONS
 from tacpipe.tasks.material.pairs import EVERY, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
@@ -305,8 +305,8 @@ PLUGIN = '''
 from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
-from tacpipe.constraints import PositiveInt, Range
-from tacpipe.stage import stage
+from tacpipe.plugins.constraints import PositiveInt, Range
+from tacpipe import stage
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from typing import Any
 
 import pytest
 
-from tacpipe import commands, extras, registry
+from tacpipe.cli import commands
 from tacpipe.errors import MissingModuleError
+from tacpipe.plugins import extras, registry
 from tests import without_extras
 from tests.clouds import shapes
 from tests.conftest import Lab, forget, tacpipe
@@ -279,10 +280,10 @@ def test_a_module_that_a_plug_in_needs_is_named_with_its_package(lab: Lab, monke
     )
     points = "[tacpipe.stages]\nlate = late_stages:late\nearly = early_stages:early\n"
     (folder / "other_stages-1.egg-info" / "entry_points.txt").write_text(points)
-    stage = "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom tacpipe.stage import stage\n"
+    stage = "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom tacpipe import stage\n"
     stage += "@dataclass(frozen=True)\nclass Params:\n    pass\n@stage(version=1)\n"
     (folder / "late_stages.py").write_text(
-        f"{stage}def late(params: Params, recording: Shard) -> Table:\n    import rarely_there\n"
+        f"{stage}def late(params: Params, recording: Recording) -> Table:\n    import rarely_there\n"
     )
     (folder / "early_stages.py").write_text("import rarely_there\n")
     monkeypatch.syspath_prepend(folder)

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe import garbage, upkeep
-from tacpipe.hashing import bytes_digest
-from tacpipe.store import Store
+from tacpipe.io.hashing import bytes_digest
+from tacpipe.maintenance import garbage, repair
+from tacpipe.store.store import Store
 from tests.conftest import Lab
 from tests.test_pipeline import counts, replace_stream
 
@@ -59,7 +59,7 @@ def test_what_an_output_held_before_is_removed_and_a_dry_run_only_counts(lab: La
     dry = collected(lab, "--dry-run")
     assert dry["objects"] == 4  # a manifest and three shards: three times two is two times three, and stays
     assert collected(lab) == {**dry, "drafts": dry["drafts"]}
-    assert upkeep.verify(lab.store).clean
+    assert repair.verify(lab.store).clean
     assert counts(lab.run("scale data/r -o data/s --factor 3 --json").out) == (0, 4)
     ran, reused = counts(lab.run("scale data/r -o data/s --factor 2 --json").out)
     assert ran + reused == 4 and ran >= 3
@@ -131,7 +131,7 @@ def test_what_a_killed_collection_had_moved_aside_is_found_and_put_back(lab: Lab
     age(lab)
     collected(lab)
     assert all(Path(store.object_path(name)).exists() for name in names)
-    assert upkeep.verify(store).clean
+    assert repair.verify(store).clean
 
 
 def test_nothing_is_removed_while_a_manifest_that_something_descends_from_is_damaged(lab: Lab) -> None:
@@ -256,7 +256,7 @@ def test_what_git_brought_back_to_a_path_is_live_though_the_root_names_another(l
     age(lab)
     collected(lab)
     assert tacpipe.open("data/s").to_numpy()["trial-001"].values[1].tolist() == [4]
-    assert upkeep.verify(lab.store).clean
+    assert repair.verify(lab.store).clean
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -293,6 +293,6 @@ def test_leases_of_killed_processes_are_swept_up_and_those_of_others_stay(lab: L
 def test_two_collections_do_not_run_at_once(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tacpipe.leases._try_lock", lambda path: None)
+        patch.setattr("tacpipe.store.leases._try_lock", lambda path: None)
         failed = lab.call("store gc")
     assert failed.code == 6

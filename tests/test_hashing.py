@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe import hashing
 from tacpipe.errors import TacpipeError
-from tacpipe.hashing import bytes_digest, canonical, digest, file_digest, remembered_file_digest
+from tacpipe.io import hashing
+from tacpipe.io.hashing import bytes_digest, canonical, digest, file_digest, remembered_file_digest
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),

@@ -7,8 +7,8 @@ import math
 
 import pytest
 
-from tacpipe import headline
-from tacpipe.headline import Headline, Row
+from tacpipe.metrics import headline
+from tacpipe.metrics.headline import Headline, Row
 
 ONE = Headline(
     "forward",

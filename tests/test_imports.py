@@ -12,7 +12,7 @@ from tests import chain
 HEAVY = {"torch", "pyarrow", "pandas", "sklearn", "open3d", "numpy", "scipy", "matplotlib"}
 PROBE = """
 import json, sys
-from tacpipe import cli
+from tacpipe.cli import main as cli
 sys.argv = ["tacpipe", *sys.argv[1:]]
 try:
     cli.main()

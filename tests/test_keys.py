@@ -14,12 +14,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tacpipe import keys
-from tacpipe import params as params_of
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.engine import keys
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.hashing import canonical, digest
-from tacpipe.manifest import Manifest
-from tacpipe.stage import Stage, stage
+from tacpipe.io.hashing import canonical, digest
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins.stage import Stage, stage
 from tests.conftest import Lab
 
 numbers = st.integers(-(2**80), 2**80) | st.floats(allow_nan=False, allow_infinity=False)

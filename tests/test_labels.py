@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.overview import SHOWN
-from tacpipe.store import Store
+from tacpipe.cli.show import SHOWN
+from tacpipe.store.store import Store
 from tests.conftest import Lab
 
 MANY = SHOWN + 10

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import directory, layout
+from tacpipe.datasets import directory
 from tacpipe.errors import StorageError, UsageError
-from tacpipe.hashing import bytes_digest
+from tacpipe.io.hashing import bytes_digest
 from tacpipe.recording import spool
-from tacpipe.store import Store
+from tacpipe.store import layout
+from tacpipe.store.store import Store
 from tests.conftest import Lab, Ran
 from tests.test_garbage import age
 

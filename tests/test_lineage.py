@@ -10,7 +10,7 @@ def explained(lab: Lab, path: str) -> dict[str, object]:
 
 
 def test_the_lineage_goes_down_to_the_raw_files(lab: Lab) -> None:
-    from tacpipe.hashing import file_digest
+    from tacpipe.io.hashing import file_digest
 
     Path("src").mkdir()
     Path("src/a.txt").write_text("1 2 3")

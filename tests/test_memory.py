@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tacpipe import memory
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
-from tacpipe.tables import from_parquet, to_parquet
+from tacpipe.io import memory
+from tacpipe.io.parquet import from_parquet, to_parquet
 from tests.conftest import Lab
 
 
@@ -88,7 +88,7 @@ def test_a_recording_that_memory_does_not_hold_is_no_bad_recording(lab: Lab, mon
 def test_a_limit_of_address_space_is_answered_by_one_sentence(lab: Lab, command: str, megabytes: int) -> None:
     lab.run("simulate toy -o data/r --trials 9")
     ran = subprocess.run(
-        [sys.executable, "-m", "tacpipe.cli", *command.split()],
+        [sys.executable, "-m", "tacpipe", *command.split()],
         cwd=lab.folder,
         capture_output=True,
         text=True,

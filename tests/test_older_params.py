@@ -9,11 +9,13 @@ from typing import Any
 
 import pytest
 
-from tacpipe import params as params_of
-from tacpipe import registry
 from tacpipe.errors import TacpipeError
-from tacpipe.hashing import digest
-from tacpipe.tasks import forward, material, touch
+from tacpipe.io.hashing import digest
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.material import task as material
+from tacpipe.tasks.touch import task as touch
 from tests.asked import asked
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward import trials

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe import headline
+from tacpipe.metrics import headline
 from tests import chain
 from tests.conftest import tacpipe
 from tests.test_imports import HEAVY, imported
@@ -75,7 +75,7 @@ def test_a_result_is_shown_by_its_headline_its_baselines_and_what_it_rests_on(la
 
 
 def test_a_result_of_before_headlines_says_so() -> None:
-    from tacpipe import model_overview
+    from tacpipe.cli import model_overview
 
     value: dict[str, Any] = {
         "headline": None,

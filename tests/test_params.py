@@ -4,10 +4,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
 
-from tacpipe import params as params_of
-from tacpipe.constraints import Range
 from tacpipe.errors import UsageError
-from tacpipe.stage import Stage, stage
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins.constraints import Range
+from tacpipe.plugins.stage import Stage, stage
 
 
 @dataclass(frozen=True)

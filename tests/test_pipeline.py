@@ -7,12 +7,13 @@ import pyarrow as pa
 import pytest
 
 import tacpipe
-from tacpipe import directory, processor
-from tacpipe.dataset import Shard
-from tacpipe.execution import named
-from tacpipe.hashing import digest, file_digest
-from tacpipe.manifest import Manifest
-from tacpipe.tables import to_parquet
+from tacpipe.datasets import directory
+from tacpipe.datasets.dataset import Recording
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.engine import processor
+from tacpipe.io.hashing import digest, file_digest
+from tacpipe.io.parquet import to_parquet
+from tacpipe.store.records import named
 from tests.conftest import Lab
 
 
@@ -290,7 +291,7 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
     assert lab.call("scale data/r -o data/s --recompute-and-compare").code == 0
     honest = toy_stages.scale.function
 
-    def changed(params: toy_stages.Scale, recording: "Shard") -> pa.Table:
+    def changed(params: toy_stages.Scale, recording: "Recording") -> pa.Table:
         return honest(toy_stages.Scale(3), recording)
 
     monkeypatch.setitem(toy_stages.scale.__dict__, "function", changed)
@@ -312,7 +313,7 @@ def test_a_difference_to_what_another_processor_or_number_of_threads_computed_na
     assert same.code == 0 and "977" not in same.err
     honest = toy_stages.scale.function
 
-    def changed(params: toy_stages.Scale, recording: "Shard") -> pa.Table:
+    def changed(params: toy_stages.Scale, recording: "Recording") -> pa.Table:
         return honest(toy_stages.Scale(3), recording)
 
     monkeypatch.setitem(toy_stages.scale.__dict__, "function", changed)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import processor, provenance
+from tacpipe.engine import processor, provenance
 
 CPUINFO = """processor\t: 0
 model name\t: Zen 4
@@ -43,7 +43,8 @@ def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
     program = (
-        "from tacpipe import processor; before = processor.threads(); import torch; print(before, processor.threads())"
+        "from tacpipe.engine import processor; before = processor.threads(); import torch;"
+        "print(before, processor.threads())"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import registry
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins import registry
 from tests.conftest import Lab, forget
 
 
@@ -18,7 +18,7 @@ def test_the_names_are_those_that_importlib_finds() -> None:
 
 @pytest.mark.parametrize("name", sorted(registry.stages()))
 def test_every_built_in_stage_loads_and_has_a_summary_and_help_for_each_param(name: str) -> None:
-    from tacpipe import params
+    from tacpipe.plugins import params
 
     found = registry.load(name)
     assert found.version >= 1

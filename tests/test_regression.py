@@ -13,8 +13,9 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 from sklearn import metrics as sklearn_metrics
 
-from tacpipe import biotac_sp, regression
+from tacpipe.channels import biotac_sp
 from tacpipe.errors import TacpipeError
+from tacpipe.metrics import regression
 
 PRINTED = {  # normalised RMSE and device units, test and novel objects (RA-L 2020, Figures 10 and 11)
     "pdc_th": ((0.05496, 49), (0.08289, 74)),

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import memory, regular
 from tacpipe.errors import StorageError
+from tacpipe.io import memory, regular
 from tests.promises.limits import GIB, bounded, is_sentence
 
 TERA = 3 * 10**12

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import tacpipe
-from tacpipe.hashing import bytes_digest
+from tacpipe.io.hashing import bytes_digest
 from tests.conftest import Lab
 from tests.test_garbage import age
 from tests.test_pipeline import counts
@@ -120,9 +120,10 @@ def test_an_output_within_a_dataset_or_around_one_is_refused(lab: Lab) -> None:
 
 
 def test_a_page_does_not_replace_a_file_that_tacpipe_did_not_write(lab: Lab, tmp_path: Path) -> None:
-    from tacpipe import output, replacing
+    from tacpipe.datasets import replacing
+    from tacpipe.engine import output
+    from tacpipe.engine.request import Request
     from tacpipe.errors import UsageError
-    from tacpipe.request import Request
 
     Path("notes.html").write_text("mine")
     plan = replacing.Plan("report", 1)
@@ -144,12 +145,13 @@ def test_an_emulated_rig_file_does_not_replace_another_one(lab: Lab) -> None:
 def test_a_file_is_replaced_only_by_the_command_that_writes_such_files(
     tmp_path: Path, before: str, refused: bool
 ) -> None:
-    from tacpipe import candidates_command, replacing
+    from tacpipe.cli import candidates
+    from tacpipe.datasets import replacing
     from tacpipe.errors import UsageError
 
     (tmp_path / "grasps.csv").write_text(before)
     with pytest.raises(UsageError) if refused else contextlib.nullcontext():
-        replacing.refuse_foreign(tmp_path / "grasps.csv", candidates_command.HEADER.encode())
+        replacing.refuse_foreign(tmp_path / "grasps.csv", candidates.HEADER.encode())
 
 
 # ---- recordings that are ingested one after another

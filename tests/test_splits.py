@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tacpipe.datasets.splits import Roles, Scheme, assign
 from tacpipe.errors import TacpipeError
-from tacpipe.splits import Roles, Scheme, assign
 
 OBJECTS = ("4", "10", "bottle")
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import LockedError, TacpipeError
-from tacpipe.hashing import bytes_digest, digest
-from tacpipe.store import MissingError, Store, locate, project
+from tacpipe.io.hashing import bytes_digest, digest
+from tacpipe.store.store import MissingError, Store, locate, project
 
 IDENTITY = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
 EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.streams import of_quantity, signal, streams_of
+from tacpipe.channels.streams import of_quantity, signal, streams_of
 
 
 @dataclass
-class Shard:
+class Recording:
     """A recording without a store."""
 
     tables: Mapping[str, pa.Table]
@@ -33,7 +33,7 @@ def table(**columns: tuple[list[Any], dict[str, str]]) -> pa.Table:
 
 
 def streams(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
-    return streams_of(Shard(tables))  # type: ignore[arg-type]
+    return streams_of(Recording(tables))  # type: ignore[arg-type]
 
 
 TIME = ([10, 20], {"quantity": "time"})

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import DamagedError
-from tacpipe.tables import from_parquet, owned, to_parquet, with_metadata
+from tacpipe.io.parquet import from_parquet, owned, to_parquet, with_metadata
 from tests.any_table import bits, tables
 
 drawn = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])

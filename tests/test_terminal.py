@@ -15,8 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe import terminal
+from tacpipe import printable
 from tacpipe.errors import TacpipeError
+from tacpipe.io import terminal
 from tests.conftest import Lab
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202etxt.exe\x7f\r\nforged: line"
@@ -29,15 +30,15 @@ def harmless(text: str) -> bool:
 
 @given(st.text())
 def test_what_is_shown_has_no_character_that_a_terminal_obeys_and_is_one_line(text: str) -> None:
-    assert harmless(terminal.shown(text))
-    assert "\n" not in terminal.shown(text)
+    assert harmless(printable.shown(text))
+    assert "\n" not in printable.shown(text)
     assert harmless(str(TacpipeError(text)))
-    assert terminal.shown(terminal.shown(text)) == terminal.shown(text)
+    assert printable.shown(printable.shown(text)) == printable.shown(text)
 
 
 @pytest.mark.parametrize("text", ["trial-木", "Prüfling Ø 5", "木\u3000材", "😀", "back\\slash"])
 def test_what_people_write_is_shown_as_it_is(text: str) -> None:
-    assert terminal.shown(text) == text
+    assert printable.shown(text) == text
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def test_nothing_is_printed_but_by_the_terminal() -> None:
 
 
 def redirected(lab: Lab, command: str, redirections: str) -> subprocess.CompletedProcess[str]:
-    words = f'"{sys.executable}" -m tacpipe.cli {command} {redirections}'
+    words = f'"{sys.executable}" -m tacpipe {command} {redirections}'
     return subprocess.run(["sh", "-c", words], cwd=lab.folder, capture_output=True, text=True, check=False)
 
 

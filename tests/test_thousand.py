@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import tacpipe
-from tacpipe import directory
-from tacpipe.manifest import Manifest
-from tacpipe.store import Store
+from tacpipe.datasets import directory
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.store.store import Store
 from tests.conftest import tacpipe as command
 
 MANY = [pytest.param(100, marks=pytest.mark.long), pytest.param(1000, marks=pytest.mark.faults)]

@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 
 import tacpipe
-from tacpipe import projects, regular, upkeep
-from tacpipe.hashing import digest as values_digest
-from tacpipe.roots import HISTORY
-from tacpipe.store import MissingError, Store
+from tacpipe.io import regular
+from tacpipe.io.hashing import digest as values_digest
+from tacpipe.maintenance import repair
+from tacpipe.store import projects
+from tacpipe.store.roots import HISTORY
+from tacpipe.store.store import MissingError, Store
 from tests.conftest import Lab
 from tests.test_pipeline import counts
 
@@ -40,7 +42,7 @@ def test_an_empty_clone_pulls_what_was_pushed_and_works_on_it(lab: Lab, clone: P
     assert Path("data/c/manifest.json").read_bytes() == wanted
     assert counts(lab.run("centre data/s --split data/split -o data/again --json").out) == (0, 4)
     assert Path("data/again/manifest.json").read_bytes() == wanted
-    assert upkeep.verify(Store(clone / ".tacpipe")).clean
+    assert repair.verify(Store(clone / ".tacpipe")).clean
 
 
 def test_a_manifest_that_git_brought_is_enough_to_pull(lab: Lab, clone: Path) -> None:
@@ -139,7 +141,7 @@ def test_two_projects_push_the_same_path_and_each_pulls_its_own(two: Lab, monkey
         shutil.rmtree(".tacpipe/objects")
         two.run("store pull ../remote data/r")
         assert Path("data/r/manifest.json").read_bytes() == contents[name]
-        assert upkeep.verify(Store(".tacpipe")).clean
+        assert repair.verify(Store(".tacpipe")).clean
 
 
 def test_another_projects_dataset_is_pulled_by_its_name_which_the_refusal_gives(
@@ -384,7 +386,7 @@ def test_a_push_that_verifies_replaces_what_has_other_bytes_there(
     assert json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)["replaced"] == 0
     assert "replaced 1 that were damaged there" in lab.run(f"store push {remote_of(lab)} data/s --verify").out
     assert path.read_bytes() == content
-    assert upkeep.verify(Store(remote_of(lab))).clean
+    assert repair.verify(Store(remote_of(lab))).clean
 
 
 def test_an_object_of_many_blocks_goes_over_without_being_held_in_memory(

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import regular
 from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.library import open3d
+from tacpipe.clouds.ply_points import parsed as parsed_ply
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.ply import parsed as parsed_ply
+from tacpipe.io import regular
 
 TEXT = (".pts", ".xyz", ".xyzn", ".xyzrgb")  # a line a point
 SUFFIXES = (".pcd", ".ply", *TEXT)
@@ -50,7 +50,7 @@ def require_metres(path: Path, cloud: Cloud) -> None:
 
 
 def _pcd(path: Path) -> Cloud:
-    from tacpipe.formats import pcd
+    from tacpipe.clouds import pcd
 
     content = regular.content(path)
     header = pcd.read_header(path, content)

@@ -96,7 +96,7 @@ class Grasp:
         """
         import pyarrow as pa
 
-        from tacpipe.formats import channels
+        from tacpipe.channels import schema as channels
 
         fields = [channels.float_field(name, "m", "position", name[3]) for name in POINTS]
         values = [*self.g1_m, *self.g2_m]

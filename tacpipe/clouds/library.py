@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from tacpipe import extras
+from tacpipe.plugins import extras
 
 
 @contextmanager

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import extras
 from tacpipe.clouds.candidates import Candidate
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.files import readable_errors, write_whole
+from tacpipe.io.files import readable_errors, write_whole
+from tacpipe.plugins import extras
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tacpipe import regular
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt
+from tacpipe.io import regular
+from tacpipe.printable import excerpt
 
 SIZES = {  # bytes of a scalar property
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),

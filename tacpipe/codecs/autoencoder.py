@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
-from tacpipe import model_files
-from tacpipe.codecs import measures, stretches
+from tacpipe.codecs import frame_stacking, measures
 from tacpipe.codecs.codec import (
     DESCRIPTION,
     TENSORS,
@@ -25,6 +24,7 @@ from tacpipe.codecs.codec import (
     encode_finite,
     latent_names,
 )
+from tacpipe.datasets import model_files
 
 if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
@@ -45,7 +45,7 @@ class Autoencoder:
     encoder: Layers
     decoder: Layers
     frames: int = 1  # rows in a row that it reads
-    of: str = stretches.LEVELS
+    of: str = frame_stacking.LEVELS
     measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "autoencoder"
 
@@ -60,7 +60,7 @@ class Autoencoder:
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        inputs = stretches.inputs(values, begins, self.of, self.frames)
+        inputs = frame_stacking.inputs(values, begins, self.of, self.frames)
         return encode_finite(self.project, inputs, len(self.latents))
 
     def project(self, inputs: Floats) -> Floats:

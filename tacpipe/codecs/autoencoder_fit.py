@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tacpipe.codecs import measures, stretches
+from tacpipe.codecs import frame_stacking, measures
 from tacpipe.codecs.autoencoder import Autoencoder, scaled
 from tacpipe.codecs.standard import standard
 from tacpipe.codecs.training_rows import TrainingRows
@@ -83,7 +83,7 @@ def fit(
     workspace: Path,
     *,
     components: int,
-    of: str = stretches.LEVELS,
+    of: str = frame_stacking.LEVELS,
 ) -> Autoencoder:
     """Return the codec of ``components`` latents whose network, of those ``tried``, gives held-out rows back best.
 
@@ -165,7 +165,7 @@ def _trained(
         return loop.Part(len(rows), loss)
 
     return loop.train(
-        lambda: _Mirrored(widths, bias=of == stretches.LEVELS),
+        lambda: _Mirrored(widths, bias=of == frame_stacking.LEVELS),
         loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace,

@@ -9,18 +9,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from tacpipe import model_files
-from tacpipe.codecs.stretches import INCREMENTS, LEVELS
+from tacpipe.codecs.frame_stacking import INCREMENTS, LEVELS
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt
 
 if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
     Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 DESCRIPTION, TENSORS = "codec.json", "codec.safetensors"
-KINDS = ("autoencoder", "pca")
-NEEDED = {"of": str, "channels": list, "layout": list}
 
 
 class Codec(Protocol):
@@ -124,45 +120,3 @@ def latent_names(count: int) -> tuple[str, ...]:
 def description(content: Mapping[str, Any]) -> bytes:
     """Return the bytes of ``codec.json``: keys sorted, so that one codec has one content."""
     return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
-
-
-def load(files: Mapping[str, bytes]) -> Codec:
-    """Return the codec that `codec.json` and `codec.safetensors` among ``files`` hold.
-
-    Raises `TacpipeError` where a file is missing or the kind is unknown.
-    """
-    missing = [name for name in (DESCRIPTION, TENSORS) if name not in files]
-    if missing:
-        raise TacpipeError(f"There is no {' and no '.join(missing)} here. Give the output of `tacpipe compress`.")
-    kind = model_files.tree(files, DESCRIPTION, {"kind": str})["kind"]
-    if kind in KINDS:
-        model_files.tree(files, DESCRIPTION, NEEDED)
-    if kind == "pca":
-        from tacpipe.codecs.pca import PCA
-
-        return _tried(lambda: PCA.from_files(files))
-    if kind == "autoencoder":
-        from tacpipe.codecs.autoencoder import Autoencoder
-
-        return _tried(lambda: Autoencoder.from_files(files))
-    raise TacpipeError(
-        f"A codec of kind {excerpt(kind)} is unknown here; {' and '.join(KINDS)} are known. "
-        f"Install the plug-in that made it."
-    )
-
-
-def _tried(read: Callable[[], Codec]) -> Codec:
-    """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` where they do not."""
-    with model_files.believed("the codec"), np.errstate(all="ignore"):
-        codec = read()
-        if codec.of not in (LEVELS, INCREMENTS) or not all(isinstance(name, str) for name in codec.channels):
-            raise ValueError(f"it is of {codec.of} and of {len(codec.channels)} channels")
-        if len(codec.layout) != len(codec.channels) or not all(isinstance(one, Mapping) for one in codec.layout):
-            raise ValueError(f"{len(codec.channels)} channels lie in {len(codec.layout)} places")
-        row = np.zeros((1, len(codec.channels)))
-        latents = codec.encode(row, codec.channels)
-        if latents.shape != (1, len(codec.latents)) or codec.decode(latents).shape != row.shape:
-            raise ValueError(f"{row.shape[1]} channels become {latents.shape[1]} latents and others")
-        if not np.isfinite(latents).all():
-            raise ValueError("its numbers are so large that latents are not finite")
-    return codec

@@ -26,7 +26,7 @@ DIGITS = 6  # that are told; beyond them the order of additions shows, which the
 
 
 class Fitted(Protocol):
-    """A codec that reads rows as `tacpipe.codecs.stretches.inputs` makes them."""
+    """A codec that reads rows as `tacpipe.codecs.frame_stacking.inputs` makes them."""
 
     @property
     def scale_count(self) -> Floats:

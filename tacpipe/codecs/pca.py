@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
-from tacpipe import model_files
-from tacpipe.codecs import measures, stretches
+from tacpipe.codecs import frame_stacking, measures
 from tacpipe.codecs.codec import (
     DESCRIPTION,
     TENSORS,
@@ -27,6 +26,7 @@ from tacpipe.codecs.codec import (
 )
 from tacpipe.codecs.standard import standard
 from tacpipe.codecs.training_rows import TrainingRows
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class PCA:
     scale_count: Floats  # (channel,)
     components: Floats  # (latent, channel)
     explained_ratio: Floats  # (component,), of all components, kept or not
-    of: str = stretches.LEVELS
+    of: str = frame_stacking.LEVELS
     measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "pca"
 
@@ -59,7 +59,7 @@ class PCA:
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        return encode_finite(self.project, stretches.inputs(values, begins, self.of, 1), len(self.components))
+        return encode_finite(self.project, frame_stacking.inputs(values, begins, self.of, 1), len(self.components))
 
     def project(self, inputs: Floats) -> Floats:
         """Return the latents (row, latent) of finite rows (row, channel), levels or increments as ``of`` says."""
@@ -111,7 +111,7 @@ def fit(
     *,
     components: int = 20,
     variance: float = 0.0,
-    of: str = stretches.LEVELS,
+    of: str = frame_stacking.LEVELS,
 ) -> PCA:
     """Return the codec fitted on ``inputs``, shape (row, channel), counts above rest or increments as ``of`` says.
 
@@ -145,7 +145,7 @@ def fit(
 
 
 def fit_and_measure(
-    rows: TrainingRows, *, components: int = 20, variance: float = 0.0, of: str = stretches.LEVELS
+    rows: TrainingRows, *, components: int = 20, variance: float = 0.0, of: str = frame_stacking.LEVELS
 ) -> PCA:
     """Return the codec fitted on ``rows`` of all recordings, with its measures.
 

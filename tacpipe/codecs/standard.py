@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.codecs.stretches import LEVELS
+from tacpipe.codecs.frame_stacking import LEVELS
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:

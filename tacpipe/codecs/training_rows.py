@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe import splits
-from tacpipe.codecs import standard, stretches, tactile
+from tacpipe.codecs import frame_stacking, standard, tactile
 from tacpipe.codecs.codec import check_channels
+from tacpipe.datasets import splits
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
@@ -57,14 +57,14 @@ class TrainingRows:
         return np.concatenate([np.zeros((0, width)), *(self.inputs[name] for name in sorted(names))])
 
 
-def read(shards: Mapping[str, Shard], of: str, frames: int = 1) -> TrainingRows:
+def read(shards: Mapping[str, Recording], of: str, frames: int = 1) -> TrainingRows:
     """Return the rows of recordings that a codec ``of`` levels or increments of some ``frames`` is fitted on.
 
     A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Warns of
     channels that never move while others do. Raises `TacpipeError` where there is no recording or no tactile channel,
     and naming the recording whose channels are others.
     """
-    stretches.check(of)
+    frame_stacking.check(of)
     if not shards:
         raise TacpipeError("There is no training recording to fit a codec on. Make a split that has some.")
     channels: tuple[str, ...] | None = None
@@ -91,7 +91,7 @@ def _usable(table: pa.Table, channels: tuple[str, ...], of: str, frames: int) ->
     """Return the rows (row, frames * channel) of a recording that a codec may be fitted on."""
     counts = tactile.above_rest(table, channels)
     counts[tactile.gaps(table)] = np.nan  # what is made of such a row is not finite either
-    made = stretches.inputs(counts, stretches.breaks(tactile.times(table)), of, frames)
+    made = frame_stacking.inputs(counts, frame_stacking.breaks(tactile.times(table)), of, frames)
     usable = np.isfinite(made).all(axis=1)
     if "contact" in table.column_names:
         usable &= table.column("contact").to_numpy() >= 0

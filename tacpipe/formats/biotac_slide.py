@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.files import walk
 from tacpipe.formats.folders import Params
-from tacpipe.stage import Files, Recording, stage
+from tacpipe.io.files import walk
+from tacpipe.plugins.stage import Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -74,7 +74,7 @@ def recording_name(material: int, trial: int) -> str:
 
 
 @stage(version=2, discover=discover)
-def biotac_slide(params: Params, files: Files) -> Recording:
+def biotac_slide(params: Params, files: Files) -> RecordingOutput:
     """Return the stream biotac of a slide, and those of the arm that are there; angular velocity that is NaN stays so."""
     from tacpipe.formats import published, xela
 
@@ -93,7 +93,7 @@ def biotac_slide(params: Params, files: Files) -> Recording:
     marked = published.mark("biotac-slide", begin[0].as_py() if len(begin) else 0)
     # all published slides of a material were recorded in a row; of others nobody says so
     session = {"session": f"biotac-m{material:02d}"} if marked else {}
-    return Recording(
+    return RecordingOutput(
         streams,
         {
             "sensor": "biotac",
@@ -111,27 +111,27 @@ def _finger(path: Path) -> pa.Table:
     """Return the stream of the finger: 44 columns of uint16 counts as they were written, spikes included."""
     import pyarrow as pa
 
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
     from tacpipe.formats.csv_table import read_csv
 
     names = ["tdc", "tac", "pdc"]
-    names += [f"pac{reading}" for reading in range(1, channels.VIBRATIONS + 1)]
-    names += [f"ele{electrode}" for electrode in range(1, channels.ELECTRODES + 1)]
+    names += [f"pac{reading}" for reading in range(1, schema.VIBRATIONS + 1)]
+    names += [f"ele{electrode}" for electrode in range(1, schema.ELECTRODES + 1)]
     table = read_csv(path, names, integers=pa.uint16(), trailing_comma=True, seconds="timestamp")
-    return _stream(path, table, channels.biotac_fields())
+    return _stream(path, table, schema.biotac_fields())
 
 
 def _arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
     from tacpipe.formats.csv_table import read_csv
 
-    angles, speeds = channels.joint_fields()
+    angles, speeds = schema.joint_fields()
     fields = {
-        "pose": channels.pose_fields(),
-        "twist": channels.twist_fields(),
-        "wrench": channels.wrench_fields(),
+        "pose": schema.pose_fields(),
+        "twist": schema.twist_fields(),
+        "wrench": schema.wrench_fields(),
         "joint_position": angles,
-        "joint_torque": channels.joint_torque_fields(),
+        "joint_torque": schema.joint_torque_fields(),
         "joint_velocity": speeds,
     }[stream]
     return _stream(path, read_csv(path, columns, allow_nan=stream == "twist", seconds="timestamp"), fields)
@@ -142,7 +142,7 @@ def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
     import numpy as np
     import pyarrow as pa
 
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
     from tacpipe.formats.csv_table import file_row
 
     t_ns = table.column("t_ns").to_numpy()
@@ -153,4 +153,4 @@ def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
             f"{path}, row {file_row(path, row)}: the timestamp is {(t_ns[row] - t_ns[row - 1]) / 1e6:g} ms after the one "
             f"before; it must be later. Put the rows in order or leave the slide out."
         )
-    return pa.Table.from_arrays(table.columns, schema=pa.schema([channels.time_field(), *fields]))
+    return pa.Table.from_arrays(table.columns, schema=pa.schema([schema.time_field(), *fields]))

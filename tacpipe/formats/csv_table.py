@@ -24,10 +24,10 @@ import pyarrow as pa
 import pyarrow.csv as pc
 from numpy.typing import NDArray
 
-from tacpipe import regular
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt, listed, plain
-from tacpipe.tables import owned
+from tacpipe.io import regular
+from tacpipe.io.parquet import owned
+from tacpipe.printable import excerpt, listed, plain
 
 _STAMP = re.compile(r"\s*\d{1,10}(\.\d{1,9})?\s*")
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)

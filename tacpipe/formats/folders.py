@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tacpipe import recording_names
+from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError
-from tacpipe.files import walk
-from tacpipe.stage import Files
+from tacpipe.io.files import walk
+from tacpipe.plugins.stage import Files
 
 PREFIX = "data_sample_"
 
@@ -75,5 +75,5 @@ def text(name: str) -> str:
 
 
 def valid(name: str) -> str:
-    """Return a folder's name as that of a recording (`tacpipe.recording_names.valid`), without the prefix of trials."""
+    """Return a folder's name as that of a recording (`recording_names.valid`), without the prefix of trials."""
     return recording_names.valid(name.removeprefix(PREFIX) or name) or "trial"

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from tacpipe.origin import PUBLISHED
-from tacpipe.stage import Attribute
+from tacpipe.datasets.origin import PUBLISHED
+from tacpipe.plugins.stage import Attribute
 
 MONTHS = {  # first and last month (UTC) in which a set was recorded, by format; one without stamps is known by its layout
     "biotac-slide": ("2020-02", "2020-02"),

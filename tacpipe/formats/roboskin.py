@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe import regular
-from tacpipe.constraints import Rate
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt, plain
-from tacpipe.files import walk
-from tacpipe.stage import Attribute, Files, Recording, stage
+from tacpipe.io import regular
+from tacpipe.io.files import walk
+from tacpipe.plugins.constraints import Rate
+from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
+from tacpipe.printable import excerpt, plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,11 +83,12 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 
 @stage(version=2, discover=discover)
-def roboskin(params: Params, files: Files) -> Recording:
+def roboskin(params: Params, files: Files) -> RecordingOutput:
     """Return the stream roboskin of a slide: 60 columns, triangle by triangle, one row a frame; stamps are made."""
     import numpy as np
 
-    from tacpipe.formats import channels, published
+    from tacpipe.channels import schema
+    from tacpipe.formats import published
     from tacpipe.signals.resampling import uniform_grid
     from tacpipe.signals.scrambling import scramble
 
@@ -99,8 +100,8 @@ def roboskin(params: Params, files: Files) -> Recording:
     t_ns = uniform_grid(0, round((frames - 1) * 1e9 / params.rate_hz), params.rate_hz)
     columns = np.reshape(slide, (-1, frames))
     material = _label(block, labels, place) + 1
-    return Recording(
-        {"roboskin": channels.stream(t_ns, columns, channels.roboskin_fields(), MADE)},
+    return RecordingOutput(
+        {"roboskin": schema.stream(t_ns, columns, schema.roboskin_fields(), MADE)},
         {
             "sensor": "roboskin",
             "material": material,
@@ -179,7 +180,7 @@ def _felt(path: Path, place: int) -> NDArray[np.float32]:
     """
     import numpy as np
 
-    from tacpipe.formats.channels import TRIANGLE_TAXELS, TRIANGLES
+    from tacpipe.channels.schema import TRIANGLE_TAXELS, TRIANGLES
     from tacpipe.signals.axes import is_time, lag_one
     from tacpipe.signals.scrambling import unscramble
 

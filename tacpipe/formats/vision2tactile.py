@@ -15,14 +15,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe import recording_names, regular
-from tacpipe.constraints import NonNegativeFloat
+from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import plain
-from tacpipe.files import walk
 from tacpipe.formats.folders import require, text, valid
-from tacpipe.hashing import remembered_file_digest
-from tacpipe.stage import Files, Recording, stage
+from tacpipe.io import regular
+from tacpipe.io.files import walk
+from tacpipe.io.hashing import remembered_file_digest
+from tacpipe.plugins.constraints import NonNegativeFloat
+from tacpipe.plugins.stage import Files, RecordingOutput, stage
+from tacpipe.printable import plain
 
 if TYPE_CHECKING:
     from tacpipe.clouds.cloud import Cloud
@@ -74,13 +75,14 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 
 @stage(version=2, discover=discover)
-def vision2tactile(params: Params, files: Files) -> Recording:
+def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     """Return the streams cloud, grasp and reading of a grasp; one with the reading of an earlier one is marked."""
     import numpy as np
 
-    from tacpipe import biotac_sp
+    from tacpipe.channels import biotac_sp, schema
+    from tacpipe.clouds import pcd
     from tacpipe.clouds.files import require_metres
-    from tacpipe.formats import channels, pcd, published
+    from tacpipe.formats import published
 
     own = {Path(name).name: path for name, path in files.items() if not name.startswith(TWIN)}
     label, time_s, _ = next(name for name in files if not name.startswith(TWIN)).split("/")
@@ -94,9 +96,9 @@ def vision2tactile(params: Params, files: Files) -> Recording:
     require_metres(own[CLOUD], cloud)
     _check_distance(own[GRASP], cloud, grasp, params.beside_mm)
     t_ns = int(time_s) * 10**9
-    reading = channels.stream(np.array([t_ns]), [[value] for value in _reading(own[READING])], biotac_sp.fields())
+    reading = schema.stream(np.array([t_ns]), [[value] for value in _reading(own[READING])], biotac_sp.fields())
     twins = [name.removeprefix(TWIN) for name in files if name.startswith(TWIN)]
-    return Recording(
+    return RecordingOutput(
         {"cloud": cloud.table(), "grasp": grasp.table(t_ns), "reading": reading},
         {
             "sensor": "biotac-sp",

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt
-from tacpipe.formats import channels
-from tacpipe.stage import Attribute
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import excerpt
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,7 +31,7 @@ def read_uskin(path: Path) -> list[NDArray[np.uint16]]:
 
     from tacpipe.formats.csv_table import read_csv
 
-    names = [f"txl{taxel}_{axis}" for taxel in range(1, channels.TAXELS + 1) for axis in channels.AXES]
+    names = [f"txl{taxel}_{axis}" for taxel in range(1, schema.TAXELS + 1) for axis in schema.AXES]
     table = read_csv(path, names, integers=pa.uint16())
     return [table.column(name).to_numpy() for name in names]
 
@@ -49,8 +49,8 @@ def read_marker(path: Path, name: str) -> tuple[NDArray[np.float64], float]:
 
     Raises `TacpipeError`, naming file and row, where the quaternion has not length 1.
     """
-    columns = [f"{name}_position_{axis}" for axis in channels.AXES]
-    pose = read_floats(path, columns + [f"{name}_quaternion_{part}" for part in channels.COMPONENTS])
+    columns = [f"{name}_position_{axis}" for axis in schema.AXES]
+    pose = read_floats(path, columns + [f"{name}_quaternion_{part}" for part in schema.COMPONENTS])
     unseen = (pose == UNSEEN).all(axis=1)
     pose[unseen] = np.nan
     require_unit(path, pose[:, 3:], f"{name}_quaternion")
@@ -135,8 +135,8 @@ def tactile_streams(
     columns: Mapping[str, Sequence[NDArray[np.uint16]]], t_ns: NDArray[np.int64], made: str | None
 ) -> dict[str, pa.Table]:
     """Return the tables of the sensors by stream name."""
-    fields = channels.uskin_fields()
-    return {name: channels.stream(t_ns[: len(found[0])], found, fields, made) for name, found in columns.items()}
+    fields = schema.uskin_fields()
+    return {name: schema.stream(t_ns[: len(found[0])], found, fields, made) for name, found in columns.items()}
 
 
 def authors_role(role: str) -> dict[str, Attribute]:

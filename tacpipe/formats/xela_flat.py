@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.formats.folders import Params, trials
-from tacpipe.stage import Files, Recording, stage
+from tacpipe.plugins.stage import Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,11 +26,12 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 
 @stage(version=2, discover=discover)
-def xela_flat(params: Params, files: Files) -> Recording:
+def xela_flat(params: Params, files: Files) -> RecordingOutput:
     """Return the streams xela1, xela2, robot, marker1 and marker2 of a trial; an unseen marker is NaN."""
     import numpy as np
 
-    from tacpipe.formats import channels, folders, published, xela
+    from tacpipe.channels import schema
+    from tacpipe.formats import folders, published, xela
     from tacpipe.signals.resampling import uniform_grid
 
     trial = folders.require(files, NAMES)
@@ -43,8 +44,8 @@ def xela_flat(params: Params, files: Files) -> Recording:
         [f"position_{joint}" for joint in joints]
         + ["position_panda_finger"]
         + [f"velocity_{joint}" for joint in joints]
-        + [f"ee_state_position_{axis}" for axis in channels.AXES]
-        + [f"ee_state_orientation_{part}" for part in channels.COMPONENTS],
+        + [f"ee_state_position_{axis}" for axis in schema.AXES]
+        + [f"ee_state_orientation_{part}" for part in schema.COMPONENTS],
     )  # (time, 22)
     xela.require_unit(files[ROBOT], robot[:, -4:], "ee_state_orientation")
     markers = {name: xela.read_marker(files[MARKER], name) for name in ("marker1", "marker2")}
@@ -55,14 +56,14 @@ def xela_flat(params: Params, files: Files) -> Recording:
 
     last_ns = round((rows["xela_sensor1.csv"] - 1) * 1e9 / rate_hz)
     t_ns = np.int64(meta.utc_ns("start_time")) + uniform_grid(0, last_ns, rate_hz)
-    angles, speeds = channels.joint_fields()
-    finger = channels.float_field("finger_m", "m", "finger_width")
-    fields = [*angles, finger, *speeds, *channels.pose_fields()]
+    angles, speeds = schema.joint_fields()
+    finger = schema.float_field("finger_m", "m", "finger_width")
+    fields = [*angles, finger, *speeds, *schema.pose_fields()]
     streams: dict[str, pa.Table] = xela.tactile_streams(tactile, t_ns, MADE)
-    streams["robot"] = channels.stream(t_ns[: len(robot)], robot.T, fields, MADE)
+    streams["robot"] = schema.stream(t_ns[: len(robot)], robot.T, fields, MADE)
     for name, (pose, _) in markers.items():
-        streams[name] = channels.stream(t_ns[: len(pose)], pose.T, channels.pose_fields(), MADE)
-    return Recording(
+        streams[name] = schema.stream(t_ns[: len(pose)], pose.T, schema.pose_fields(), MADE)
+    return RecordingOutput(
         streams,
         {
             "sensor": "xela-uskin",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.folders import Params, trials
-from tacpipe.stage import Files, Recording, stage
+from tacpipe.plugins.stage import Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,12 +28,13 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 
 @stage(version=1, discover=discover)
-def xela_psc(params: Params, files: Files) -> Recording:
+def xela_psc(params: Params, files: Files) -> RecordingOutput:
     """Return the streams xela1, xela2, robot, marker and slip of a trial; an unseen marker is NaN."""
     import numpy as np
     import pyarrow as pa
 
-    from tacpipe.formats import channels, folders, xela
+    from tacpipe.channels import schema
+    from tacpipe.formats import folders, xela
     from tacpipe.formats.csv_table import read_csv
     from tacpipe.signals.holds import mean_rate_hz
 
@@ -51,20 +52,20 @@ def xela_psc(params: Params, files: Files) -> Recording:
     xela.check_rows(trial, rows, ROBOT, missing_allowed=1)
 
     t_ns = np.int64(meta.utc_ns("start_time")) + _stamps_ns(files[ROBOT], robot[:, -1])
-    angles, speeds = channels.joint_fields()
+    angles, speeds = schema.joint_fields()
     planned = [
-        channels.float_field(f"commanded_velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in channels.AXES[:2]
+        schema.float_field(f"commanded_velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in schema.AXES[:2]
     ]
     streams: dict[str, Any] = xela.tactile_streams(tactile, t_ns, None)
-    streams["robot"] = channels.stream(
-        t_ns, [*robot[:, :14].T, *pose.T, *robot[:, 14:16].T], [*angles, *speeds, *channels.pose_fields(), *planned]
+    streams["robot"] = schema.stream(
+        t_ns, [*robot[:, :14].T, *pose.T, *robot[:, 14:16].T], [*angles, *speeds, *schema.pose_fields(), *planned]
     )
-    streams["marker"] = channels.stream(t_ns[: len(marker)], marker.T, channels.pose_fields())
+    streams["marker"] = schema.stream(t_ns[: len(marker)], marker.T, schema.pose_fields())
     marks = [labels.column(name).to_numpy() for name in labels.column_names]
     _require_flags(files[LABELS], labels.column_names, marks)
-    fields = [channels.label_field(name) for name in labels.column_names]
-    streams["slip"] = channels.stream(t_ns[: labels.num_rows], marks, fields)
-    return Recording(
+    fields = [schema.label_field(name) for name in labels.column_names]
+    streams["slip"] = schema.stream(t_ns[: labels.num_rows], marks, fields)
+    return RecordingOutput(
         streams,
         {
             "sensor": "xela-uskin",

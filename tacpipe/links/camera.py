@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe import extras
 from tacpipe.clouds.depth_frame import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links.opened import Arrived, Opened
+from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
 PAUSE_S = 0.002  # between looks for a frame; at the fastest they are 11 ms apart

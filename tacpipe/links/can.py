@@ -8,12 +8,12 @@ import termios
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import extras
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.files import listed
+from tacpipe.io.files import listed
 from tacpipe.links import serial_port
 from tacpipe.links.arrival import Arrivals
 from tacpipe.links.opened import Arrived, Opened
+from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.excerpt import excerpt
+from tacpipe.printable import excerpt
 
 SCHEMES = {
     "serial": "serial:/dev/ttyACM0",

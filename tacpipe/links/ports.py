@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe import extras, files
 from tacpipe.errors import DeviceError, MissingModuleError
+from tacpipe.io import files
+from tacpipe.plugins import extras
 
 BY_ID = Path("/dev/serial/by-id")
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe import params, registry
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import params, registry
 from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor

@@ -10,10 +10,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe import extras
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import holders, ports
 from tacpipe.links.opened import Arrived, Descriptor
+from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Line, Sensor
 
 if TYPE_CHECKING:

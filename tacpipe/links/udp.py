@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.excerpt import plain
 from tacpipe.links import holders, network
 from tacpipe.links.arrival import Arrivals
 from tacpipe.links.link import LinkLostError
 from tacpipe.links.opened import Arrived, Descriptor
+from tacpipe.printable import plain
 from tacpipe.sensors.sensor import Sensor
 
 MOST = 1 << 16  # bytes of the largest datagram

@@ -7,10 +7,10 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from tacpipe import extras
 from tacpipe.errors import DeviceError
 from tacpipe.links import network
 from tacpipe.links.opened import Arrived, Opened
+from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:

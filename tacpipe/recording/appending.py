@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from tacpipe import directory, provenance
-from tacpipe import manifest as manifest_of
+from tacpipe.datasets import directory
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
+from tacpipe.engine import provenance
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.excerpt import plain
-from tacpipe.manifest import ACQUIRE, Entry, Manifest
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import plain
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
 from tacpipe.recording.spool import Spooled
-from tacpipe.stage import Attribute
-from tacpipe.store import Object, Store
+from tacpipe.store.store import Object, Store
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -143,7 +144,7 @@ def _free(wanted: str, taken: Mapping[str, Any]) -> str:
 
 
 def _shard(store: Store, stream: str, table: pa.Table) -> dict[str, Any]:
-    from tacpipe.tables import to_parquet
+    from tacpipe.io.parquet import to_parquet
 
     stored: Object = store.put(to_parquet(table), durable=True)
     if not _same(store.read(stored.digest), table):
@@ -155,7 +156,7 @@ def _same(content: bytes, written: pa.Table) -> bool:
     """Return whether a shard's bytes hold a table to the bit, NaN equal to itself; a column at a time, to save memory."""
     import pyarrow as pa
 
-    from tacpipe.tables import from_parquet
+    from tacpipe.io.parquet import from_parquet
 
     for kind in written.schema:
         read = from_parquet(content, [kind.name])

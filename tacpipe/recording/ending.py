@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tacpipe.excerpt import plain
+from tacpipe.printable import plain
 
 COMPLETED, INTERRUPTED, RECOVERED = "completed", "interrupted", "recovered"  # values of the attribute `ended`
 REASONS = {

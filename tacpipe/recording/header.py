@@ -13,11 +13,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tacpipe import manifest, store
+from tacpipe.datasets import manifest
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt
-from tacpipe.roots import BESIDE_NAME
-from tacpipe.store import Store
+from tacpipe.printable import excerpt
+from tacpipe.store import store
+from tacpipe.store.roots import BESIDE_NAME
+from tacpipe.store.store import Store
 
 FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files beside the recordings
 MOST_NS = 1 << 62  # of the readings of a clock

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 from tacpipe.errors import DeviceError
-from tacpipe.recording import clock, stranger
+from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import STALL_NS
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Note, Spool
@@ -176,7 +176,7 @@ class Recorder:
             return str(station.error)
         if watch.error:
             return f"Stream {name} ({station.stream.address}): {watch.error}"
-        return stranger.sentence(
+        return silence_diagnosis.sentence(
             station.stream, f"a frame of {station.stream.kind} was awaited for {FIRST_S:g} s", watch.heard
         )
 

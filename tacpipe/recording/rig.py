@@ -22,12 +22,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import params, registry, regular
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.excerpt import excerpt, plain
+from tacpipe.io import regular
 from tacpipe.links import link
+from tacpipe.plugins import params, registry
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import excerpt, plain
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.stage import Attribute
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TAKEN = ("events", "truth")  # streams that a recording has beside those of its sensors

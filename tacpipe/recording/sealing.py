@@ -185,10 +185,10 @@ def table(
     """Return batches as the table of a stream with these stamps (sample,), and how uncertain they are where any is."""
     import pyarrow as pa
 
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
 
     columns: list[tuple[pa.Field, Any]] = []
-    columns.append((channels.time_field(), t_ns))
+    columns.append((schema.time_field(), t_ns))
     if uncertain_ns.any():
         kind = pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"})
         columns.append((kind, uncertain_ns))
@@ -236,7 +236,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     """Return the table of what went wrong in all streams, in the order of time."""
     import pyarrow as pa
 
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
 
     rows = sorted((event, name) for name, one in sealed.items() for event in one.events)
     rows += _cut_off(sealed, spooled)
@@ -256,7 +256,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
         ],
         schema=pa.schema(
             [
-                channels.time_field(),
+                schema.time_field(),
                 pa.field("stream", pa.string()),
                 pa.field("cause", pa.string()),
                 pa.field("frames", pa.int64(), metadata=whole),

@@ -39,11 +39,12 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe import layout, regular
 from tacpipe.errors import TacpipeError
-from tacpipe.files import listed, readable_errors, sync_folder, write_whole
+from tacpipe.io import regular
+from tacpipe.io.files import listed, readable_errors, sync_folder, write_whole
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED, RECOVERED
 from tacpipe.sensors.framing import Chunks
+from tacpipe.store import layout
 
 FOLDER = layout.SPOOL  # within the store
 MARK = b"tacB"

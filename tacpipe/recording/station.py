@@ -13,7 +13,7 @@ from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError
-from tacpipe.recording import clock, stranger
+from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import Pace
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool import Note
@@ -65,7 +65,7 @@ class Station:
             self._open()
         except NoReplyError as error:
             heard = [Chunks.of(error.heard)] if error.heard else []
-            raise DeviceError(stranger.sentence(self.stream, error.awaited, heard, reply=True)) from error
+            raise DeviceError(silence_diagnosis.sentence(self.stream, error.awaited, heard, reply=True)) from error
         self._thread.start()
 
     def take(self) -> list[Chunks | Note]:

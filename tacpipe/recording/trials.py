@@ -8,19 +8,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tacpipe import interruption
+from tacpipe.datasets.manifest import NAME_BYTES
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import excerpt, plain
-from tacpipe.interruption import Ended
-from tacpipe.manifest import NAME_BYTES
+from tacpipe.io import termination
+from tacpipe.io.termination import Ended
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import excerpt, plain
 from tacpipe.recording import appending, clock, header, sealing, triggers
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import ENDED, Note, Spool, Spooled, users
 from tacpipe.recording.view import View
-from tacpipe.stage import Attribute
-from tacpipe.store import Store
+from tacpipe.store.store import Store
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _record(
         return ended() or stops()
 
     kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
-    with interruption.saying(f"tacpipe: interrupted. {kept}."), contextlib.closing(spool):  # nobody else may recover it
+    with termination.saying(f"tacpipe: interrupted. {kept}."), contextlib.closing(spool):  # nobody else may recover it
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
             spool.note(Note(clock.now_ns(), "", ENDED, how))

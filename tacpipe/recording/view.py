@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe import progress, terminal
+from tacpipe import printable
+from tacpipe.io import progress, terminal
 from tacpipe.recording import clock
 from tacpipe.recording.watch import Figures, Watch, tactile_channels
 
@@ -63,7 +64,7 @@ class View:
         from rich.text import Text
 
         table = Table(
-            "stream", "Hz", "jitter ms", "latency ms", "samples", "lost", "bytes lost", title=terminal.shown(state)
+            "stream", "Hz", "jitter ms", "latency ms", "samples", "lost", "bytes lost", title=printable.shown(state)
         )
         for name, found in figures.items():
             latency = "" if found.latency_ms is None else f"{found.latency_ms:.2f}"

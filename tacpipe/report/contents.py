@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
 

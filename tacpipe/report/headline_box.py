@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from tacpipe import headline
-from tacpipe.headline import Headline
+from tacpipe.metrics import headline
+from tacpipe.metrics.headline import Headline
 from tacpipe.report import markup
 
 
 def box(sentences: Sequence[tuple[str, str]]) -> str:
-    """Return sentences with their verdicts (`tacpipe.headline.verdict`), green only where it is ``better``."""
+    """Return sentences with their verdicts (`tacpipe.metrics.headline.verdict`), green only where it is ``better``."""
     return "\n".join(
         f'<p class="{f"headline {verdict}".strip()}">{escape(_unbroken(told))}</p>'
         for told, verdict in sentences

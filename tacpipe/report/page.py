@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import model_files
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.report import contents, markup, plain
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 TASKS = {  # the package whose functions ``report`` and ``reads`` tell of a task's results, by the task's name
     "forward": "tacpipe.report.forward",

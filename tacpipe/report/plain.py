@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.report import contents, markup, provenance
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 
 def render(result: Dataset, number: int, of: int) -> str:

@@ -7,11 +7,11 @@ from collections.abc import Collection, Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.origin import PUBLISHED
+from tacpipe.datasets.origin import PUBLISHED
 from tacpipe.report import markup
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
 

@@ -70,15 +70,15 @@ class AtiNetFT(Sensor):
         """Return ``status`` (uint32, 0: all is well) and the load: int32 counts, or N and N m where those are told."""
         import pyarrow as pa
 
-        from tacpipe.formats import channels
+        from tacpipe.channels import schema
 
         status = pa.field("status", pa.uint32(), metadata={"unit": "1", "quantity": "status"})
         if self.counts_per_force:
-            return [status, *channels.wrench_fields()]
+            return [status, *schema.wrench_fields()]
         return [status] + [
             pa.field(f"{kind}_{axis}", pa.int32(), metadata={"unit": "count", "quantity": kind, "component": axis})
             for kind in ("force", "torque")
-            for axis in channels.AXES
+            for axis in schema.AXES
         ]
 
     def framer(self) -> Framer:

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.channels.schema import ELECTRODES, VIBRATIONS, biotac_fields
 from tacpipe.errors import UsageError
-from tacpipe.formats.channels import ELECTRODES, VIBRATIONS, biotac_fields
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Bytes, Framer, Framing

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.channels.schema import AXES
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.formats.channels import AXES
 from tacpipe.sensors import pts
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16

@@ -84,21 +84,21 @@ class Franka(Sensor):
         """
         import pyarrow as pa
 
-        from tacpipe.formats import channels
+        from tacpipe.channels import schema
 
-        angles, speeds = channels.joint_fields(JOINTS)
+        angles, speeds = schema.joint_fields(JOINTS)
         external = [
-            channels.float_field(f"joint{joint}_external_torque_nm", "N m", "external_torque")
+            schema.float_field(f"joint{joint}_external_torque_nm", "N m", "external_torque")
             for joint in range(1, JOINTS + 1)
         ]
         status = {"unit": "1", "quantity": "status"}
         return [
-            *channels.pose_fields(),
+            *schema.pose_fields(),
             *angles,
             *speeds,
-            *channels.joint_torque_fields(JOINTS),
+            *schema.joint_torque_fields(JOINTS),
             *external,
-            *channels.wrench_fields(),
+            *schema.wrench_fields(),
             pa.field("success_rate", pa.float32(), metadata={"unit": "1", "quantity": "share"}),
             *(pa.field(name, pa.uint8(), metadata=status) for name in MODES),
             *(pa.field(name, pa.uint64(), metadata=status) for name in ERRORS),

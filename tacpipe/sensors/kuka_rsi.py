@@ -192,23 +192,23 @@ def _texts(root: ElementTree.Element, name: str) -> list[str]:
 
 
 def _fields(name: str) -> list[pa.Field]:
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
 
     if name == "RIst":
-        return channels.pose_fields()
+        return schema.pose_fields()
     if name == "RSol":
         return [
-            channels.float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part)
-            for field in channels.pose_fields()
+            schema.float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part)
+            for field in schema.pose_fields()
             for kind, part in [(field.name.split("_")[0], field.name.split("_")[1])]
         ]
     if name == "AIPos":
-        return channels.joint_fields(len(AXES))[0]
+        return schema.joint_fields(len(AXES))[0]
     if name == "ASPos":
-        return [channels.float_field(f"joint{n}_target_rad", "rad", "target_joint_position") for n in range(1, 7)]
+        return [schema.float_field(f"joint{n}_target_rad", "rad", "target_joint_position") for n in range(1, 7)]
     if name == "MACur":
-        return [channels.float_field(f"joint{n}_current", "1", "current") for n in range(1, 7)]
-    return [channels.float_field(name.replace(".", "_").lower(), "1", "state")]
+        return [schema.float_field(f"joint{n}_current", "1", "current") for n in range(1, 7)]
+    return [schema.float_field(name.replace(".", "_").lower(), "1", "state")]
 
 
 def _columns(name: str, numbers: Floats) -> Floats:

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.channels.schema import AXES
 from tacpipe.errors import UsageError
-from tacpipe.formats.channels import AXES
 from tacpipe.sensors.framing import MALFORMED, Account, Bytes, Chunks, Framer, Loss, Run
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 

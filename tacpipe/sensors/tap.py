@@ -66,13 +66,13 @@ class Tap(Sensor):
         """Return ``event`` and ``json``, text, and the numbers, float64; of grasps the columns of `Grasp.table`."""
         import pyarrow as pa
 
-        from tacpipe.formats import channels
+        from tacpipe.channels import schema
 
         if self.grasp:
-            fields = [channels.float_field(name, "m", "position", name[3]) for name in POINTS]
-            turned = [channels.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
+            fields = [schema.float_field(name, "m", "position", name[3]) for name in POINTS]
+            turned = [schema.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
             return fields + turned if self.grasp == "wrist" else fields
-        numbers = [channels.float_field(_column(told), _unit(told), "state") for told in self.numbers]
+        numbers = [schema.float_field(_column(told), _unit(told), "state") for told in self.numbers]
         text = {"unit": "1", "quantity": "text"}
         return [*(pa.field(name, pa.string(), metadata=text) for name in ("event", "json")), *numbers]
 

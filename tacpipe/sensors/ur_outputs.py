@@ -85,17 +85,17 @@ def fields_of(output: str) -> list[pa.Field]:
     """Return the fields that an output becomes: those that arms have elsewhere, or its own name, small, and a number."""
     import pyarrow as pa
 
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
 
     if output == POSE:
-        return channels.pose_fields()
+        return schema.pose_fields()
     if output == "actual_TCP_force":
-        return channels.wrench_fields()
+        return schema.wrench_fields()
     if output == "actual_TCP_speed":
-        return channels.twist_fields()
+        return schema.twist_fields()
     if output in JOINT_NAMES:
         suffix, unit, quantity = JOINT_NAMES[output]
-        return [channels.float_field(f"joint{n}_{suffix}", unit, quantity) for n in range(1, JOINTS + 1)]
+        return [schema.float_field(f"joint{n}_{suffix}", unit, quantity) for n in range(1, JOINTS + 1)]
     kind = type_of(output)
     assert kind is not None
     letters, count = WIRE[kind]

@@ -62,9 +62,9 @@ class Xela(Sensor):
         """Return ``taxel01_x``, …, uint16 counts, and with ``forces`` ``taxel01_force_x_n``, …, float32 newtons."""
         import pyarrow as pa
 
-        from tacpipe.formats import channels
+        from tacpipe.channels import schema
 
-        counts = channels.uskin_fields(self.taxels)
+        counts = schema.uskin_fields(self.taxels)
         if not self.forces:
             return counts
         return counts + [
@@ -74,7 +74,7 @@ class Xela(Sensor):
                 metadata={"unit": "N", "quantity": "force", "taxel": str(taxel), "component": axis},
             )
             for taxel in range(1, self.taxels + 1)
-            for axis in channels.AXES
+            for axis in schema.AXES
         ]
 
     def framer(self) -> Framer:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.formats import channels
+from tacpipe.channels import schema
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.uint16]
@@ -54,7 +54,7 @@ VIBRATION_COUNT_S_N = 25.0  # PAC, by the derivative of what is felt
 NOISE_COUNT, PRESSURE_NOISE_COUNT, VIBRATION_NOISE_COUNT = 0.75, 1.0, 3.0
 DRIFT_COUNT = 0.3  # random walk of an electrode, counts after one second
 RATE_HZ = 100.0
-VIBRATION_RATE_HZ = RATE_HZ * channels.VIBRATIONS
+VIBRATION_RATE_HZ = RATE_HZ * schema.VIBRATIONS
 REST_COUNT = (2500.0, 3500.0)  # of an electrode that touches nothing
 TARE_ROWS = 10  # at the start, whose mean is taken off
 WARMTH_COUNT, WARMING_S = 120.0, 6.0  # TAC: the finger is warmer than the material
@@ -91,7 +91,7 @@ def vibration(felt_n: Floats, noise_scale: float, rng: np.random.Generator) -> C
     """Return PAC (time, reading) of what is felt at `VIBRATION_RATE_HZ` (time * reading,), N."""
     noise = rng.normal(0, VIBRATION_NOISE_COUNT, len(felt_n))
     change = np.diff(felt_n, prepend=felt_n[:1]) * VIBRATION_RATE_HZ
-    return counted(VIBRATION_COUNT_S_N * change + noise_scale * noise).reshape(-1, channels.VIBRATIONS)
+    return counted(VIBRATION_COUNT_S_N * change + noise_scale * noise).reshape(-1, schema.VIBRATIONS)
 
 
 def warmth(since_s: Floats, noise_scale: float, rng: np.random.Generator) -> tuple[Counts, Counts]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 
 Floats = NDArray[np.float64]
 

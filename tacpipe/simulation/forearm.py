@@ -13,11 +13,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.formats import channels
+from tacpipe.channels import schema
 
 Floats = NDArray[np.float64]
 
-TAXELS = channels.TRIANGLES * channels.TRIANGLE_TAXELS
+TAXELS = schema.TRIANGLES * schema.TRIANGLE_TAXELS
 PITCH_M = 0.0067  # of the taxels of a triangle
 SIDE_M = 0.030
 APERTURE_M = 0.0018
@@ -39,9 +39,9 @@ def _places() -> Floats:
     module = np.array([[place - (3 - row) / 2, (row - 1) * np.sqrt(3) / 2] for row, place in rows]) * PITCH_M
     module[[3, 5]] = module[[5, 3]]  # the fourth is the one in the centre
     triangles = []
-    for triangle in range(channels.TRIANGLES):
+    for triangle in range(schema.TRIANGLES):
         sign = 1 - 2 * (triangle % 2)
-        along = (triangle - (channels.TRIANGLES - 1) / 2) * SIDE_M / 2
+        along = (triangle - (schema.TRIANGLES - 1) / 2) * SIDE_M / 2
         triangles.append(module * sign + [along, -sign * SIDE_M / 12 * np.sqrt(3)])
     return np.concatenate(triangles)
 

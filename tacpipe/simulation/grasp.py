@@ -16,12 +16,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp, schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import channels
+from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import fingertip_sp, grasp_truth, pinch, pinch_course, tabletop
 from tacpipe.simulation.grasp_scene import Felt, Rig, Scene, families, feel, perform, sensors, thing
-from tacpipe.stage import Attribute, Recording
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +31,7 @@ READ_NS = 5_000_000_000  # from the plan to the reading
 NOISE, BOUND = 4, 5  # streams of random numbers
 
 
-def simulate_trial(seed: int, index: int, rig: Rig) -> Recording:
+def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
     """Return trial ``index`` of the rig: cloud, grasp, reading, truth; or raw: scene, grasp, biotac_sp, scene_truth, truth.
 
     The same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth. Raises
@@ -59,7 +58,7 @@ def simulate_trial(seed: int, index: int, rig: Rig) -> Recording:
         streams["reading"] = _logged(np.array([t_ns + READ_NS]), made, felt.shown[None], still, rig, rng)
     bound = grasp_truth.bound(made, scene, rig, np.random.default_rng([seed, BOUND, index]))
     streams["truth"] = grasp_truth.table(t_ns, scene, felt, bound, moments_ns)
-    return Recording(streams, _attributes(scene, session(index, rig)))
+    return RecordingOutput(streams, _attributes(scene, session(index, rig)))
 
 
 def stamp_ns(index: int, rig: Rig) -> int:
@@ -109,7 +108,7 @@ def _logged(
 ) -> pa.Table:
     """Return a stream of readings of what sensors show (time, finger, channel), with noise."""
     counts = fingertip_sp.counted(shown + rig.noise_scale * made.noise * rng.normal(size=shown.shape))
-    return channels.stream(t_ns, fingertip_sp.rows(counts, speed_n_s, rig.noise_scale, rng), biotac_sp.fields())
+    return schema.stream(t_ns, fingertip_sp.rows(counts, speed_n_s, rig.noise_scale, rng), biotac_sp.fields())
 
 
 def _attributes(scene: Scene, session: int) -> dict[str, Attribute]:

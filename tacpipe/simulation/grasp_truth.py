@@ -8,8 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
-from tacpipe.formats import channels
+from tacpipe.channels import biotac_sp, schema
 from tacpipe.simulation import fingertip_sp, touch_bound
 from tacpipe.simulation.grasp_scene import Felt, Rig, Scene
 
@@ -50,12 +49,12 @@ def table(t_ns: int, scene: Scene, felt: Felt, known: tuple[Floats, Floats], mom
             for finger, short in enumerate(biotac_sp.FINGERS)
             for channel, column in enumerate(biotac_sp.columns(f"e_{short}") + biotac_sp.columns(f"pdc_{short}"))
         ]
-    fields = [channels.float_field(name, unit, quantity) for name, unit, quantity, _ in columns]
+    fields = [schema.float_field(name, unit, quantity) for name, unit, quantity, _ in columns]
     moments = [
         pa.field(f"gt_{name}_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"}) for name in moments_ns
     ]
     values = [*([value] for *_, value in columns), *([at] for at in moments_ns.values())]
-    return channels.stream(np.array([t_ns]), values, [*fields, *moments])
+    return schema.stream(np.array([t_ns]), values, [*fields, *moments])
 
 
 def _finger(finger: int, scene: Scene, felt: Felt) -> list[tuple[str, str, str, float]]:

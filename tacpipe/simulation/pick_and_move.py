@@ -24,9 +24,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe.formats import channels
+from tacpipe.channels import schema
+from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, mechanics, proximity, taxels, trajectory
-from tacpipe.stage import Attribute, Recording
 
 Floats = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ class Scene:
     loss_ns: int | None  # when the grip gave way
 
 
-def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
+def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
     """Return trial ``index`` of the rig: the streams xela1, xela2, robot, proximity and truth, and what is known of them.
 
     The same seed, index and rig give the same values. Attributes that begin with ``gt_`` and the columns of ``truth``,
@@ -108,10 +108,10 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
         arrived_ns = faults.arrivals(samples.true_ns, delay_ms * 1e6, rng)
         values, fields = _measured(name, scene, samples.true_ns, rig, rng)
         clocks = [start_ns + faults.device_stamps(samples.true_ns, clock), samples.seq]
-        streams[name] = channels.stream(start_ns + arrived_ns, [*clocks, *values.T], [*_clock_fields(), *fields])
+        streams[name] = schema.stream(start_ns + arrived_ns, [*clocks, *values.T], [*_clock_fields(), *fields])
         known |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
     streams["truth"] = _truth(scene, start_ns)
-    return Recording(streams, _attributes(scene, index, start_ns, rig) | known)
+    return RecordingOutput(streams, _attributes(scene, index, start_ns, rig) | known)
 
 
 def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
@@ -160,7 +160,7 @@ def touch(scene: Scene, finger: int, true_ns: NDArray[np.int64], *, creep: float
     late = at(taxels.lagged(contact.normal_n[:, finger], trajectory.RATE_HZ))
     share = taxels.shares(scene.skins[finger], displacement, torque)
     pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * share
-    own = slice(finger * channels.TAXELS, (finger + 1) * channels.TAXELS)
+    own = slice(finger * schema.TAXELS, (finger + 1) * schema.TAXELS)
     return np.concatenate([pulled[:, own] + taxels.bulge(pressed), pressed[:, :, None]], axis=2)
 
 
@@ -169,7 +169,7 @@ def _measured(
 ) -> tuple[NDArray[Any], list[Any]]:
     """Return what a device logs of samples taken at ``true_ns`` (time, channel), and its fields."""
     if name == "robot":
-        return arm(scene, true_ns), [channels.float_field("finger_m", "m", "finger_width"), *channels.pose_fields()]
+        return arm(scene, true_ns), [schema.float_field("finger_m", "m", "finger_width"), *schema.pose_fields()]
     if name == "proximity":
         up_m = interpolation(scene, true_ns)(scene.contact.displacement_m[:, 1])
         field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
@@ -180,7 +180,7 @@ def _measured(
     drift_scale = 0.0 if rig.still else rig.noise_scale
     errors = taxels.errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
     counts = taxels.digitised(one.base_count + taxels.signal(one, force) + errors)
-    return faults.hold(counts, rig.hold_probability, rng)[0], channels.uskin_fields()
+    return faults.hold(counts, rig.hold_probability, rng)[0], schema.uskin_fields()
 
 
 def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
@@ -245,27 +245,27 @@ def _truth(scene: Scene, start_ns: int) -> Any:
     """Return the stream ``truth`` at 1 kHz."""
     contact = scene.contact
     columns: list[tuple[Any, Any]] = [
-        (channels.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[:, j]) for j in (0, 1)
+        (schema.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[:, j]) for j in (0, 1)
     ]
     columns += _vector("gt_force_{}_n", "N", "force", contact.force_n)
     columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", scene.path.acceleration_m_s2)
     moved, speed = contact.displacement_m, contact.velocity_m_s
     columns += _vector("gt_displacement_{}_m", "m", "position", moved, "xz")
-    columns.append((channels.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
+    columns.append((schema.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
     columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", speed, "xz")
-    columns.append((channels.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
-    columns.append((channels.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm))
-    columns.append((channels.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad))
+    columns.append((schema.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
+    columns.append((schema.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm))
+    columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad))
     mass = np.full(len(scene.path.t_ns), scene.grasp.mass_kg)
-    columns.append((channels.float_field("gt_mass_kg", "kg", "mass"), mass))
-    columns += [(channels.label_field("gt_slip"), contact.slip), (channels.label_field("gt_dropped"), contact.dropped)]
+    columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass))
+    columns += [(schema.label_field("gt_slip"), contact.slip), (schema.label_field("gt_dropped"), contact.dropped)]
     fields, values = zip(*columns, strict=True)
-    return channels.stream(start_ns + scene.path.t_ns, values, fields)
+    return schema.stream(start_ns + scene.path.t_ns, values, fields)
 
 
-def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[str] = channels.AXES) -> list[Any]:
+def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[str] = schema.AXES) -> list[Any]:
     return [
-        (channels.float_field(name.format(axis), unit, quantity), column)
+        (schema.float_field(name.format(axis), unit, quantity), column)
         for axis, column in zip(axes, values.T, strict=True)
     ]
 

@@ -24,10 +24,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import channels
+from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, fingertip, forearm, texture
-from tacpipe.stage import Attribute, Recording
 
 Floats = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def material(seed: int, sensor: str, number: int, rig: Rig = Rig()) -> texture.M
     return texture.material(np.random.default_rng([seed, MATERIAL, source, known]))
 
 
-def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
+def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
     """Return trial ``index`` of the rig: the stream biotac or roboskin, truth, and for some of the BioTac the arm's.
 
     The same seed, index and rig give the same values. Columns of ``truth``, on the true times of the tactile samples,
@@ -132,15 +132,15 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> Recording:
     streams = {}
     if scene.place.sensor == "biotac":
         arrived_ns = start_ns + faults.arrivals(scene.true_ns, rig.jitter_ms * 1e6, rng)
-        streams["biotac"] = channels.stream(arrived_ns, _finger(scene, signal, rig, rng), channels.biotac_fields())
+        streams["biotac"] = schema.stream(arrived_ns, _finger(scene, signal, rig, rng), schema.biotac_fields())
         if rig.arm_every and scene.place.number % rig.arm_every == 0:
             streams |= _arm(scene, start_ns, rig, rng)
     else:
         taxels = forearm.read(signal, rig.noise_scale, rng)
         made = f"from a nominal rate of {forearm.RATE_HZ:g} Hz"
-        streams["roboskin"] = channels.stream(start_ns + scene.true_ns, taxels.T, channels.roboskin_fields(), made)
+        streams["roboskin"] = schema.stream(start_ns + scene.true_ns, taxels.T, schema.roboskin_fields(), made)
     streams["truth"] = _truth(scene, start_ns)
-    return Recording(streams, _attributes(scene.place))
+    return RecordingOutput(streams, _attributes(scene.place))
 
 
 def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
@@ -168,7 +168,7 @@ def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
 def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
     """Return counts per newton (time, channel), d (time, channel), xi (channel,) in metres, and the aperture's sigma."""
     if scene.place.sensor == "biotac":
-        shape = (len(scene.true_ns), channels.ELECTRODES)
+        shape = (len(scene.true_ns), schema.ELECTRODES)
         gain, lean = (np.broadcast_to(known, shape) for known in (fingertip.gains(), fingertip.leans()))
         return gain, lean, fingertip.ALONG_M, fingertip.APERTURE_M
     gain = forearm.GAIN_COUNT_N * forearm.shares(scene.patch_m)
@@ -264,9 +264,9 @@ def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) ->
     electrodes = fingertip.read(signal, rig.noise_scale, rng)
     touched = scene.true_ns[int((scene.force_n > 0).argmax())]
     tdc, tac = fingertip.warmth((scene.true_ns - touched) / 1e9, rig.noise_scale, rng)
-    pac = np.zeros((len(signal), channels.VIBRATIONS), np.uint16)
+    pac = np.zeros((len(signal), schema.VIBRATIONS), np.uint16)
     if rig.pac:
-        rows = np.arange(pac.size) / channels.VIBRATIONS
+        rows = np.arange(pac.size) / schema.VIBRATIONS
         at, contact = (np.interp(rows, np.arange(len(signal)), known) for known in (scene.position_m, scene.contact))
         pac = fingertip.vibration(contact * texture.felt(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng)
     return [tdc, tac, scene.pressure_count, *pac.T, *electrodes.T]
@@ -294,23 +294,23 @@ def _arm(scene: Scene, start_ns: int, rig: Rig, rng: np.random.Generator) -> dic
     turned = rig.noise_scale * rng.normal(0, TORQUE_NOISE_NM, load.shape)
     unknown = np.full((3, len(taken)), np.nan)
     return {
-        "twist": channels.stream(arrived_ns, [*twist.T, *unknown], channels.twist_fields()),
-        "wrench": channels.stream(arrived_ns, [*load.T, *turned.T], channels.wrench_fields()),
+        "twist": schema.stream(arrived_ns, [*twist.T, *unknown], schema.twist_fields()),
+        "wrench": schema.stream(arrived_ns, [*load.T, *turned.T], schema.wrench_fields()),
     }
 
 
 def _truth(scene: Scene, start_ns: int) -> pa.Table:
     """Return the stream ``truth``, at the true times of the tactile samples."""
     fields = [
-        channels.float_field("gt_position_m", "m", "position"),
-        channels.float_field("gt_speed_m_s", "m/s", "speed"),
-        channels.float_field("gt_force_n", "N", "force"),
-        channels.float_field("gt_patch_along_m", "m", "position"),
-        channels.float_field("gt_patch_across_m", "m", "position"),
+        schema.float_field("gt_position_m", "m", "position"),
+        schema.float_field("gt_speed_m_s", "m/s", "speed"),
+        schema.float_field("gt_force_n", "N", "force"),
+        schema.float_field("gt_patch_along_m", "m", "position"),
+        schema.float_field("gt_patch_across_m", "m", "position"),
         pa.field("gt_phase", pa.int8(), metadata={"unit": "1", "quantity": "label"}),
     ]
     columns = [scene.position_m, scene.speed_m_s, scene.force_n, *scene.patch_m.T, scene.phase]
-    return channels.stream(start_ns + scene.true_ns, columns, fields)
+    return schema.stream(start_ns + scene.true_ns, columns, fields)
 
 
 def _attributes(which: Place) -> dict[str, Attribute]:

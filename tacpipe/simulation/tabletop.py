@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tacpipe.channels import schema
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.formats import channels
 from tacpipe.simulation import depth_camera
 from tacpipe.simulation.depth_camera import Placed
 from tacpipe.simulation.primitives import Shape
@@ -57,7 +57,7 @@ def view(
 
 def tables(seen: View) -> dict[str, pa.Table]:
     """Return the stream ``scene``, and ``scene_truth`` with a row a point: 0 the table, 1 the object, 2 another one."""
-    truth = pa.Table.from_arrays([pa.array(seen.surface)], schema=pa.schema([channels.label_field("gt_surface")]))
+    truth = pa.Table.from_arrays([pa.array(seen.surface)], schema=pa.schema([schema.label_field("gt_surface")]))
     return {"scene": seen.cloud.table(), "scene_truth": truth}
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.formats import channels
+from tacpipe.channels import schema
 
 Floats = NDArray[np.float64]
 
@@ -55,8 +55,8 @@ class Skin:
 
 def skin(rng: np.random.Generator) -> Skin:
     """Return a random skin."""
-    mixing = np.eye(3) + OFF_AXIS * rng.uniform(-1, 1, (channels.TAXELS, 3, 3))
-    base = np.array(BASE_COUNT) + rng.uniform(-BASE_SPREAD_COUNT, BASE_SPREAD_COUNT, (channels.TAXELS, 3))
+    mixing = np.eye(3) + OFF_AXIS * rng.uniform(-1, 1, (schema.TAXELS, 3, 3))
+    base = np.array(BASE_COUNT) + rng.uniform(-BASE_SPREAD_COUNT, BASE_SPREAD_COUNT, (schema.TAXELS, 3))
     centre = rng.uniform(-CENTRE_M, CENTRE_M, 2)
     return Skin(centre, float(rng.uniform(*SIGMA_M)), mixing * np.array(GAIN_COUNT_N)[:, None], base)
 
@@ -111,9 +111,7 @@ def signal(one: Skin, force_n: Floats) -> Floats:
 
 def forces(one: Skin, counts: Floats) -> Floats:
     """Return the force on each taxel (time, taxel, axis), N, that would give these counts without drift and noise."""
-    above = np.einsum(
-        "mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, channels.TAXELS, 3) - one.base_count
-    )
+    above = np.einsum("mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, schema.TAXELS, 3) - one.base_count)
     bent = np.einsum("tna,nba->tnb", above, np.linalg.inv(one.gain_count_n))
     size = (np.sqrt(1 + 4 * QUADRATIC_N * np.abs(bent)) - 1) / (2 * QUADRATIC_N)
     force: Floats = np.sign(bent) * size
@@ -122,9 +120,9 @@ def forces(one: Skin, counts: Floats) -> Floats:
 
 def crosstalk() -> Floats:
     """Return what of each taxel's signal each one sees (taxel, taxel)."""
-    row, column = np.divmod(np.arange(channels.TAXELS), 4)
+    row, column = np.divmod(np.arange(schema.TAXELS), 4)
     apart = np.abs(row[:, None] - row) + np.abs(column[:, None] - column)
-    seen: Floats = np.eye(channels.TAXELS) + CROSSTALK * (apart == 1)
+    seen: Floats = np.eye(schema.TAXELS) + CROSSTALK * (apart == 1)
     return seen
 
 
@@ -141,7 +139,7 @@ def lagged(values: Floats, rate_hz: float) -> Floats:
 
 def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.Generator) -> Floats:
     """Return noise and drift in counts (time, taxel, axis) of samples taken at ``at_s`` (time,)."""
-    shape = (len(at_s), channels.TAXELS, 3)
+    shape = (len(at_s), schema.TAXELS, 3)
     steps_s = np.diff(at_s, prepend=at_s[:1])
     drift = np.cumsum(rng.normal(0, 1.0, shape) * np.sqrt(steps_s)[:, None, None], axis=0) * DRIFT_COUNT
     noise = rng.normal(0, 1.0, shape) * NOISE_COUNT

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tacpipe.dataset import Dataset, Shard
+from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.datasets.manifest import chain_difference
 from tacpipe.errors import UsageError
-from tacpipe.manifest import chain_difference
 
 Chain = Sequence[Mapping[str, Any]]  # of a manifest: the stages that recordings went through one by one
 
 
-def opened(recordings: Dataset | Shard, chain: Chain | None) -> Dataset:
+def opened(recordings: Dataset | Recording, chain: Chain | None) -> Dataset:
     """Return a dataset, or the one of a recording alone, that went through the stages ``chain``; None: not known.
 
     Raises `UsageError` for anything else, and where the stages are others.
     """
-    if isinstance(recordings, Shard):
+    if isinstance(recordings, Recording):
         recordings = recordings.alone
     if not isinstance(recordings, Dataset):
         raise UsageError(
@@ -46,7 +46,7 @@ def _check(wanted: Chain, found: Chain) -> None:
 
 def _command(step: Mapping[str, Any]) -> str:
     """Return the command of a link of a chain, with the params that are not the default."""
-    from tacpipe import params, registry
+    from tacpipe.plugins import params, registry
 
     usual = params.to_json(params.from_json(registry.load(step["stage"]), {}))
     words = [step["stage"].replace(".", " ")]

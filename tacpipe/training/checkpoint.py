@@ -16,10 +16,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from tacpipe import regular
 from tacpipe.errors import TacpipeError
-from tacpipe.files import readable_errors, sync_folder, write_whole
-from tacpipe.hashing import bytes_digest
+from tacpipe.io import regular
+from tacpipe.io.files import readable_errors, sync_folder, write_whole
+from tacpipe.io.hashing import bytes_digest
 
 FILE = "checkpoint"
 log = logging.getLogger(__name__)

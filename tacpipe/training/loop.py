@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io.progress import bar
 from tacpipe.models.tensors import under
-from tacpipe.progress import bar
 from tacpipe.training import checkpoint
 
 RISE = 0.3  # share of all epochs over which the learning rate of a cycle rises

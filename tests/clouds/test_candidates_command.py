@@ -13,7 +13,7 @@ import open3d
 import pytest
 
 import tacpipe
-from tacpipe import candidates_command
+from tacpipe.cli import candidates as candidates_command
 from tacpipe.clouds.candidates import candidates
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
@@ -109,7 +109,7 @@ def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypat
     held = SimpleNamespace(streams=("cloud", "grasp"), table=lambda stream: bottle.table())
     bare = SimpleNamespace(streams=("grasp",))
     opened = SimpleNamespace(shards={"bleach-1": held, "bleach-2": bare})
-    monkeypatch.setattr("tacpipe.pipeline.open_dataset", lambda path: opened)
+    monkeypatch.setattr("tacpipe.engine.pipeline.open_dataset", lambda path: opened)
     told = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
     assert told == rows(lab.run("candidates bottle.ply --count 3").out)
     for words, sentence in (

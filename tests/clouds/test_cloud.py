@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from tacpipe.clouds.cloud import COLOUR, POSITION, Cloud
 from tacpipe.errors import TacpipeError
-from tacpipe.tables import from_parquet, to_parquet
+from tacpipe.io.parquet import from_parquet, to_parquet
 
 POINTS = arrays.arrays(
     np.float32,

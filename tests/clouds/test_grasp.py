@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
 from tacpipe.errors import TacpipeError
-from tacpipe.tables import from_parquet, to_parquet
+from tacpipe.io.parquet import from_parquet, to_parquet
 
 
 def grasp(seed: int, *, wrist: bool = True) -> Grasp:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tacpipe.codecs import stretches
+from tacpipe.codecs import frame_stacking
 from tacpipe.errors import TacpipeError
 
 
@@ -31,7 +31,7 @@ def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, of: str, 
     values = rng.normal(size=(12, 2))
     begins = rng.random(12) < 0.3
     begins[0] = True
-    assert np.allclose(stretches.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
+    assert np.allclose(frame_stacking.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
 
 
 def test_later_rows_change_nothing_before_them() -> None:
@@ -40,22 +40,22 @@ def test_later_rows_change_nothing_before_them() -> None:
     other[6:] += 100
     for of in ("levels", "increments"):
         for frames in (1, 2, 3):
-            one, two = (stretches.inputs(each, None, of, frames) for each in (values, other))
+            one, two = (frame_stacking.inputs(each, None, of, frames) for each in (values, other))
             assert np.array_equal(one[:6], two[:6])
             assert not np.array_equal(one[6:], two[6:])
 
 
 def test_a_stretch_begins_after_a_step_of_more_than_one_and_a_half_times_the_median() -> None:
     t_ns = np.cumsum([0, 20, 20, 29, 20, 31, 20]).astype(np.int64) * 1_000_000
-    assert stretches.breaks(t_ns).nonzero()[0].tolist() == [0, 5]
-    assert stretches.breaks(t_ns[:1]).tolist() == [True]
-    assert stretches.breaks(t_ns[:0]).tolist() == []
+    assert frame_stacking.breaks(t_ns).nonzero()[0].tolist() == [0, 5]
+    assert frame_stacking.breaks(t_ns[:1]).tolist() == [True]
+    assert frame_stacking.breaks(t_ns[:0]).tolist() == []
 
 
 def test_no_rows_give_no_inputs_of_the_right_width() -> None:
-    assert stretches.inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
+    assert frame_stacking.inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
 
 
 def test_another_kind_of_value_is_refused() -> None:
     with pytest.raises(TacpipeError, match="of is 'speed'; a codec is fitted on levels or increments"):
-        stretches.inputs(np.zeros((2, 1)), None, "speed", 1)
+        frame_stacking.inputs(np.zeros((2, 1)), None, "speed", 1)

@@ -13,17 +13,17 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.biotac_slide import biotac_slide, discover
 from tacpipe.formats.folders import Params
-from tacpipe.stage import Recording
+from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.slide_files import SECOND, write_biotac
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
-def read(source: Path, params: Params | None = None) -> Recording:
+def read(source: Path, params: Params | None = None) -> RecordingOutput:
     params = params or Params()
     (files,) = discover(params, source).values()
     recording = biotac_slide(params, files)
-    assert isinstance(recording, Recording)
+    assert isinstance(recording, RecordingOutput)
     return recording
 
 

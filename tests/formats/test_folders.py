@@ -16,9 +16,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe import execution, files, manifest, recording_names, regular
+from tacpipe.datasets import manifest, recording_names
+from tacpipe.engine import execution
 from tacpipe.errors import UsageError
 from tacpipe.formats.folders import PREFIX, trials, valid
+from tacpipe.io import files, regular
 from tests.conftest import Lab
 from tests.formats import grasp_files, slide_files, xela_files
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from tacpipe.clouds import pcd
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import pcd
 from tests.formats.grasp_files import colours, header, packed, points_m
 
 FLOATS = st.floats(-100, 100, width=32)

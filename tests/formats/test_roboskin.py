@@ -11,19 +11,19 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.roboskin import Params, discover, roboskin
+from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.signals.scrambling import scramble, unscramble
-from tacpipe.stage import Recording
 from tests.formats.slide_files import felt, write_roboskin
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
-def read(source: Path, params: Params | None = None) -> dict[str, Recording]:
+def read(source: Path, params: Params | None = None) -> dict[str, RecordingOutput]:
     params = params or Params()
     return {name: roboskin(params, files) for name, files in discover(params, source).items()}
 
 
-def values(recording: Recording) -> np.ndarray:
+def values(recording: RecordingOutput) -> np.ndarray:
     """Return (triangle, taxel, time)."""
     table = recording.streams["roboskin"]
     return np.stack([column.to_numpy() for column in table.columns[1:]]).reshape(6, 10, table.num_rows)

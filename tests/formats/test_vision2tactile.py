@@ -10,12 +10,12 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.vision2tactile import Params, discover, session, vision2tactile
-from tacpipe.stage import Recording
+from tacpipe.plugins.stage import RecordingOutput
 from tests.conftest import sample_data
 from tests.formats.grasp_files import BEGAN_S, colours, counts, header, packed, points_m, write_grasp
 from tests.test_imports import HEAVY, imported
@@ -23,12 +23,12 @@ from tests.test_imports import HEAVY, imported
 PUBLISHED = sample_data() / "vision2tactile"
 
 
-def read(source: Path, params: Params | None = None) -> dict[str, Recording]:
+def read(source: Path, params: Params | None = None) -> dict[str, RecordingOutput]:
     params = params or Params()
     return {name: vision2tactile(params, files) for name, files in discover(params, source).items()}
 
 
-def reading(recording: Recording) -> list[int]:
+def reading(recording: RecordingOutput) -> list[int]:
     (row,) = recording.streams["reading"].drop_columns("t_ns").to_pylist()
     return list(row.values())
 

@@ -13,17 +13,17 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.folders import Params
 from tacpipe.formats.xela_flat import discover, xela_flat
-from tacpipe.stage import Recording
+from tacpipe.plugins.stage import RecordingOutput
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 Trial = Callable[..., Path]
 
 
-def read(folder: Path, params: Params | None = None) -> Recording:
+def read(folder: Path, params: Params | None = None) -> RecordingOutput:
     params = params or Params()
     (files,) = discover(params, folder).values()
     recording = xela_flat(params, files)
-    assert isinstance(recording, Recording)
+    assert isinstance(recording, RecordingOutput)
     return recording
 
 

@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.folders import Params
 from tacpipe.formats.xela_psc import discover, xela_psc
-from tacpipe.stage import Recording
+from tacpipe.plugins.stage import RecordingOutput
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 Trial = Callable[..., Path]
 
 
-def read(folder: Path) -> Recording:
+def read(folder: Path) -> RecordingOutput:
     (files,) = discover(Params(), folder).values()
     recording = xela_psc(Params(), files)
-    assert isinstance(recording, Recording)
+    assert isinstance(recording, RecordingOutput)
     return recording
 
 

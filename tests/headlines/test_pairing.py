@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import regression
-from tacpipe.headlines import forward, material, pairing, touch
+from tacpipe.metrics import pairing, regression
+from tacpipe.tasks.forward import headline as forward
+from tacpipe.tasks.material import headline as material
+from tacpipe.tasks.touch import headline as touch
 
 RECORDINGS = [f"r{index:02d}" for index in range(12)]
 

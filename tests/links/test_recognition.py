@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import registry
 from tacpipe.links.recognition import CERTAIN, recognise
+from tacpipe.plugins import registry
 from tacpipe.recording import rig
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError
-from tacpipe.stage import Recording, Result, stage
+from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
-    from tacpipe.stage import Files, Fitted, Trial
+    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.plugins.stage import Files, Fitted, Trial
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Make:
 
 
 @stage(version=1)
-def make(params: Make, trial: Trial) -> Recording:
+def make(params: Make, trial: Trial) -> RecordingOutput:
     """Return counting numbers, times the number of the trial plus one."""
     import numpy as np
     import pyarrow as pa
@@ -36,7 +36,7 @@ def make(params: Make, trial: Trial) -> Recording:
     values = (np.arange(params.rows) * (trial + 1) + params.offset).astype(np.uint16)  # (time,)
     left = pa.table({"t_ns": t_ns, "x": pa.array(values, pa.uint16())})
     right = pa.table({"t_ns": t_ns, "y": pa.array(values[::-1].copy(), pa.uint16())})
-    return Recording({"left": left, "right": right}, {"trial": trial, "material": "cork"})
+    return RecordingOutput({"left": left, "right": right}, {"trial": trial, "material": "cork"})
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def discover(params: Read, source: Path) -> dict[str, dict[str, Path]]:
 
 
 @stage(version=1, discover=discover)
-def read(params: Read, files: Files) -> Recording:
+def read(params: Read, files: Files) -> RecordingOutput:
     """Return the numbers of a text file, one a line."""
     import pyarrow as pa
 
@@ -59,7 +59,7 @@ def read(params: Read, files: Files) -> Recording:
         values = [int(line) for line in path.read_text().split()]
     except ValueError as error:
         raise TacpipeError(f"{path} holds {error.args[0].rpartition(':')[2].strip()}, which is no number.") from None
-    return Recording({"left": pa.table({"x": pa.array(values, pa.uint16())})})
+    return RecordingOutput({"left": pa.table({"x": pa.array(values, pa.uint16())})})
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Scale:
 
 
 @stage(version=1)
-def scale(params: Scale, recording: Shard) -> pa.Table:
+def scale(params: Scale, recording: Recording) -> pa.Table:
     """Return the left stream, multiplied."""
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -86,9 +86,9 @@ def scale(params: Scale, recording: Shard) -> pa.Table:
 
 
 @stage(version=1, reads=("material",))
-def named(params: Read, recording: Shard) -> Recording:
+def named(params: Read, recording: Recording) -> RecordingOutput:
     """Return the table as it is, with the material as it was read."""
-    return Recording(recording.table("left"), {"seen": recording.attributes["material"]})
+    return RecordingOutput(recording.table("left"), {"seen": recording.attributes["material"]})
 
 
 @stage(version=1)
@@ -101,7 +101,7 @@ def fit(params: Read, train: Dataset) -> Result:
 
 
 @stage(version=1, fit=fit)
-def centre(params: Read, recording: Shard, codec: Fitted) -> pa.Table:
+def centre(params: Read, recording: Recording, codec: Fitted) -> pa.Table:
     """Return the table with the training mean taken off."""
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -128,4 +128,4 @@ def halves(params: Read, recordings: Dataset) -> Result:
     roles = ["train" if position < len(names) / 2 else "test" for position in range(len(names))]
     fold = pa.array([0] * len(names), pa.int32())
     table = pa.table({"recording": names, "fold": fold, "role": roles})
-    return Result(recordings={"split": Recording(table)})
+    return Result(recordings={"split": RecordingOutput(table)})

@@ -62,7 +62,7 @@ def run(*words: str) -> None:
 
 def tacpipe(command: str, **environment: str) -> tuple[int, str]:
     """Run a command in this process; return its exit code and what it printed."""
-    from tacpipe import cli
+    from tacpipe.cli import main as cli
 
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):

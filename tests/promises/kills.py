@@ -23,9 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from tacpipe import upkeep
-from tacpipe.interruption import SENTENCE
-from tacpipe.store import Store
+from tacpipe.io.termination import SENTENCE
+from tacpipe.maintenance import repair
+from tacpipe.store.store import Store
 from tests.promises import operations_cases
 from tests.promises.counts import count
 from tests.promises.warm import Warm, serving
@@ -66,7 +66,7 @@ class Fresh:
         self.out = out
         with out.open("ab") as printed:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tacpipe.cli", *words.split()],
+                [sys.executable, "-m", "tacpipe", *words.split()],
                 cwd=folder,
                 env={**os.environ, **environment},
                 stdin=subprocess.DEVNULL,
@@ -294,7 +294,7 @@ def aged(project: Path) -> None:
 
 def _verify(scene: Scene) -> None:
     for path in scene.project.rglob("format"):
-        found = upkeep.verify(Store(path.parent))
+        found = repair.verify(Store(path.parent))
         assert found.clean, found.to_text()
 
 

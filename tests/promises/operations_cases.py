@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from tacpipe.hashing import bytes_digest
+from tacpipe.io.hashing import bytes_digest
 
 
 def _nothing(lab: Path) -> None:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tacpipe import execution
-from tacpipe.hashing import digest
-from tacpipe.stage import Stage
+from tacpipe.engine import execution
+from tacpipe.io.hashing import digest
+from tacpipe.plugins.stage import Stage
 
 
 class Replay:
@@ -27,10 +27,10 @@ class Replay:
 
     def install(self) -> None:
         """Replace what executes stages, for the rest of this process."""
-        from tacpipe import tables
+        from tacpipe.io import parquet
         from tacpipe.training import checkpoint
 
-        execute, reader, stage, to_parquet = execution.execute, execution.reader, Stage.__call__, tables.to_parquet
+        execute, reader, stage, to_parquet = execution.execute, execution.reader, Stage.__call__, parquet.to_parquet
         self._save, self._resume = checkpoint.write, checkpoint.read
 
         def executing(task: Any, *given: Any, **named: Any) -> Any:
@@ -65,7 +65,7 @@ class Replay:
             return self._parquet[id(table)][1]
 
         execution.execute, execution.reader, Stage.__call__ = executing, reading, calling  # type: ignore
-        checkpoint.write, checkpoint.read, tables.to_parquet = saving, resuming, packing
+        checkpoint.write, checkpoint.read, parquet.to_parquet = saving, resuming, packing
 
     def _call(self, stage: Stage, arguments: dict[str, Any], run: Callable[[], Any]) -> Any:
         workspace = next((arguments[name] for name, kind in stage.arguments.items() if kind == "Workspace"), None)

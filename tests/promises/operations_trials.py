@@ -22,9 +22,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tacpipe import cli, execution, hashing, projects, upkeep
+from tacpipe.cli import main as cli
+from tacpipe.engine import execution
 from tacpipe.errors import DAMAGED, TacpipeError
-from tacpipe.store import Store
+from tacpipe.io import hashing
+from tacpipe.maintenance import repair
+from tacpipe.store import projects
+from tacpipe.store.store import Store
 from tests.promises.operations import Call, Shim
 from tests.promises.operations_cases import CASES, Case
 from tests.promises.operations_power import Disk
@@ -232,7 +236,7 @@ def _wrong(ran: Ran) -> list[str]:
 
 def _unsound(where: str, store: Store) -> list[str]:
     try:
-        found = upkeep.verify(store)
+        found = repair.verify(store)
     except TacpipeError as error:  # it is a store no more
         return [f"{where} is damaged: {error}"]
     return [] if found.clean else [f"{where} is damaged: {found.to_text()}"]

@@ -15,10 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import tacpipe
+from tacpipe.datasets.manifest import NAME, Manifest, parse
 from tacpipe.errors import DAMAGED, TacpipeError, UsageError
-from tacpipe.hashing import bytes_digest
-from tacpipe.manifest import NAME, Manifest, parse
-from tacpipe.tables import owned
+from tacpipe.io.hashing import bytes_digest
+from tacpipe.io.parquet import owned
 from tests.any_table import bits
 from tests.conftest import Lab, Ran
 

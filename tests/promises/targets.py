@@ -22,17 +22,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tacpipe import manifest, params, registry
 from tacpipe.clouds import files as cloud_files
+from tacpipe.clouds import pcd, ply_points
 from tacpipe.clouds.depth_frame import DepthFrame
-from tacpipe.codecs import codec as codecs
+from tacpipe.codecs import stored
 from tacpipe.codecs.pca import fit
-from tacpipe.formats import pcd, ply
-from tacpipe.hashing import digest
+from tacpipe.datasets import manifest
+from tacpipe.io.hashing import digest
+from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import report_descriptor
+from tacpipe.plugins import params, registry
 from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
-from tacpipe.tables import from_parquet, to_parquet
 from tests.formats import grasp_files, slide_files, xela_files
 from tests.promises import decoding
 from tests.sensors.test_every_sensor import CASES
@@ -60,7 +61,7 @@ def targets() -> dict[str, Target]:
         Target("rig", _rig, lambda: [path.read_bytes() for path in sorted((HERE / "rigs").glob("*.toml"))]),
         Target("spool", _spool, _spools),
         Target("pcd", lambda data: pcd.parsed(NAMED, data), _pcds),
-        Target("ply", lambda data: ply.parsed(NAMED, data), _plys),
+        Target("ply", lambda data: ply_points.parsed(NAMED, data), _plys),
         Target("depth-frame", lambda data: DepthFrame.of_bytes(data).points(), _frames),
         Target("report-descriptor", report_descriptor.parse, _descriptors),
         Target("codec", _codec, lambda: _parts(_codec_files())),
@@ -174,10 +175,10 @@ def _pcds() -> list[bytes]:
 @functools.cache
 def _plys() -> list[bytes]:
     points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
-    whole = ply.packed(points, colours)
+    whole = ply_points.packed(points, colours)
     text = whole[: whole.index(b"end_header")].replace(b"binary_little_endian", b"ascii") + b"end_header\n"
     rows = "".join(f"{x:g} {y:g} {z:g} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(points, colours, strict=True))
-    return [whole, ply.packed(points, None), text + rows.encode()]
+    return [whole, ply_points.packed(points, None), text + rows.encode()]
 
 
 @functools.cache
@@ -199,7 +200,7 @@ def _codec_files() -> dict[str, bytes]:
 
 
 def _codec(data: bytes) -> object:
-    return codecs.load(replaced(_codec_files(), data))
+    return stored.load(replaced(_codec_files(), data))
 
 
 def replaced(files: dict[str, bytes], data: bytes) -> dict[str, bytes]:

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import upkeep
-from tacpipe.store import Store
+from tacpipe.maintenance import repair
+from tacpipe.store.store import Store
 from tests.promises import kills
 from tests.promises.counts import count
 from tests.promises.kills import Scene
@@ -69,7 +69,7 @@ def outcomes(scene: Scene, commands: Sequence[str]) -> list[dict[str, int]]:
 
 def tidy(store: Store) -> None:
     """Fail unless a store is sound, and nobody left a lease or a draft in it."""
-    assert upkeep.verify(store).clean, upkeep.verify(store).to_text()
+    assert repair.verify(store).clean, repair.verify(store).to_text()
     assert list((store.root / "tmp").iterdir()) == []
     assert list((store.root / "leases").iterdir()) == []
 
@@ -167,7 +167,7 @@ def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs
         os.kill(running.pid, signal.SIGCONT)
         told = f"stopped after {after_s:.4f} of {lasts_s:.4f} s: "
         assert kills.ended(running) == 0, told + running.out.read_text()
-        found = upkeep.verify(Store(scene.project / ".tacpipe"))
+        found = repair.verify(Store(scene.project / ".tacpipe"))
         assert found.clean, told + found.to_text()
         assert kills.State.of(scene.project).files == wanted, told
         count("kills survived")
@@ -194,7 +194,7 @@ def test_two_hosts_that_share_a_store_make_each_key_once(scene: Scene, tmp_path:
     scene.run("simulate toy --trials 12 --rows 4 -o data/r")
     shutil.copytree(scene.project / "data", tmp_path / "other/data")
     store, seen = scene.project / ".tacpipe", tmp_path / "seen"
-    here = [sys.executable, "-m", "tacpipe.cli"]
+    here = [sys.executable, "-m", "tacpipe"]
     there = [*UNSHARED, "sh", "-c", ELSEWHERE, "sh", str(seen), str(store), *here]
     processes = [
         subprocess.Popen(
@@ -213,7 +213,7 @@ def test_two_hosts_that_share_a_store_make_each_key_once(scene: Scene, tmp_path:
 
 PROBE = """
 import json, shlex, sys
-from tacpipe import cli
+from tacpipe.cli import main as cli
 for words in sys.argv[1:]:
     sys.argv = ["tacpipe", *shlex.split(words)]
     assert cli.answer(sys.argv[1:]) == 0

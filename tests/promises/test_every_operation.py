@@ -18,7 +18,9 @@ from typing import Any
 import pytest
 import typer
 
-from tacpipe import registry, store_command, upkeep
+from tacpipe.cli import store
+from tacpipe.maintenance import repair
+from tacpipe.plugins import registry
 from tests.conftest import Lab
 from tests.promises.counts import count
 from tests.promises.operations import Call, Shim
@@ -86,7 +88,8 @@ BREAKS = {
 @pytest.mark.parametrize("broken", BREAKS)
 def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tmp_path: Path) -> None:
     script = (
-        "import os; from pathlib import Path; from tacpipe import directory, files, store\n"
+        "import os; from pathlib import Path; from tacpipe.datasets import directory; from tacpipe.io import files\n"
+        "from tacpipe.store import store\n"
         f"{BREAKS[broken]}"
         "from tests.promises import operations_trials; operations_trials.main()"
     )
@@ -116,13 +119,13 @@ def test_garbage_is_not_collected_where_a_folder_cannot_be_listed(lab: Lab, fold
         ran = lab.call("store gc")
     assert ran.code == 1 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1
     assert sorted(lab.store.root.glob("objects/*/*")) == there
-    assert upkeep.verify(lab.store).clean
+    assert repair.verify(lab.store).clean
 
 
 def test_no_stage_and_no_command_of_the_store_is_left_out() -> None:
     stages = {name for name, target in registry.stages().items() if not target.startswith("toy_")}
     program = typer.Typer()
-    store_command.add(program, "")
+    store.add(program, "")
     (group,) = program.registered_groups
     assert group.typer_instance is not None
     commands = {f"store {command.name}" for command in group.typer_instance.registered_commands}

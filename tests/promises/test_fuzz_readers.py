@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from tacpipe import registry
 from tacpipe.clouds.files import SUFFIXES
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tests.promises.counts import count
 from tests.promises.limits import bounded, is_sentence
 from tests.promises.mutations import inputs

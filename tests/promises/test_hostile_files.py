@@ -16,11 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tacpipe import memory, parquet_claims
 from tacpipe.clouds import files as cloud_files
+from tacpipe.clouds import pcd, ply_points
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.formats import csv_table, pcd, ply
-from tacpipe.tables import from_parquet, to_parquet
+from tacpipe.formats import csv_table
+from tacpipe.io import memory, parquet_claims
+from tacpipe.io.parquet import from_parquet, to_parquet
 from tests.conftest import Lab
 from tests.promises import targets
 from tests.promises.counts import count
@@ -210,7 +211,7 @@ def test_sizes_of_compressed_points_that_lie_are_refused(
 def test_points_that_a_ply_file_only_claims_are_refused(tmp_path: Path, points: str, form: str) -> None:
     content = f"ply\nformat {form} 1.0\nelement vertex {points}\n{XYZ}end_header\n1 2 3\n".encode()
     refused(cloud(tmp_path, "a.ply", content), r"a\.ply")
-    refused(lambda: ply.parsed(Path("a.ply"), content), r"a\.ply")
+    refused(lambda: ply_points.parsed(Path("a.ply"), content), r"a\.ply")
 
 
 @pytest.mark.parametrize("element", ["face 1000000000000", "face 1"])
@@ -238,7 +239,7 @@ def test_one_long_number_among_many_does_not_take_its_length_for_each() -> None:
     head = f"{PCD}POINTS 100000\nDATA ascii\n".encode()
     refused(lambda: pcd.parsed(Path("a"), head + b"1" * 1_000_000 + b" 1 1\n" + rows), "letters")
     text = f"ply\nformat ascii 1.0\nelement vertex 100000\n{XYZ}end_header\n".encode()
-    refused(lambda: ply.parsed(Path("a"), text + b"1" * 1_000_000 + b" 1 1\n" + rows), "letters")
+    refused(lambda: ply_points.parsed(Path("a"), text + b"1" * 1_000_000 + b" 1 1\n" + rows), "letters")
 
 
 # ---- arrays

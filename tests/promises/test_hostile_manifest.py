@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from tacpipe.datasets.manifest import parse
 from tacpipe.errors import TacpipeError
-from tacpipe.hashing import bytes_digest, digest
-from tacpipe.manifest import parse
+from tacpipe.io.hashing import bytes_digest, digest
 from tests.conftest import Lab
 from tests.promises.counts import count
 from tests.promises.limits import GIB, bounded, is_sentence

@@ -18,10 +18,12 @@ import torch
 from safetensors.torch import load, save
 
 import tacpipe
-from tacpipe import registry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
-from tacpipe.tasks import forward, material, touch
+from tacpipe.plugins import registry
+from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.material import task as material
+from tacpipe.tasks.touch import task as touch
 from tests import chain
 from tests.conftest import tacpipe as ran
 from tests.promises.counts import count

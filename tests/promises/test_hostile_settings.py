@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import params, registry, yaml_text
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import yaml_text
 from tacpipe.links import opening
+from tacpipe.plugins import params, registry
 from tacpipe.recording import rig
 from tests.conftest import Lab
 from tests.promises.counts import count

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 import tacpipe
+from tacpipe.datasets.manifest import parse
 from tacpipe.errors import DAMAGED, DONE, FAILED, USAGE, DamagedError, TacpipeError
-from tacpipe.hashing import digest
-from tacpipe.manifest import parse
-from tacpipe.store import MissingError, Store
+from tacpipe.io.hashing import digest
+from tacpipe.store.store import MissingError, Store
 from tests.conftest import Lab
 from tests.promises.counts import count
 from tests.promises.limits import GIB, bounded, is_sentence

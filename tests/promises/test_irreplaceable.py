@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.hashing import bytes_digest
-from tacpipe.manifest import Manifest, parse
+from tacpipe.datasets.manifest import Manifest, parse
+from tacpipe.io.hashing import bytes_digest
 from tests.conftest import Lab
 from tests.promises import damages, specimen
 from tests.promises.counts import count

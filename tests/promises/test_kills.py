@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.interruption import SENTENCE
+from tacpipe.io.termination import SENTENCE
 from tests.promises import kills, stubborn
 from tests.promises.counts import count
 from tests.promises.kills import Scene
@@ -168,7 +168,7 @@ def test_an_interrupt_ends_the_wait_for_a_lock(scene: Scene) -> None:
 
 def test_a_process_that_was_told_to_ignore_interrupts_goes_on(scene: Scene) -> None:
     scene.run("simulate toy --trials 1 --rows 4 -o data/r")
-    words = [sys.executable, "-m", "tacpipe.cli", *["scale", "data/r", "-o", "data/s", "--pause-s", "1"]]
+    words = [sys.executable, "-m", "tacpipe", *["scale", "data/r", "-o", "data/s", "--pause-s", "1"]]
     process = subprocess.Popen(
         ["nohup", "sh", "-c", 'trap "" INT; exec "$@"', "sh", *words],
         cwd=scene.project,

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from tacpipe import upkeep
 from tacpipe.errors import DAMAGED, FAILED, USAGE
-from tacpipe.store import Store
+from tacpipe.maintenance import repair
+from tacpipe.store.store import Store
 from tests.conftest import Lab
 from tests.promises import damages, specimen
 from tests.promises.counts import count
@@ -208,7 +208,7 @@ def ordinary() -> None:
                 raise OSError(ctypes.get_errno(), "prctl")
 
 
-def as_ordinary_user(one: Specimen, words: str, program: str = "tacpipe.cli") -> subprocess.CompletedProcess[str]:
+def as_ordinary_user(one: Specimen, words: str, program: str = "tacpipe") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", program, *words.split()],
         cwd=one.folder,
@@ -262,7 +262,7 @@ def test_a_store_that_may_only_be_read_is_pushed_from(
         assert ran.returncode == 0 and not ran.stderr, (verb, ran.stderr)
     assert json.loads(ran.stdout)["objects"] == 0
     assert specimen.files(locked.store) == before
-    assert upkeep.verify(Store(remote)).clean
+    assert repair.verify(Store(remote)).clean
     assert {root["path"] for root in Store(remote).roots.all()} == {"data/recordings", "data/total"}
     for path in (locked.object("total", "metrics.json"), locked.folder / "data/total/metrics.json"):
         path.chmod(0o644)

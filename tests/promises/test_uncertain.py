@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe import execution
+from tacpipe.engine import execution
 from tacpipe.errors import DAMAGED, FAILED
 from tests.conftest import forget, tacpipe
 from tests.promises import damages, specimen

@@ -85,7 +85,7 @@ def run(folder: Path, words: Sequence[str], log: Path, inject: str = "", names: 
     command = ["strace", "-f", "-qq", "-y", "-s", "4096", "-e", f"trace={traced}", "-e", "signal=none", "-o", str(log)]
     command += ["-e", f"inject={inject}"] if inject else []
     ran = subprocess.run(
-        [*command, sys.executable, "-m", "tacpipe.cli", *words],
+        [*command, sys.executable, "-m", "tacpipe", *words],
         cwd=folder,
         env={**os.environ, "PYTHONHASHSEED": "0"},
         stdin=subprocess.DEVNULL,

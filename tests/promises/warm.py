@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-IMPORTED = ("pyarrow.parquet", "pyarrow.compute", "tacpipe.pipeline", "tacpipe.stage_command", "tacpipe.store_command")
+IMPORTED = ("pyarrow.parquet", "pyarrow.compute", "tacpipe.engine.pipeline", "tacpipe.cli.stages", "tacpipe.cli.store")
 
 
 class Warm:
@@ -91,7 +91,7 @@ def _become(folder: str, words: str, out: str, environment: Mapping[str, str]) -
         os.umask(0o002)
         sys.path = [path for path in sys.path if os.access(path, os.R_OK)]  # the interpreter may be root's alone
     sys.argv = ["tacpipe", *shlex.split(words)]
-    from tacpipe import cli
+    from tacpipe.cli import main as cli
 
     cli.main()
 

@@ -23,10 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import tacpipe
+from tacpipe.cli.emulate import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import matching, rig_file
-from tacpipe.simulation.emulation.emulate_command import SWITCH_S
+from tacpipe.simulation.emulation import rig_file
 from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.testing import matching
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[2]

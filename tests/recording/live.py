@@ -18,7 +18,7 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.simulation.emulation import rig_file
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.matching import STAMPS
+from tacpipe.testing.matching import STAMPS
 from tests.simulation.emulation.rigs import awaited
 
 __all__ = ["awaited"]

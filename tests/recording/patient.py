@@ -1,4 +1,4 @@
-"""A recorder that gives devices as long as a busy computer may take: it can be run in the place of ``tacpipe.cli``.
+"""A recorder that gives devices as long as a busy computer may take: it can be run in the place of ``tacpipe``.
 
 A trial's duration is counted in samples there: it has lasted a second once every stream gave those of a second. How long a
 device may be silent is tried over a clock that the test turns, in `test_schedule`; here such limits would measure the
@@ -75,7 +75,7 @@ def longer(ask: Ask) -> Ask:
 
 
 if __name__ == "__main__":
-    from tacpipe import cli
+    from tacpipe.cli import main
 
     relax(pytest.MonkeyPatch())
-    cli.main()
+    main.main()

@@ -14,14 +14,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe import registry
-from tacpipe.columns import Columns
+from tacpipe.io.columns import Columns
+from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins import registry
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing
 from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.signals.clocks import fit_clock, host_times
-from tacpipe.tables import to_parquet
 from tests.sensors import made
 
 MINUTES, SKEW_PPM, OFFSET_S = 10, 50.0, 12.345
@@ -100,14 +100,14 @@ def test_offset_is_found_to_half_a_sample_and_drift_to_two_ppm(sensor: str, tmp_
 
 
 def test_synchronize_tells_the_clock_masks_what_was_lost_and_keeps_the_stamps(xela: Recorded) -> None:
-    class Shard:
+    class Recording:
         name, attributes, streams = "r", {"master": "device"}, ("device",)
 
         def columns(self, stream: str) -> Columns:
             return Columns(to_parquet(xela.table))
 
     stage = registry.load("synchronize")
-    made: Any = stage(stage.params(), Shard())
+    made: Any = stage(stage.params(), Recording())
 
     assert abs(float(made.attributes["device_clock_drift_ppm"]) + SKEW_PPM) < 2
     assert float(made.attributes["device_clock_residual_ms"]) < 2

@@ -55,7 +55,7 @@ sequence = {{ number = "n" }}
 """
 # how long a device may take is as in all tests of this tier, but what counts as a stall is as for users
 RUN = "from tests.recording import patient; import pytest, os, time; del patient.LIMITS['tacpipe.recording.pace'];"
-RUN += "patient.relax(pytest.MonkeyPatch()); {change}; from tacpipe import cli; cli.main()"
+RUN += "patient.relax(pytest.MonkeyPatch()); {change}; from tacpipe.cli import main as cli; cli.main()"
 SLOW = "sync = os.fdatasync; os.fdatasync = lambda handle: (time.sleep(1.0), sync(handle))[1]"
 
 

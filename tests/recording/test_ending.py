@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.interruption import TWICE_S
+from tacpipe.io.termination import TWICE_S
 from tacpipe.recording import sealing
 from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab
@@ -137,7 +137,7 @@ def test_one_signal_while_sealing_changes_nothing(lab: Lab, rig: Emulator, while
 def test_two_signals_at_once_are_one_wish(
     lab: Lab, rig: Emulator, while_sealing: Interrupt, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tacpipe.interruption.TWICE_S", 1000.0)  # however slow the computer is between the two
+    monkeypatch.setattr("tacpipe.io.termination.TWICE_S", 1000.0)  # however slow the computer is between the two
     while_sealing(2, 0)  # as of `timeout`, which signals a process and then its group
     lab.run("acquire rig.toml -o rec --duration 0.5")
 
@@ -146,7 +146,7 @@ def test_two_signals_at_once_are_one_wish(
 
 def test_a_second_signal_ends_a_sealing_that_hears_of_none(lab: Lab, rig: Emulator) -> None:
     script = (
-        "import hashlib, sys; from tacpipe import cli; from tacpipe.recording import sealing;"
+        "import hashlib, sys; from tacpipe.cli import main as cli; from tacpipe.recording import sealing;"
         "sealing.seal = lambda *_: (print('sealing', flush=True), hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1));"
         "sys.argv = ['tacpipe', *'acquire rig.toml -o rec --name one --quiet'.split()]; cli.main()"
     )

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import store as store_of
 from tacpipe.recording import appending, spool
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
@@ -22,6 +21,7 @@ from tacpipe.recording.sealing import seal
 from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.store import store as store_of
 from tests.conftest import Lab
 from tests.promises import counts
 from tests.recording import killing, live

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import registry
-from tacpipe.columns import Columns
+from tacpipe.io.columns import Columns
+from tacpipe.io.parquet import to_parquet
 from tacpipe.links import udp
+from tacpipe.plugins import registry
 from tacpipe.recording import clock, sealing, station
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
@@ -19,7 +20,6 @@ from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
 from tacpipe.recording.spool import Note, Spool, Spooled
 from tacpipe.recording.station import READ_S, Station
-from tacpipe.tables import to_parquet
 from tests.conftest import Lab
 from tests.recording import force_rig, live
 from tests.recording.scripted import Script
@@ -172,14 +172,14 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
     device = Device(monkeypatch, sent, dict.fromkeys(range(1000, 8600, 310), 300))
     table = recorded(tmp_path, device, rig).table
 
-    class Shard:
+    class Recording:
         name, attributes, streams = "r", {"master": "pad"}, ("pad",)
 
         def columns(self, stream: str) -> Columns:
             return Columns(to_parquet(table))
 
     stage = registry.load("synchronize")
-    made_of: Any = stage(stage.params(), Shard())
+    made_of: Any = stage(stage.params(), Recording())
 
     assert float(made_of.attributes["pad_clock_residual_ms"]) < 0.1
     assert abs(float(made_of.attributes["pad_clock_drift_ppm"])) < 1

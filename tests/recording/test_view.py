@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tacpipe import progress
+from tacpipe.io import progress
 from tacpipe.links.link import Address
 from tacpipe.recording import clock, rig
 from tacpipe.recording import view as view_of

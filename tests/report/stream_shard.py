@@ -8,8 +8,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from tacpipe.columns import Columns
-from tacpipe.tables import to_parquet
+from tacpipe.io.columns import Columns
+from tacpipe.io.parquet import to_parquet
 
 
 @dataclass

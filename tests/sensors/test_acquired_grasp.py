@@ -9,12 +9,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tacpipe.channels import schema
+from tacpipe.clouds import ply_points
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import estimated_wrist
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.formats import channels, ply
+from tacpipe.plugins.registry import load
 from tacpipe.recording.reading import Reading
-from tacpipe.registry import load
 from tacpipe.sensors.clouds import Clouds
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -29,7 +30,7 @@ def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
     batch = reading.feed(Chunks.of([(5, chunk)]))
     assert not reading.account.lost
     columns = [column for block in batch.values for column in block.T]
-    return channels.stream(batch.t_ns, columns, sensor.fields())
+    return schema.stream(batch.t_ns, columns, sensor.fields())
 
 
 @pytest.mark.parametrize("kind", ["points", "wrist"])
@@ -41,7 +42,7 @@ def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     told = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
 
     came = {
-        "scene": acquired(Clouds(), ply.packed(whole.cloud.points_m, whole.cloud.colours)),
+        "scene": acquired(Clouds(), ply_points.packed(whole.cloud.points_m, whole.cloud.colours)),
         "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": told}).encode()),
     }
 

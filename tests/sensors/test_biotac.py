@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tacpipe.channels.schema import biotac_fields
 from tacpipe.errors import UsageError
-from tacpipe.formats.channels import biotac_fields
 from tacpipe.sensors.biotac import BioTac, with_parity
 from tests.sensors import made
 

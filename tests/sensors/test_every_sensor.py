@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import registry
 from tacpipe.errors import UsageError
+from tacpipe.plugins import registry
 from tacpipe.recording import rig
 from tacpipe.sensors.framing import Run
 from tacpipe.sensors.sensor import Frames, Samples, Sensor

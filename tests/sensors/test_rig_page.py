@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe import registry
+from tacpipe.plugins import registry
 from tacpipe.recording import rig
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors.framing import Chunks

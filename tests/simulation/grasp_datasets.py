@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
-from tacpipe.hashing import digest
+from tacpipe.channels import biotac_sp
+from tacpipe.io.hashing import digest
 from tacpipe.simulation.grasp import simulate_trial
 from tacpipe.simulation.grasp_scene import Rig
 from tests.stages.conftest import FakeShard

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, Rig, simulate_trial
 from tests.tasks.material.textures import Slide, dataset
 

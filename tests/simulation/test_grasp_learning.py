@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation.grasp_scene import Rig
-from tacpipe.tasks import touch
+from tacpipe.tasks.touch import task as touch
 from tests.asked import fitting
 from tests.simulation.grasp_datasets import grasps, readings
 

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
+from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import depth_camera, household
 from tacpipe.simulation.grasp import session, simulate_trial, stamp_ns
 from tacpipe.simulation.grasp_scene import Rig, Scene, perform, thing
-from tacpipe.stage import Recording
 from tests.simulation.grasp_datasets import SEED
 
 RIG = Rig()
@@ -32,11 +32,11 @@ def scene(index: int, rig: Rig = RIG) -> Scene:
 
 
 @cache
-def recording(index: int, rig: Rig = RIG) -> Recording:
+def recording(index: int, rig: Rig = RIG) -> RecordingOutput:
     return simulate_trial(SEED, index, rig)
 
 
-def truth(made: Recording) -> dict[str, Any]:
+def truth(made: RecordingOutput) -> dict[str, Any]:
     return {name: values[0] for name, values in made.streams["truth"].to_pydict().items()}
 
 

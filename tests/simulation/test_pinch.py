@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation import fingertip_sp, pinch
 from tacpipe.simulation.depth_camera import Placed

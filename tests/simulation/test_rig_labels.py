@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.formats import channels
-from tacpipe.registry import load
+from tacpipe.channels import schema
+from tacpipe.plugins.registry import load
+from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import faults, pick_and_move, taxels
-from tacpipe.stage import Recording
 from tests.stages.conftest import FakeShard
 
 TRIALS = 20
@@ -20,13 +20,13 @@ simulate, synchronize = load("simulate.forward"), load("synchronize")
 contacts, slips = load("segment.contacts"), load("segment.slips")
 
 
-def recorded(trial: int, **rig: Any) -> Recording:
-    found: Recording = simulate(simulate.params(**rig), trial)
+def recorded(trial: int, **rig: Any) -> RecordingOutput:
+    found: RecordingOutput = simulate(simulate.params(**rig), trial)
     return found
 
 
-def synced(recording: Recording, **params: Any) -> Recording:
-    found: Recording = synchronize(synchronize.params(**params), FakeShard(recording.streams))
+def synced(recording: RecordingOutput, **params: Any) -> RecordingOutput:
+    found: RecordingOutput = synchronize(synchronize.params(**params), FakeShard(recording.streams))
     return found
 
 
@@ -127,10 +127,10 @@ def test_held_frames_are_found() -> None:
         counts = np.column_stack([streams["xela1"].column(kind.name).to_numpy() for kind in kinds])
         counts, repeated = faults.hold(counts, probability, np.random.default_rng(trial))
         first = streams["xela1"].select(["t_ns", "t_device_ns", "seq"])
-        again = channels.stream(first.column("t_ns").to_numpy(), counts.T, kinds)
+        again = schema.stream(first.column("t_ns").to_numpy(), counts.T, kinds)
         for name in ("t_device_ns", "seq"):
             again = again.append_column(first.schema.field(name), first.column(name))
-        table = synced(Recording({**streams, "xela1": again}), grid="logged").streams[""]
+        table = synced(RecordingOutput({**streams, "xela1": again}), grid="logged").streams[""]
         rows = np.searchsorted(first.column("seq").to_numpy(), table.column("xela1_seq").to_numpy())
         marked = column(table, "xela1_held")
         hits, found, held = hits + (marked & repeated[rows]).sum(), found + marked.sum(), held + repeated[rows].sum()

@@ -16,15 +16,15 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from tacpipe.metrics import skill
-from tacpipe.registry import load
+from tacpipe.metrics.forecast import skill
+from tacpipe.plugins.registry import load
 from tacpipe.simulation import taxels, trajectory
-from tacpipe.tasks import forward
+from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, told
 from tests.asked import fitting
-from tests.stages.conftest import FakeShard as Shard
+from tests.stages.conftest import FakeShard as Recording
 from tests.stages.learning_fakes import FakeShard, dataset
 
 Floats = NDArray[np.floating[Any]]
@@ -56,8 +56,8 @@ simulate, synchronize, contacts = load("simulate.forward"), load("synchronize"),
 def recorded(index: int, grid: str = "uniform", **rig: Any) -> FakeShard:
     """A segmented trial of the rig."""
     recording = simulate(simulate.params(**rig), index)
-    synced = synchronize(synchronize.params(grid=grid), Shard(recording.streams))
-    table = contacts(contacts.params(), Shard({"": synced.streams[""]})).streams[""]
+    synced = synchronize(synchronize.params(grid=grid), Recording(recording.streams))
+    table = contacts(contacts.params(), Recording({"": synced.streams[""]})).streams[""]
     return FakeShard(f"trial-{index}", table, dict(recording.attributes) | {"grid": grid})
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tacpipe.simulation.slide import Rig
-from tacpipe.simulation.texture_likelihood import likelihood_accuracy
+from tacpipe.testing.texture_likelihood import likelihood_accuracy
 from tests.simulation.slide_datasets import SEED, indices, slides
 from tests.tasks.material.textures import dataset, judged, trained
 

@@ -14,12 +14,12 @@ from numpy.polynomial import polynomial
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from tacpipe.errors import TacpipeError
-from tacpipe.registry import load
+from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins.registry import load
 from tacpipe.signals.axes import is_time, lag_one
 from tacpipe.signals.scrambling import scramble, unscramble
 from tacpipe.simulation import fingertip, forearm
 from tacpipe.simulation.slide import SENSORS, Rig, material, nuisance, place, simulate_trial
-from tacpipe.tables import to_parquet
 
 PLAIN = Rig(pac=False, arm_every=0)
 QUIET = replace(PLAIN, noise_scale=0.0, session_scale=0.0)

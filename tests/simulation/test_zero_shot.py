@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
-from tacpipe.tasks import material
+from tacpipe.tasks.material import task as material
 from tests.asked import fitting
 from tests.stages.conftest import FakeShard
 from tests.tasks.material.textures import Slide, dataset

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import pyarrow as pa
 import pytest
 
-from tacpipe.columns import Columns
-from tacpipe.stage import Attribute
-from tacpipe.tables import to_parquet
+from tacpipe.io.columns import Columns
+from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins.stage import Attribute
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.hashing import digest
+from tacpipe.io.hashing import digest
 
 CHANNELS = [f"xela{sensor}_taxel{taxel:02d}_{axis}" for sensor in (1, 2) for taxel in (1, 2) for axis in "xyz"]
 REST = 16000.0

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe.formats import channels
+from tacpipe.channels import schema
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import IIWA14
 
@@ -23,7 +23,7 @@ def finger(pressure: NDArray[Any], seed: int = 0) -> pa.Table:
     rows = len(pressure)
     counts = rng.integers(10, 60, (44, rows))
     counts[2] = pressure
-    return channels.stream(START_NS + np.arange(rows) * 10_000_000, list(counts), channels.biotac_fields())
+    return schema.stream(START_NS + np.arange(rows) * 10_000_000, list(counts), schema.biotac_fields())
 
 
 def pressed(rows: int = 800, reached: int = 0) -> NDArray[Any]:
@@ -47,15 +47,15 @@ def drawn(rows: int, moves: slice, speed_m_s: float = LIMIT_M_S, rate_hz: float 
     flange_m = kinematics.joint_frames(IIWA14, joint_rad)[:, -1, :3, 3]
     t_ns = START_NS + np.rint(time_s * 1e9).astype(np.int64)
     upright = np.tile([0.0, 1.0, 0.0, 0.0], (count, 1))
-    angles, speeds = channels.joint_fields()
+    angles, speeds = schema.joint_fields()
     velocity = kinematics.hand_velocity(IIWA14, joint_rad, turning, flange_m)
     load = np.tile([0.5, -0.5, 2.0, 0.0, 0.0, 0.0], (count, 1))
     return {
-        "joint_position": channels.stream(t_ns, joint_rad.T, angles),
-        "joint_velocity": channels.stream(t_ns + 1_000_000, turning.T, speeds),
-        "pose": channels.stream(t_ns + 2_000_000, np.column_stack([flange_m, upright]).T, channels.pose_fields()),
-        "twist": channels.stream(t_ns + 3_000_000, velocity.T, channels.twist_fields()),
-        "wrench": channels.stream(t_ns + 4_000_000, load.T, channels.wrench_fields()),
+        "joint_position": schema.stream(t_ns, joint_rad.T, angles),
+        "joint_velocity": schema.stream(t_ns + 1_000_000, turning.T, speeds),
+        "pose": schema.stream(t_ns + 2_000_000, np.column_stack([flange_m, upright]).T, schema.pose_fields()),
+        "twist": schema.stream(t_ns + 3_000_000, velocity.T, schema.twist_fields()),
+        "wrench": schema.stream(t_ns + 4_000_000, load.T, schema.wrench_fields()),
     }
 
 

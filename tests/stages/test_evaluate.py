@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe import registry
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tests.stages.learning_fakes import dataset, motion
 from tests.tasks.forward.trials import compressed, trained
 

@@ -9,53 +9,52 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp, schema
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import channels
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
+from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation.tabletop import OBJECT
-from tacpipe.stage import Recording
 from tests.clouds.scene_fakes import Scene, scene
 
 START_NS = 1_561_629_162_000_000_000
 STEP_NS = 10_000_000
 CLOSED, SETTLED = 130, 160  # rows: both fingers touch, and press as hard as they will
 grasps = load("segment.grasps")
-Shard = Callable[..., Any]
+Recording = Callable[..., Any]
 
 
 def felt(rows: int = 300) -> pa.Table:
     """Return both fingers' stream: channel k has the level 1000 + k, and 300 more from row `SETTLED` on."""
     level = 1000 + np.arange(58)[:, None] + 300 * np.clip((np.arange(rows) - CLOSED) / (SETTLED - CLOSED), 0, 1)
-    return channels.stream(START_NS + np.arange(rows) * STEP_NS, list(np.rint(level)), biotac_sp.fields())
+    return schema.stream(START_NS + np.arange(rows) * STEP_NS, list(np.rint(level)), biotac_sp.fields())
 
 
 def raw(whole: Scene, **other: pa.Table) -> dict[str, pa.Table]:
     return {"scene": whole.cloud.table(), "grasp": whole.grasp.table(START_NS), "biotac_sp": felt(), **other}
 
 
-def cut(recording: Any, **params: Any) -> Recording:
+def cut(recording: Any, **params: Any) -> RecordingOutput:
     found = grasps(grasps.params(**params), recording)
-    assert isinstance(found, Recording)
+    assert isinstance(found, RecordingOutput)
     return found
 
 
 @pytest.fixture(scope="module")
-def simulated() -> list[Recording]:
+def simulated() -> list[RecordingOutput]:
     """Raw grasps of the simulated rig, one of each family of objects."""
     simulate = load("simulate.touch")
     params = simulate.params(trials=6, seed=11, objects=1, raw=True)
     return [simulate(params, trial) for trial in range(6)]
 
 
-def of_truth(recording: Recording, name: str) -> Any:
+def of_truth(recording: RecordingOutput, name: str) -> Any:
     return recording.streams["truth"].column(name)[0].as_py()
 
 
 def test_of_simulated_scenes_nearly_all_points_of_the_object_and_nearly_no_others_are_found(
-    shard: Shard, simulated: list[Recording]
+    shard: Recording, simulated: list[RecordingOutput]
 ) -> None:
     for recording in simulated:
         found = Cloud.of(cut(shard(recording.streams)).streams["cloud"]).points_m
@@ -67,7 +66,7 @@ def test_of_simulated_scenes_nearly_all_points_of_the_object_and_nearly_no_other
 
 
 def test_of_simulated_streams_contact_and_reading_are_those_of_the_truth(
-    shard: Shard, simulated: list[Recording]
+    shard: Recording, simulated: list[RecordingOutput]
 ) -> None:
     for recording in simulated:
         found, stream = cut(shard(recording.streams)), recording.streams["biotac_sp"]
@@ -93,7 +92,7 @@ def test_of_simulated_streams_contact_and_reading_are_those_of_the_truth(
             assert error <= 1 + 4 * channel.std() / np.sqrt(20 / 1.57)  # the spread of a median of 20 rows
 
 
-def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Shard) -> None:
+def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Recording) -> None:
     whole = scene(1)
     truth = pa.table({"t_ns": [START_NS], "gt_force_n": [2.0]})
     found = cut(shard(raw(whole, truth=truth)))
@@ -110,11 +109,11 @@ def test_a_raw_grasp_becomes_the_points_of_its_object_and_one_reading(shard: Sha
     assert found.streams["truth"].equals(truth)
 
 
-def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_one(shard: Shard) -> None:
+def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_one(shard: Recording) -> None:
     found = cut(shard(raw(scene(1))))
     reading = found.streams["reading"]
     assert reading.schema.equals(
-        channels.stream(np.array([0]), [[0]] * 58, biotac_sp.fields()).schema, check_metadata=True
+        schema.stream(np.array([0]), [[0]] * 58, biotac_sp.fields()).schema, check_metadata=True
     )
     assert reading.num_rows == 1
     values = [reading.column(field.name)[0].as_py() for field in biotac_sp.fields()]
@@ -125,7 +124,7 @@ def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_on
     assert SETTLED - 1 <= (reading.column("t_ns")[0].as_py() - START_NS) / STEP_NS <= SETTLED
 
 
-def test_single_wrong_readings_in_the_window_do_not_count(shard: Shard) -> None:
+def test_single_wrong_readings_in_the_window_do_not_count(shard: Recording) -> None:
     stream = felt()
     column = stream.column("mf_electrode07").to_numpy().copy()
     column[[SETTLED + 3, SETTLED + 9]] = 4095
@@ -135,13 +134,13 @@ def test_single_wrong_readings_in_the_window_do_not_count(shard: Shard) -> None:
     assert found.streams["reading"].column("mf_electrode07")[0].as_py() == 1306
 
 
-def test_a_scene_without_colours_gives_a_cloud_without_them(shard: Shard) -> None:
+def test_a_scene_without_colours_gives_a_cloud_without_them(shard: Recording) -> None:
     whole = scene(1)
     found = cut(shard(raw(whole, scene=Cloud(whole.cloud.points_m).table())))
     assert found.streams["cloud"].column_names == ["x_m", "y_m", "z_m"]
 
 
-def test_a_finished_grasp_stays_as_it_is(shard: Shard) -> None:
+def test_a_finished_grasp_stays_as_it_is(shard: Recording) -> None:
     whole = scene(1)
     first = cut(shard(raw(whole)))
     again = cut(shard(first.streams))
@@ -151,7 +150,7 @@ def test_a_finished_grasp_stays_as_it_is(shard: Shard) -> None:
     assert again.attributes == {}
 
 
-def test_a_grasp_that_was_not_made_yet_has_its_object_cut_out_and_no_reading(shard: Shard) -> None:
+def test_a_grasp_that_was_not_made_yet_has_its_object_cut_out_and_no_reading(shard: Recording) -> None:
     whole = raw(scene(1))
     made = cut(shard(whole))
     planned = cut(shard({name: table for name, table in whole.items() if name != "biotac_sp"}))
@@ -161,7 +160,7 @@ def test_a_grasp_that_was_not_made_yet_has_its_object_cut_out_and_no_reading(sha
     assert set(cut(shard(planned.streams)).streams) == set(planned.streams)
 
 
-def test_an_object_that_was_cut_out_already_needs_no_scene(shard: Shard) -> None:
+def test_an_object_that_was_cut_out_already_needs_no_scene(shard: Recording) -> None:
     whole = raw(scene(1))
     first = cut(shard(whole))
     again = cut(shard({"cloud": first.streams["cloud"], "grasp": whole["grasp"], "biotac_sp": whole["biotac_sp"]}))
@@ -169,7 +168,7 @@ def test_an_object_that_was_cut_out_already_needs_no_scene(shard: Shard) -> None
     assert again.streams["reading"].equals(first.streams["reading"])
 
 
-def test_a_sample_that_is_missing_is_no_reading_of_0(shard: Shard) -> None:
+def test_a_sample_that_is_missing_is_no_reading_of_0(shard: Recording) -> None:
     whole = raw(scene(1))
     stream, name = whole["biotac_sp"], "th_electrode07"
     at = stream.column_names.index(name)
@@ -182,7 +181,7 @@ def test_a_sample_that_is_missing_is_no_reading_of_0(shard: Shard) -> None:
         cut(shard({**whole, "biotac_sp": empty}))
 
 
-def test_what_a_raw_grasp_lacks_is_told(shard: Shard) -> None:
+def test_what_a_raw_grasp_lacks_is_told(shard: Recording) -> None:
     whole = raw(scene(1))
     with pytest.raises(TacpipeError, match="Recording trial has no scene; a grasp has the streams scene and grasp"):
         cut(shard({"grasp": whole["grasp"]}))
@@ -190,7 +189,7 @@ def test_what_a_raw_grasp_lacks_is_told(shard: Shard) -> None:
         cut(shard({**whole, "biotac_sp": whole["biotac_sp"].drop_columns("th_pdc")}))
 
 
-def test_what_cannot_be_found_is_told_with_the_recording(shard: Shard) -> None:
+def test_what_cannot_be_found_is_told_with_the_recording(shard: Recording) -> None:
     whole = scene(1)
     away = whole.grasp.moved(np.eye(3), 0.3 * whole.normal)
     with pytest.raises(TacpipeError, match=r"Recording trial: No object is near the grasp: .* mm from the lines"):

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe import registry
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tests.stages.learning_fakes import FakeDataset, dataset
 
 REPORT = registry.load("report")

@@ -12,14 +12,14 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.params import from_json, to_json
-from tacpipe.registry import load
+from tacpipe.plugins.params import from_json, to_json
+from tacpipe.plugins.registry import load
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 segment = load("segment.contacts")
 slips = load("segment.slips")
 synchronize = load("synchronize")
-Shard = Callable[..., Any]
+Recording = Callable[..., Any]
 
 
 def contacts(params: Any, recording: Any) -> pa.Table:
@@ -40,7 +40,7 @@ def table(loads: list[float], sensor: str = "xela1", rest: float = 1000.0) -> pa
     return pa.table(values, schema=pa.schema(fields))
 
 
-def test_contacts_with_their_padding_are_numbered_and_all_rows_stay(shard: Shard) -> None:
+def test_contacts_with_their_padding_are_numbered_and_all_rows_stay(shard: Recording) -> None:
     given = table([0.0] * 50 + [500.0] * 50 + [0.0] * 100 + [500.0] * 50 + [0.0] * 50)
     found = contacts(segment.params(pad_s=0.1), shard({"": given}))
     assert found.column("contact").to_pylist() == [-1] * 45 + [0] * 60 + [-1] * 90 + [1] * 60 + [-1] * 45
@@ -48,13 +48,13 @@ def test_contacts_with_their_padding_are_numbered_and_all_rows_stay(shard: Shard
     assert found.drop_columns(["contact"]).equals(given)
 
 
-def test_the_level_at_rest_is_written_beside_each_channel(shard: Shard) -> None:
+def test_the_level_at_rest_is_written_beside_each_channel(shard: Recording) -> None:
     found = contacts(segment.params(), shard({"": table([0.0] * 50 + [500.0] * 50)}))
     assert float(found.schema.field("xela1_taxel02_z").metadata[b"rest"]) == 1002.0
     assert found.schema.field("xela1_taxel02_z").metadata[b"unit"] == b"count"
 
 
-def test_the_tare_chooses_the_level_that_is_written_and_never_the_contacts(shard: Shard) -> None:
+def test_the_tare_chooses_the_level_that_is_written_and_never_the_contacts(shard: Recording) -> None:
     given = shard({"": table([7.0, *[0.0] * 49, *[500.0] * 50])})  # the first frame is a bad one
     found = {tare: contacts(segment.params(tare=tare), given) for tare in ("median", "first", "axis_mean")}
     levels = {
@@ -72,7 +72,7 @@ def test_the_tare_chooses_the_level_that_is_written_and_never_the_contacts(shard
         assert one.column("contact").equals(found["median"].column("contact"))
 
 
-def test_either_finger_counts(shard: Shard) -> None:
+def test_either_finger_counts(shard: Recording) -> None:
     still, pressed = table([0.0] * 100), table([0.0] * 50 + [500.0] * 50, "xela2")
     both = still
     for field in pressed.schema:
@@ -81,18 +81,18 @@ def test_either_finger_counts(shard: Shard) -> None:
     assert contacts(segment.params(pad_s=0.0), shard({"": both})).column("contact").to_pylist() == [-1] * 50 + [0] * 50
 
 
-def test_a_recording_without_contact_has_none_in_any_row(shard: Shard) -> None:
+def test_a_recording_without_contact_has_none_in_any_row(shard: Recording) -> None:
     found = contacts(segment.params(), shard({"": table([0.0, 50.0] * 50)}))
     assert found.column("contact").to_pylist() == [-1] * 100
     assert found.column_names == [*table([0.0]).column_names, "contact"]
 
 
-def test_a_recording_that_begins_in_the_grasp_is_one_contact(shard: Shard) -> None:
+def test_a_recording_that_begins_in_the_grasp_is_one_contact(shard: Recording) -> None:
     found = contacts(segment.params(begins="grasped"), shard({"": table([0.0] * 30)}))
     assert found.column("contact").to_pylist() == [0] * 30
 
 
-def test_what_cannot_be_is_refused(shard: Shard) -> None:
+def test_what_cannot_be_is_refused(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="has no tactile channel"):
         contacts(segment.params(), shard({"": pa.table({"t_ns": [1]})}))
 
@@ -118,7 +118,7 @@ def overlap(one: pa.Table, other: pa.Table) -> float:
 
 @pytest.mark.parametrize(("unit", "factor"), UNITS)
 def test_contacts_of_simulated_trials_in_any_unit_are_those_in_counts_and_of_the_ground_truth(
-    unit: str, factor: float, shard: Shard
+    unit: str, factor: float, shard: Recording
 ) -> None:
     simulate = load("simulate.forward")
     for trial in range(4):
@@ -134,7 +134,7 @@ def test_contacts_of_simulated_trials_in_any_unit_are_those_in_counts_and_of_the
 
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="published recordings are not here")
-def test_contacts_of_published_trials_in_newtons_are_those_in_counts(shard: Shard) -> None:
+def test_contacts_of_published_trials_in_newtons_are_those_in_counts(shard: Recording) -> None:
     ingest, overlaps = load("ingest.xela-flat"), []
     assert ingest.discover is not None
     found = ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move")
@@ -145,7 +145,7 @@ def test_contacts_of_published_trials_in_newtons_are_those_in_counts(shard: Shar
     assert len(overlaps) == 13 and min(overlaps) > 0.9 and np.median(overlaps) > 0.99
 
 
-def test_thresholds_in_another_unit_stand_in_the_attributes_and_those_in_counts_do_not(shard: Shard) -> None:
+def test_thresholds_in_another_unit_stand_in_the_attributes_and_those_in_counts_do_not(shard: Recording) -> None:
     loads = [*np.random.default_rng(0).normal(0, 1, 50), *[500.0] * 50]
     counted, other = table(loads), in_unit(table(loads, "skin"), "N", 0.01)
     both = pa.table(
@@ -158,7 +158,7 @@ def test_thresholds_in_another_unit_stand_in_the_attributes_and_those_in_counts_
     assert segment(segment.params(), shard({"": counted})).attributes == {} and found.notes == []
 
 
-def test_thresholds_can_be_given_in_the_unit_of_the_stream(shard: Shard) -> None:
+def test_thresholds_can_be_given_in_the_unit_of_the_stream(shard: Recording) -> None:
     given = shard({"": in_unit(table([0.0] * 50 + [50.0] * 50 + [500.0] * 50), "N", 0.01)})
     found = segment(segment.params(on_level=1.0, pad_s=0.0), given)
     assert found.streams[""].column("contact").to_pylist() == [-1] * 100 + [0] * 50
@@ -169,7 +169,7 @@ def test_thresholds_can_be_given_in_the_unit_of_the_stream(shard: Shard) -> None
     assert both.attributes["xela1_contact_off"] == 0.1
 
 
-def test_thresholds_in_a_unit_that_no_stream_has_are_refused(shard: Shard) -> None:
+def test_thresholds_in_a_unit_that_no_stream_has_are_refused(shard: Recording) -> None:
     counted, other = shard({"": table([0.0])}), shard({"": in_unit(table([0.0]), "N", 0.01)})
     with pytest.raises(UsageError, match=r"on_level and off_level are of streams in other units.*xela1 in count"):
         segment(segment.params(on_level=0.5), counted)
@@ -179,7 +179,7 @@ def test_thresholds_in_a_unit_that_no_stream_has_are_refused(shard: Shard) -> No
         segment(segment.params(on_level=0.0), other)
 
 
-def test_a_recording_without_contact_has_a_note_with_thresholds_and_largest_load_in_the_unit(shard: Shard) -> None:
+def test_a_recording_without_contact_has_a_note_with_thresholds_and_largest_load_in_the_unit(shard: Recording) -> None:
     quiet = table([0.0, 50.0] * 50)
     (note,) = segment(segment.params(), shard({"": quiet})).notes
     assert "no contact of 0.3 s or more was found in this recording" in note
@@ -203,7 +203,7 @@ def touched(found: pa.Table) -> np.ndarray:
     return np.asarray(found.column("t_ns").to_numpy()[found.column("contact").to_numpy() >= 0])
 
 
-def test_the_contact_of_a_simulated_trial_is_that_of_its_ground_truth(shard: Shard) -> None:
+def test_the_contact_of_a_simulated_trial_is_that_of_its_ground_truth(shard: Recording) -> None:
     simulate = load("simulate.forward")
     for trial in range(4):
         recording = simulate(simulate.params(duration_s=6.0, friction_scale=4.0), trial)
@@ -243,7 +243,7 @@ def near(found: list[int], *wanted: range) -> bool:
     return inner <= set(found) <= outer
 
 
-def test_a_slip_is_marked_where_the_object_moves_and_known_a_little_later(shard: Shard) -> None:
+def test_a_slip_is_marked_where_the_object_moves_and_known_a_little_later(shard: Recording) -> None:
     found = slips(slips.params(), shard({"": looked_at(fall(300, 150, 30, 120.0))}))
     assert near(marked(found, "slip"), range(150, 181))
     assert 151 < marked(found, "slip_online")[0] <= 156
@@ -253,7 +253,7 @@ def test_a_slip_is_marked_where_the_object_moves_and_known_a_little_later(shard:
         assert found.schema.field(name).metadata == {b"unit": b"1", b"quantity": b"label"}
 
 
-def test_an_object_that_slips_off_the_patch_is_dropped_and_slips_no_more(shard: Shard) -> None:
+def test_an_object_that_slips_off_the_patch_is_dropped_and_slips_no_more(shard: Recording) -> None:
     found = slips(slips.params(saturated_count=0.0), shard({"": looked_at(fall(300, 150, 60, 300.0))}))
     assert marked(found, "dropped") == list(range(191, 300))  # beyond 200 counts, which are 25 mm
     assert near(marked(found, "slip"), range(150, 191))
@@ -263,7 +263,7 @@ def test_an_object_that_slips_off_the_patch_is_dropped_and_slips_no_more(shard: 
     assert marked(nearer, "dropped")[0] == 159
 
 
-def test_outside_of_contacts_nothing_slips_and_each_grasp_begins_anew(shard: Shard) -> None:
+def test_outside_of_contacts_nothing_slips_and_each_grasp_begins_anew(shard: Recording) -> None:
     first, second = fall(300, 150, 30, 300.0), fall(300, 150, 30, 120.0)
     contact = np.r_[np.full(50, -1), np.zeros(200), np.full(50, -1), np.ones(300)]
     found = slips(slips.params(), shard({"": looked_at(np.r_[first, second], contact)}))
@@ -273,7 +273,7 @@ def test_outside_of_contacts_nothing_slips_and_each_grasp_begins_anew(shard: Sha
     assert marked(none, "slip") == marked(none, "slip_online") == marked(none, "dropped") == []
 
 
-def test_rows_without_a_reading_do_not_slip(shard: Shard) -> None:
+def test_rows_without_a_reading_do_not_slip(shard: Recording) -> None:
     distance = fall(300, 150, 30, 120.0)
     distance[160:165] = np.nan
     found = slips(slips.params(), shard({"": looked_at(distance)}))
@@ -281,7 +281,7 @@ def test_rows_without_a_reading_do_not_slip(shard: Shard) -> None:
     assert not set(marked(found, "slip")) & set(range(160, 165))
 
 
-def test_the_online_labels_of_a_recording_do_not_change_with_what_comes_after(shard: Shard) -> None:
+def test_the_online_labels_of_a_recording_do_not_change_with_what_comes_after(shard: Recording) -> None:
     rng = np.random.default_rng(0)
     distance = fall(300, 150, 30, 120.0) + rng.normal(0, 0.4, 300)
     other = np.r_[distance[:170], 600 + rng.normal(0, 30, 130)]
@@ -293,7 +293,7 @@ def test_the_online_labels_of_a_recording_do_not_change_with_what_comes_after(sh
     assert any(now[:170])
 
 
-def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Shard) -> None:
+def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="has 0 columns whose quantity is proximity"):
         slips(slips.params(), shard({"": table([0.0] * 9)}))
     with pytest.raises(TacpipeError, match="no column depth; proximity is in proximity_distance"):
@@ -312,7 +312,7 @@ def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Shard) -> No
 @pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
-def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard: Shard) -> None:
+def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard: Recording) -> None:
     ingest = load("ingest.xela-flat")
     assert ingest.discover is not None
     for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():

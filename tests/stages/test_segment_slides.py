@@ -11,25 +11,25 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import channels
-from tacpipe.registry import load
-from tacpipe.stage import Recording
+from tacpipe.plugins.registry import load
+from tacpipe.plugins.stage import RecordingOutput
 from tests.stages.slide_fakes import START_NS, drawn, finger, pressed, replaced
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 slides = load("segment.slides")
 synchronize = load("synchronize")
-Shard = Callable[..., Any]
+Recording = Callable[..., Any]
 
 
-def cut(recording: Any, **params: Any) -> Recording:
+def cut(recording: Any, **params: Any) -> RecordingOutput:
     found = slides(slides.params(**params), recording)
-    assert isinstance(found, Recording)
+    assert isinstance(found, RecordingOutput)
     return found
 
 
-def rows_of(found: Recording) -> tuple[int, int]:
+def rows_of(found: RecordingOutput) -> tuple[int, int]:
     """Return the first row and the one behind the last, told from the stamps."""
     t_ns = found.streams["slide"].column("t_ns").to_numpy()
     return int(t_ns[0] - START_NS) // 10_000_000, int(t_ns[-1] - START_NS) // 10_000_000 + 1
@@ -37,12 +37,10 @@ def rows_of(found: Recording) -> tuple[int, int]:
 
 def skin(frames: int = 75) -> pa.Table:
     values = np.random.default_rng(0).uniform(0, 190, (60, frames))
-    return channels.stream(
-        np.arange(frames) * 20_000_000, list(values), channels.roboskin_fields(), "from nominal rate"
-    )
+    return schema.stream(np.arange(frames) * 20_000_000, list(values), schema.roboskin_fields(), "from nominal rate")
 
 
-def test_the_middle_of_a_slide_is_kept_with_all_columns_of_the_finger(shard: Shard) -> None:
+def test_the_middle_of_a_slide_is_kept_with_all_columns_of_the_finger(shard: Recording) -> None:
     given = finger(pressed(800))
     found = cut(shard({"biotac": given}))
     assert rows_of(found) == (200, 600)
@@ -58,7 +56,7 @@ def test_the_middle_of_a_slide_is_kept_with_all_columns_of_the_finger(shard: Sha
 
 @pytest.mark.parametrize("reached", [0, 1, 57, 300])
 def test_a_slide_starts_in_the_row_that_reaches_the_trigger_and_goes_on_though_the_pressure_falls(
-    shard: Shard, reached: int
+    shard: Recording, reached: int
 ) -> None:
     given = shard({"biotac": finger(pressed(800, reached))})
     assert rows_of(cut(given, crop="none")) == (reached, 800)
@@ -66,7 +64,7 @@ def test_a_slide_starts_in_the_row_that_reaches_the_trigger_and_goes_on_though_t
     assert rows_of(cut(given, crop="offset", frames=350)) == (reached + 101, reached + 451)
 
 
-def test_an_arm_bounds_the_slide_and_gives_its_profile(shard: Shard) -> None:
+def test_an_arm_bounds_the_slide_and_gives_its_profile(shard: Recording) -> None:
     given = {"biotac": finger(pressed(800, 30)), **drawn(800, slice(60, 740))}
     found = cut(shard(given), crop="none")
     first, stop = rows_of(found)
@@ -83,7 +81,7 @@ def test_an_arm_bounds_the_slide_and_gives_its_profile(shard: Shard) -> None:
     assert found.attributes["outside_protocol"] is False
 
 
-def test_a_speed_that_a_lost_cycle_multiplied_is_filtered_and_stays_in_the_raw_one(shard: Shard) -> None:
+def test_a_speed_that_a_lost_cycle_multiplied_is_filtered_and_stays_in_the_raw_one(shard: Recording) -> None:
     arm = drawn(800, slice(60, 740))
     arm["joint_velocity"] = replaced(arm["joint_velocity"], "joint1_velocity_rad_s", 30, 1.0)  # at rest, row 20
     profile = cut(shard({"biotac": finger(pressed()), **arm}), crop="none").streams["profile"]
@@ -92,7 +90,7 @@ def test_a_speed_that_a_lost_cycle_multiplied_is_filtered_and_stays_in_the_raw_o
     assert profile.column("phase").to_pylist()[:40] == [-1] * 40
 
 
-def test_the_velocity_of_the_controller_counts_where_the_joints_are_missing_or_another_arms(shard: Shard) -> None:
+def test_the_velocity_of_the_controller_counts_where_the_joints_are_missing_or_another_arms(shard: Recording) -> None:
     arm = drawn(800, slice(0, 800), 0.025)
     slow = drawn(800, slice(0, 800), 0.02)["twist"]
     both = {"biotac": finger(pressed()), **arm, "twist": slow}
@@ -105,13 +103,13 @@ def test_the_velocity_of_the_controller_counts_where_the_joints_are_missing_or_a
     assert cut(shard(alone)).attributes["outside_protocol_why"] == "its speed is 20.0 mm/s and not 25.0"
 
 
-def test_an_arm_that_never_moves_leaves_the_slide_to_its_end_and_outside_the_protocol(shard: Shard) -> None:
+def test_an_arm_that_never_moves_leaves_the_slide_to_its_end_and_outside_the_protocol(shard: Recording) -> None:
     found = cut(shard({"biotac": finger(pressed()), **drawn(800, slice(0, 0))}), crop="none")
     assert rows_of(found) == (0, 800)
     assert found.attributes["outside_protocol_why"] == "its speed is 0.0 mm/s and not 25.0"
 
 
-def test_an_arm_without_a_wrench_has_no_force(shard: Shard) -> None:
+def test_an_arm_without_a_wrench_has_no_force(shard: Recording) -> None:
     arm = {name: table for name, table in drawn(800, slice(0, 800)).items() if name != "wrench"}
     found = cut(shard({"biotac": finger(pressed()), **arm}))
     assert "force_n" not in found.attributes
@@ -119,7 +117,7 @@ def test_an_arm_without_a_wrench_has_no_force(shard: Shard) -> None:
 
 
 @pytest.mark.parametrize("grid", [{"grid": "logged", "master": "biotac"}, {"rate_hz": 100.0}])
-def test_a_synchronized_recording_gives_the_same_slide(shard: Shard, grid: dict[str, Any]) -> None:
+def test_a_synchronized_recording_gives_the_same_slide(shard: Recording, grid: dict[str, Any]) -> None:
     streams = {"biotac": finger(pressed(800, 30)), **drawn(800, slice(60, 740))}
     truth = pa.table({"t_ns": streams["biotac"].column("t_ns"), "gt_force_n": pa.array(np.ones(800))})
     synced = synchronize(synchronize.params(**grid), shard({**streams, "truth": truth})).streams[""]
@@ -133,7 +131,7 @@ def test_a_synchronized_recording_gives_the_same_slide(shard: Shard, grid: dict[
     assert set(found.streams) == {"slide", "profile"}
 
 
-def test_single_wrong_readings_are_mended_and_counted_where_they_are_kept(shard: Shard) -> None:
+def test_single_wrong_readings_are_mended_and_counted_where_they_are_kept(shard: Recording) -> None:
     given = finger(pressed())
     for row, name in ((5, "electrode07"), (400, "electrode07"), (400, "electrode19"), (400, "tdc")):
         given = replaced(given, name, row, 3425)
@@ -151,14 +149,14 @@ def test_single_wrong_readings_are_mended_and_counted_where_they_are_kept(shard:
     assert cut(shard({"biotac": given}), crop="none").attributes["spikes"] == 3
 
 
-def test_a_skin_without_pressure_stays_whole(shard: Shard) -> None:
+def test_a_skin_without_pressure_stays_whole(shard: Recording) -> None:
     found = cut(shard({"roboskin": skin()}))
     assert found.streams["slide"].equals(skin())
     assert set(found.streams) == {"slide"}
     assert found.attributes == {"slide_frames": 75, "spikes": 0, "outside_protocol": False}
 
 
-def test_a_slide_that_left_the_protocol_is_kept_and_says_why(shard: Shard) -> None:
+def test_a_slide_that_left_the_protocol_is_kept_and_says_why(shard: Recording) -> None:
     found = cut(shard({"biotac": finger(np.full(500, 160))}))
     assert found.attributes["outside_protocol"] is True
     assert found.attributes["outside_protocol_why"] == (
@@ -166,7 +164,7 @@ def test_a_slide_that_left_the_protocol_is_kept_and_says_why(shard: Shard) -> No
     )
 
 
-def test_recordings_without_a_slide_are_refused_with_a_sentence(shard: Shard) -> None:
+def test_recordings_without_a_slide_are_refused_with_a_sentence(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="Recording trial: The pressure never reaches 40 counts, its most is 39"):
         cut(shard({"biotac": finger(np.full(800, 39))}))
     with pytest.raises(TacpipeError, match=r"Recording trial: The slide has 399 rows from row 0 .* 400 are to be kept"):
@@ -191,7 +189,7 @@ def published() -> dict[str, Any]:
 @pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "biotac_slide_20_50").is_dir(), reason="the published recordings are not here")
-def test_in_published_slides_nothing_but_glitches_is_mended(published: dict[str, Any], shard: Shard) -> None:
+def test_in_published_slides_nothing_but_glitches_is_mended(published: dict[str, Any], shard: Recording) -> None:
     mended: dict[str, int] = {}
     for name, recording in published.items():
         given = recording.streams["biotac"]
@@ -217,7 +215,7 @@ def test_in_published_slides_nothing_but_glitches_is_mended(published: dict[str,
 
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "biotac_slide_20_50").is_dir(), reason="the published recordings are not here")
-def test_published_slides_keep_400_frames_within_the_protocol(published: dict[str, Any], shard: Shard) -> None:
+def test_published_slides_keep_400_frames_within_the_protocol(published: dict[str, Any], shard: Recording) -> None:
     with_arm = 0
     for name, recording in published.items():
         found = cut(shard(recording.streams, name=name))

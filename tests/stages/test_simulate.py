@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
 
 simulate = load("simulate.forward")
 

@@ -10,11 +10,11 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.registry import load
+from tacpipe.plugins.registry import load
 from tests.asked import asked
 
 split = load("split")
-Shard = Callable[..., Any]
+Recording = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class FakeDataset:
     shards: dict[str, Any]
 
 
-def dataset(shard: Shard, count: int) -> FakeDataset:
+def dataset(shard: Recording, count: int) -> FakeDataset:
     return FakeDataset({f"t{i:02d}": shard({}, f"t{i:02d}", {"object": str(i % 4)}) for i in range(count)})
 
 
-def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Shard) -> None:
+def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Recording) -> None:
     result = split(asked("split", scheme="leave-one-out"), dataset(shard, 12))
     assert set(result.recordings) == {"split"}
     table = result.recordings["split"].tables
@@ -35,12 +35,12 @@ def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Shard) ->
     assert set(table.column("role").to_pylist()) == {"train", "val", "test"}
 
 
-def test_the_same_params_give_the_same_table(shard: Shard) -> None:
+def test_the_same_params_give_the_same_table(shard: Recording) -> None:
     tables = [split(asked("split", seed=3), dataset(shard, 20)).recordings["split"].tables for _ in range(2)]
     assert tables[0].equals(tables[1])
 
 
-def test_every_param_reaches_the_scheme(shard: Shard) -> None:
+def test_every_param_reaches_the_scheme(shard: Recording) -> None:
     params = asked("split", scheme="kfold", folds=2, val=0.25, seed=5, stratify="object", apart="object")
     rows = split(params, dataset(shard, 16)).recordings["split"].tables.to_pylist()
     objects = {f"t{i:02d}": i % 4 for i in range(16)}
@@ -49,12 +49,12 @@ def test_every_param_reaches_the_scheme(shard: Shard) -> None:
         assert len(learned) == 2
 
 
-def test_a_missing_attribute_is_an_error_sentence(shard: Shard) -> None:
+def test_a_missing_attribute_is_an_error_sentence(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="has no attribute authors_role"):
         split(asked("split", scheme="authors"), dataset(shard, 3))
 
 
-def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -> None:
+def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Recording) -> None:
     given = dataset(shard, 16)
     few = asked("split", test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
     rows = split(few, given).recordings["split"].tables.to_pylist()
@@ -84,7 +84,7 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Shard) -
     ],
 )
 def test_folds_without_validation_recordings_are_noted_with_a_share_that_gives_them_some(
-    params: dict[str, Any], count: int, wanted: str, shard: Shard
+    params: dict[str, Any], count: int, wanted: str, shard: Recording
 ) -> None:
     (note,) = split(asked("split", **params), dataset(shard, count)).notes
     assert wanted in note
@@ -95,6 +95,6 @@ def test_folds_without_validation_recordings_are_noted_with_a_share_that_gives_t
 
 @pytest.mark.parametrize(("params", "count"), [({"val": 0.0}, 3), ({}, 12), ({"scheme": "kfold", "val": 0.0}, 5)])
 def test_a_split_with_validation_recordings_or_asked_for_without_has_no_note(
-    params: dict[str, Any], count: int, shard: Shard
+    params: dict[str, Any], count: int, shard: Recording
 ) -> None:
     assert split(asked("split", **params), dataset(shard, count)).notes == []

@@ -12,16 +12,16 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import channels
-from tacpipe.registry import load
-from tacpipe.stage import Recording
+from tacpipe.plugins.registry import load
+from tacpipe.plugins.stage import RecordingOutput
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 T0 = 1_637_771_974_778_354_001
 MS = 1_000_000
 synchronize = load("synchronize")
-Shard = Callable[..., Any]
+Recording = Callable[..., Any]
 
 
 def params(**values: Any) -> Any:
@@ -31,22 +31,22 @@ def params(**values: Any) -> Any:
 def uskin(t_ms: np.ndarray, values: np.ndarray | None = None) -> pa.Table:
     if values is None:
         values = np.random.default_rng(0).integers(14_000, 46_000, (len(t_ms), 48))
-    return channels.stream(T0 + np.asarray(t_ms) * MS, values.T, channels.uskin_fields())
+    return schema.stream(T0 + np.asarray(t_ms) * MS, values.T, schema.uskin_fields())
 
 
 def robot(t_ms: np.ndarray) -> pa.Table:
     turned = Rotation.random(len(t_ms), rng=np.random.default_rng(1)).as_quat()
     pose = np.column_stack([np.sin(t_ms / 100), t_ms, t_ms * 2, turned])
-    return channels.stream(T0 + np.asarray(t_ms) * MS, pose.T, channels.pose_fields())
+    return schema.stream(T0 + np.asarray(t_ms) * MS, pose.T, schema.pose_fields())
 
 
 def run(shard: Any, **values: Any) -> tuple[pa.Table, Any]:
     recording = synchronize(params(**values), shard)
-    assert isinstance(recording, Recording)
+    assert isinstance(recording, RecordingOutput)
     return recording.streams[""], recording.attributes
 
 
-def test_the_grid_starts_with_the_first_tactile_stream_and_ends_where_a_stream_does(shard: Shard) -> None:
+def test_the_grid_starts_with_the_first_tactile_stream_and_ends_where_a_stream_does(shard: Recording) -> None:
     table, attributes = run(
         shard(
             {"robot": robot(np.arange(-30, 95)), "xela2": uskin(np.arange(3, 200)), "xela1": uskin(np.arange(0, 150))}
@@ -57,7 +57,7 @@ def test_the_grid_starts_with_the_first_tactile_stream_and_ends_where_a_stream_d
     assert attributes["grid_rate_hz"] == 50.0
 
 
-def test_values_are_those_of_numpy_interp_and_scipy_slerp(shard: Shard) -> None:
+def test_values_are_those_of_numpy_interp_and_scipy_slerp(shard: Recording) -> None:
     t_ms = np.cumsum(np.random.default_rng(2).integers(1, 30, 40))
     tactile, arm = uskin(t_ms), robot(t_ms)
     table, _ = run(shard({"xela1": tactile, "robot": arm}), rate_hz=120.0)
@@ -73,8 +73,8 @@ def test_values_are_those_of_numpy_interp_and_scipy_slerp(shard: Shard) -> None:
     assert table.schema.field("robot_position_x_m").type == pa.float64()
 
 
-def test_every_channel_tells_where_it_came_from_and_how(shard: Shard) -> None:
-    labels = channels.stream(T0 + np.arange(1, 100, 3) * MS, [np.arange(33) % 2], [channels.label_field("slip")])
+def test_every_channel_tells_where_it_came_from_and_how(shard: Recording) -> None:
+    labels = schema.stream(T0 + np.arange(1, 100, 3) * MS, [np.arange(33) % 2], [schema.label_field("slip")])
     t_ms = np.arange(0, 100, 9)
     table, _ = run(shard({"xela1": uskin(t_ms), "robot": robot(t_ms), "slip": labels}))
     for column, how, quantity in (
@@ -88,7 +88,7 @@ def test_every_channel_tells_where_it_came_from_and_how(shard: Shard) -> None:
     assert table.schema.field("slip_slip").type == pa.int8()
 
 
-def test_wide_integers_become_float64_and_device_clocks_stay_integers(shard: Shard) -> None:
+def test_wide_integers_become_float64_and_device_clocks_stay_integers(shard: Recording) -> None:
     t_ms = np.arange(0, 100, 7)
     table = uskin(t_ms)
     table = table.append_column("wide", pa.array(t_ms * 10**9)).append_column("seq", pa.array(np.arange(len(t_ms))))
@@ -97,7 +97,7 @@ def test_wide_integers_become_float64_and_device_clocks_stay_integers(shard: Sha
     assert found.schema.field("xela1_seq").type == pa.int64()
 
 
-def test_holds_gaps_and_distances_are_marked(shard: Shard) -> None:
+def test_holds_gaps_and_distances_are_marked(shard: Recording) -> None:
     t_ms = np.array([0, 20, 41, 60, 140, 160])
     values = np.repeat(np.arange(6)[:, None], 48, axis=1)
     values[2] = values[1]
@@ -109,7 +109,7 @@ def test_holds_gaps_and_distances_are_marked(shard: Shard) -> None:
     assert attributes["xela1_fresh_hz"] == pytest.approx(4 / 0.16)
 
 
-def test_on_the_logged_grid_values_at_equal_stamps_stay_as_they_are(shard: Shard) -> None:
+def test_on_the_logged_grid_values_at_equal_stamps_stay_as_they_are(shard: Recording) -> None:
     t_ms = np.array([0, 10, 10, 25, 60])
     tactile, arm = uskin(t_ms), robot(t_ms[:-1])
     table, _ = run(shard({"xela1": tactile, "robot": arm, "other": robot(np.arange(-5, 70, 2))}), grid="logged")
@@ -123,7 +123,7 @@ def test_on_the_logged_grid_values_at_equal_stamps_stay_as_they_are(shard: Shard
     assert table.schema.field("other_orientation_x").metadata[b"interpolation"] == b"slerp"
 
 
-def test_on_the_fresh_grid_are_the_rows_of_the_master_that_are_not_held(shard: Shard) -> None:
+def test_on_the_fresh_grid_are_the_rows_of_the_master_that_are_not_held(shard: Recording) -> None:
     t_ms = np.array([0, 10, 10, 25, 60, 70])
     values = np.random.default_rng(3).integers(14_000, 46_000, (6, 48))
     values[2], values[4] = values[1], values[3]  # the held row 2 has the stamp of row 1
@@ -162,7 +162,7 @@ def late(seconds: int = 10) -> tuple[pa.Table, np.ndarray]:
     return table.set_column(0, table.schema.field("t_ns"), pa.array(T0 + arrival_ns)), (taken_ns * 1.00004).astype(int)
 
 
-def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Shard) -> None:
+def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Recording) -> None:
     table, device_ns = late()
     streams = {"xela1": with_device(table, device_ns), "robot": robot(np.arange(0, 9000))}
     errors = {}
@@ -179,7 +179,7 @@ def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Shard) -> No
     assert np.median(errors["arrival"]) > 2
 
 
-def test_the_fit_of_each_clock_is_an_attribute(shard: Shard) -> None:
+def test_the_fit_of_each_clock_is_an_attribute(shard: Recording) -> None:
     table, device_ns = late()
     _, attributes = run(shard({"xela1": with_device(table, device_ns)}), clock="device")
     assert attributes["xela1_clock_offset_ms"] == pytest.approx(T0 / MS, abs=0.2)
@@ -187,16 +187,14 @@ def test_the_fit_of_each_clock_is_an_attribute(shard: Shard) -> None:
     assert attributes["xela1_clock_residual_ms"] == pytest.approx(3 * np.log(2), rel=0.2)
 
 
-def test_ground_truth_needs_no_device(shard: Shard) -> None:
+def test_ground_truth_needs_no_device(shard: Recording) -> None:
     table, device_ns = late()
-    truth = channels.stream(
-        T0 + np.arange(9000) * MS, [np.zeros(9000)], [channels.float_field("gt_mass_kg", "kg", "mass")]
-    )
+    truth = schema.stream(T0 + np.arange(9000) * MS, [np.zeros(9000)], [schema.float_field("gt_mass_kg", "kg", "mass")])
     found, _ = run(shard({"xela1": with_device(table, device_ns), "truth": truth}), clock="device")
     assert "gt_mass_kg" in found.column_names
 
 
-def test_a_device_clock_that_is_none_is_named_with_its_stream(shard: Shard) -> None:
+def test_a_device_clock_that_is_none_is_named_with_its_stream(shard: Recording) -> None:
     table, device_ns = late()
     with pytest.raises(
         TacpipeError, match=r"Recording trial, stream 'xela1': .* stands still at 7 ns .*--clock arrival"
@@ -208,12 +206,12 @@ def test_a_device_clock_that_is_none_is_named_with_its_stream(shard: Shard) -> N
 
 
 def test_proximity_is_the_median_of_the_readings_around_and_lies_between_them_where_there_are_none(
-    shard: Shard,
+    shard: Recording,
 ) -> None:
     t_ms = np.r_[np.arange(0, 100, 2.5), np.arange(150, 201, 2.5)]
     counts = np.random.default_rng(0).integers(544, 757, len(t_ms))
     field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
-    near = channels.stream(T0 + (t_ms * MS).astype(int), [counts], [field])
+    near = schema.stream(T0 + (t_ms * MS).astype(int), [counts], [field])
     table, _ = run(shard({"xela1": uskin(np.arange(0, 220, 20)), "proximity": near}))
     wanted = []
     for point in np.arange(0, 201, 20):
@@ -226,7 +224,7 @@ def test_proximity_is_the_median_of_the_readings_around_and_lies_between_them_wh
     assert table.column("proximity_gap").to_pylist()[6:7] == [True]
 
 
-def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shard: Shard) -> None:
+def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shard: Recording) -> None:
     t_ms = np.arange(0, 200, 10)
     walk = np.full((20, 48), 30_000)
     walk[:, 5] = 65_000 + 100 * np.arange(20)
@@ -251,7 +249,7 @@ def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shar
 @pytest.mark.long
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
-def test_nothing_wraps_in_the_published_trials(shard: Shard) -> None:
+def test_nothing_wraps_in_the_published_trials(shard: Recording) -> None:
     ingest = load("ingest.xela-flat")
     assert ingest.discover is not None
     for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
@@ -261,25 +259,25 @@ def test_nothing_wraps_in_the_published_trials(shard: Shard) -> None:
         assert {found.schema.field(name).type for name in found.column_names if "_taxel" in name} == {pa.uint16()}
 
 
-def test_ground_truth_keeps_its_names_and_has_no_masks(shard: Shard) -> None:
+def test_ground_truth_keeps_its_names_and_has_no_masks(shard: Recording) -> None:
     t_ms = np.arange(0, 200)
-    truth = channels.stream(T0 + t_ms * MS, [t_ms / 2], [channels.float_field("gt_force_n", "N", "force")])
+    truth = schema.stream(T0 + t_ms * MS, [t_ms / 2], [schema.float_field("gt_force_n", "N", "force")])
     table, attributes = run(shard({"xela1": uskin(t_ms), "truth": truth, "events": truth.slice(0, 0)}))
     assert table.column("gt_force_n").to_pylist() == [k * 10.0 for k in range(10)]
     assert not any("truth" in name or "events" in name for name in [*table.column_names, *attributes])
 
 
-def test_an_unseen_marker_stays_unseen(shard: Shard) -> None:
+def test_an_unseen_marker_stays_unseen(shard: Recording) -> None:
     t_ms = np.arange(0, 100, 20)
     pose = np.repeat([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]], 5, axis=0)
     pose[2] = np.nan
-    marker = channels.stream(T0 + t_ms * MS, pose.T, channels.pose_fields())
+    marker = schema.stream(T0 + t_ms * MS, pose.T, schema.pose_fields())
     table, _ = run(shard({"xela1": uskin(t_ms), "marker": marker}), rate_hz=100.0)
     for column in ("marker_position_x_m", "marker_orientation_w"):
         assert np.isnan(table.column(column).to_numpy()).tolist() == [False] * 3 + [True] * 3 + [False] * 3
 
 
-def test_time_that_runs_backwards_is_named_with_stream_and_row(shard: Shard) -> None:
+def test_time_that_runs_backwards_is_named_with_stream_and_row(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match=r"Recording trial: the time of stream 'robot' runs backwards at row 2"):
         run(shard({"xela1": uskin(np.arange(9)), "robot": robot(np.array([0, 5, 4]))}))
 
@@ -292,12 +290,12 @@ def test_time_that_runs_backwards_is_named_with_stream_and_row(shard: Shard) -> 
         ({"rate_hz": 0.0}, "gives no grid"),
     ],
 )
-def test_params_that_cannot_be_are_refused(shard: Shard, values: dict[str, Any], message: str) -> None:
+def test_params_that_cannot_be_are_refused(shard: Recording, values: dict[str, Any], message: str) -> None:
     with pytest.raises(TacpipeError, match=message):
         run(shard({"xela1": uskin(np.arange(9)), "robot": robot(np.arange(9))}), **values)
 
 
-def test_streams_without_common_time_rows_or_touch_are_refused(shard: Shard) -> None:
+def test_streams_without_common_time_rows_or_touch_are_refused(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="no time in common"):
         run(shard({"xela1": uskin(np.arange(9)), "robot": robot(np.arange(20, 30))}))
     with pytest.raises(TacpipeError, match="stream 'robot' has no rows"):
@@ -306,7 +304,7 @@ def test_streams_without_common_time_rows_or_touch_are_refused(shard: Shard) -> 
         run(shard({"robot": robot(np.arange(9))}))
 
 
-def test_half_a_quaternion_is_refused(shard: Shard) -> None:
+def test_half_a_quaternion_is_refused(shard: Recording) -> None:
     t_ms = np.arange(0, 100, 7)
     with pytest.raises(TacpipeError, match="needs x, y, z and w once each"):
         run(shard({"xela1": uskin(t_ms), "robot": robot(t_ms).drop_columns(["orientation_w"])}))

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe import registry
-from tacpipe.dataset import Dataset
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tests.asked import asked
 from tests.stages.learning_fakes import dataset, motion
 from tests.tasks.forward.trials import SMALL, compressed

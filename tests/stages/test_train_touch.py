@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import tacpipe
-from tacpipe import registry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tests.asked import asked
 from tests.conftest import Lab
 from tests.tasks.touch.handmade import dataset, recordings

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import tacpipe
-from tacpipe import registry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import UsageError
+from tacpipe.plugins import registry
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tests.conftest import Lab
 
@@ -67,8 +67,8 @@ def test_the_steps_from_python_are_those_of_the_command() -> None:
 
 
 def test_a_recording_that_no_dataset_was_opened_for_says_where_to_take_it_from() -> None:
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
-    shard = Shard("trial-000", {"attributes": {}, "shards": {}}, lambda digest, path: b"")
+    shard = Recording("trial-000", {"attributes": {}, "shards": {}}, lambda digest, path: b"")
     with pytest.raises(UsageError, match=r"trial-000 is not of an opened dataset\. Take it from tacpipe\.open"):
         _ = shard.alone

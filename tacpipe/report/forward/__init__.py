@@ -10,7 +10,7 @@ from tacpipe.report.forward import methods, overview, representations, section, 
 from tacpipe.report.forward.overview import Overview
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 IN_FULL = 2  # results that are told in full where there are no more
 

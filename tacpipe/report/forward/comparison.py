@@ -1,7 +1,7 @@
 """Methods and baselines beside each other: errors, skill over persistence, and how sure both are.
 
 Runs of a method are pooled: the sums of a recording that several runs were judged on are added and stay together, and
-intervals come from drawing whole recordings anew (`tacpipe.metrics`).
+intervals come from drawing whole recordings anew (`tacpipe.metrics.forecast`).
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import metrics
-from tacpipe.headline import Headline
-from tacpipe.headlines import forward as headlines
-from tacpipe.headlines.pairing import Sums
-from tacpipe.metrics import Interval
+from tacpipe.metrics import forecast
+from tacpipe.metrics.forecast import Interval
+from tacpipe.metrics.headline import Headline
+from tacpipe.metrics.pairing import Sums
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method, Run
 from tacpipe.report.spread import Spread, spread
+from tacpipe.tasks.forward import headline as headlines
 
 Floats = NDArray[np.floating[Any]]
 
-_draws = functools.lru_cache(maxsize=8)(metrics.draws)
+_draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def skill(pooled: Pool, steps: Sequence[int]) -> Interval:
     mean = _skills(np.ones((1, count)), pooled, steps)[0]
     if count < 2:
         return Interval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
-    return Interval(mean, *metrics.bounds(_skills(_draws(count), pooled, steps)))
+    return Interval(mean, *forecast.bounds(_skills(_draws(count), pooled, steps)))
 
 
 def difference(one: Pool, other: Pool, steps: Sequence[int]) -> Interval | None:
@@ -154,7 +154,7 @@ def difference(one: Pool, other: Pool, steps: Sequence[int]) -> Interval | None:
     if len(common) < 2:
         return Interval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
     drawn = _draws(len(common))
-    return Interval(mean, *metrics.bounds(_skills(drawn, pair[0], steps) - _skills(drawn, pair[1], steps)))
+    return Interval(mean, *forecast.bounds(_skills(drawn, pair[0], steps) - _skills(drawn, pair[1], steps)))
 
 
 def headline(method: Method, others: Sequence[Method], steps: Sequence[int], known: bool | None) -> Headline | None:
@@ -256,7 +256,7 @@ def _part(run: Run, predictor: str, group: str, known: bool | None) -> Pool | No
 
 def _skills(weights: NDArray[Any], pooled: Pool, steps: Sequence[int]) -> Floats:
     """Return skill at ``steps`` and its mean, (draw, step + 1), each recording counted as ``weights`` (draw, it) say."""
-    found = metrics.skill(
+    found = forecast.skill(
         weights @ pooled.at(pooled.squared, steps), weights @ pooled.at(pooled.baseline, steps)
     )  # (draw, step)
     return np.hstack([found, found.mean(axis=1, keepdims=True)])

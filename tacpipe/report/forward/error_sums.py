@@ -64,7 +64,7 @@ def read(content: bytes) -> ErrorSums:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    from tacpipe.tables import owned
+    from tacpipe.io.parquet import owned
 
     schema = pq.read_schema(pa.BufferReader(owned(content)))
     missing = [name for name in COLUMNS if name not in schema.names]

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import params as params_of
-from tacpipe import registry
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tacpipe.report.forward import error_sums
 from tacpipe.report.forward.error_sums import ErrorSums
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
 

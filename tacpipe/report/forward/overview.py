@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe import headline as headline_of
-from tacpipe.headline import Headline, counted
-from tacpipe.metrics import Interval
+from tacpipe.metrics import headline as headline_of
+from tacpipe.metrics.forecast import Interval
+from tacpipe.metrics.headline import Headline, counted
 from tacpipe.report import headline_box, markup, provenance
 from tacpipe.report.forward import comparison, figures, representations, sweep, tables, traces
 from tacpipe.report.forward import methods as by_method
@@ -21,7 +21,7 @@ from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method, Run
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FIGURE_STEPS = (3, 5, 10)  # those of the paper's figures 5 and 6

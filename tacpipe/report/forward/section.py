@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe import headline as headline_of
-from tacpipe.headline import Headline
-from tacpipe.headlines.forward import legitimate
+from tacpipe.metrics import headline as headline_of
+from tacpipe.metrics.headline import Headline
 from tacpipe.report import contents, headline_box, markup, provenance
 from tacpipe.report.forward import comparison, figures, methods, traces
+from tacpipe.tasks.forward.headline import legitimate
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
 
@@ -58,7 +58,7 @@ def headlines(result: Dataset) -> list[Headline]:
 
 
 def sentences(found: Sequence[Headline], metrics: Tree) -> list[tuple[str, str]]:
-    """Return the result in a sentence or two, each with its verdict (`tacpipe.headline.verdict`)."""
+    """Return the result in a sentence or two, each with its verdict (`tacpipe.metrics.headline.verdict`)."""
     if found:
         return [(headline_of.sentence(one), one.verdict) for one in found]
     if "skill" not in metrics:

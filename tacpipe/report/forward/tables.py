@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from tacpipe.metrics import Interval
+from tacpipe.metrics.forecast import Interval
 from tacpipe.report import markup
 from tacpipe.report.forward import comparison
 from tacpipe.report.forward import methods as by_method

@@ -11,7 +11,7 @@ from tacpipe.report.drawing import Floats
 from tacpipe.report.forward import figures
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
 SHOWN_S = 12.0  # seconds of a recording that are drawn
 UNSHIFTED = (
@@ -20,7 +20,7 @@ UNSHIFTED = (
 )
 
 
-def draw(shard: Shard, latents: Sequence[int], steps: Sequence[int]) -> str:
+def draw(shard: Recording, latents: Sequence[int], steps: Sequence[int]) -> str:
     """Return the first seconds of some latents of a recording, by their place from 0, and what was predicted of them.
 
     Latents and steps that the recording does not hold are left out; empty where none is left.

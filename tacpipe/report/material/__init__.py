@@ -10,7 +10,7 @@ from tacpipe.report.material import grouping, overview, profiles
 from tacpipe.report.material.methods import Run
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 TITLE = "recognition of materials by touch"
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.proportions import wilson
+from tacpipe.metrics.proportions import wilson
 from tacpipe.report.material.methods import Run
 from tacpipe.report.material.predictions import LEVEL, MODEL, NOTHING
 

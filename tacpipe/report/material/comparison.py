@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe import metrics
-from tacpipe.proportions import mcnemar, paired_t
+from tacpipe.metrics import forecast
+from tacpipe.metrics.proportions import mcnemar, paired_t
 from tacpipe.report.material import accuracy
 from tacpipe.report.material.methods import Method, Run
 from tacpipe.report.material.predictions import MODEL
 
-_draws = functools.lru_cache(maxsize=8)(metrics.draws)
+_draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def difference(
     places = [dict(zip(found.recordings, found.share, strict=True)) for found in (one, other)]
     shares = np.array([[place[name] for name in common] for place in places])  # (method, slide)
     gain = shares[0] - shares[1]
-    low, high = metrics.bounds((_draws(len(common)) @ gain / len(common))[:, None])
+    low, high = forecast.bounds((_draws(len(common)) @ gain / len(common))[:, None])
     right = shares >= 0.5
     unit, pairs = _paired(first, second, sensor, predictors)
     return Difference(

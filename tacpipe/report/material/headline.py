@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tacpipe.headline import Headline, clause
-from tacpipe.headlines import material as headlines_of
+from tacpipe.metrics.headline import Headline, clause
 from tacpipe.report import markup
 from tacpipe.report.material import comparison, curves, tables, wording, zero_shot
 from tacpipe.report.material.accuracy import Accuracy, accuracy, named_right
 from tacpipe.report.material.comparison import Difference
 from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import SWAPPED
+from tacpipe.tasks.material import headline as headlines_of
 
 ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
 APART = 0.2  # of accuracy: where exchanging classifiers costs more, there is no alignment to explain

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import params as params_of
-from tacpipe import registry
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tacpipe.report import contents, provenance
 from tacpipe.report.material import predictions
 from tacpipe.report.material.predictions import Predictions
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
 

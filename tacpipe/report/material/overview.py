@@ -24,7 +24,7 @@ from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import LAST, LEVEL
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 PAIRED = (
     "A slide that several runs judged counts as the share of runs that named it right; the interval is from drawing slides "

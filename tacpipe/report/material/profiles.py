@@ -14,7 +14,7 @@ from tacpipe.report.material import figures, wording
 from tacpipe.report.material.methods import PAPERS_SETS, ordered, shown
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 SLIDE, PROFILE = "slide", "profile"
 
@@ -40,17 +40,17 @@ def section(datasets: Sequence[Dataset]) -> str:
     return f"<h3>The slides</h3>{markup.note(' '.join(parts))}{''.join(drawn)}"
 
 
-def typical(shards: Sequence[Shard]) -> Shard:
+def typical(shards: Sequence[Recording]) -> Recording:
     """Return the slide of median force among those that kept to the protocol, or among all where none did."""
     kept = [one for one in shards if not one.attributes.get("outside_protocol")] or list(shards)
 
-    def force(shard: Shard) -> tuple[float, str]:
+    def force(shard: Recording) -> tuple[float, str]:
         return float(shard.attributes.get("force_n") or 0.0), shard.name
 
     return sorted(kept, key=force)[len(kept) // 2]
 
 
-def _counts(shards: Sequence[Shard], sensor: str) -> str:
+def _counts(shards: Sequence[Recording], sensor: str) -> str:
     """Return how many slides there are of a sensor, and how many kept to the protocol."""
     outside = [one for one in shards if one.attributes.get("outside_protocol")]
     some = f"{len(shards):,} slide{'s' if len(shards) > 1 else ''}"
@@ -62,7 +62,7 @@ def _counts(shards: Sequence[Shard], sensor: str) -> str:
     return text + (f" ({listed(told)})." if told else ".")
 
 
-def _figures(shard: Shard, sensor: str, published: bool) -> str:
+def _figures(shard: Recording, sensor: str, published: bool) -> str:
     """Return force and speed of one slide."""
     table = shard.table(PROFILE)
     time_ns = table["t_ns"].to_numpy()

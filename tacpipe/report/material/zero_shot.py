@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.proportions import wilson
+from tacpipe.metrics.proportions import wilson
 from tacpipe.report import markup
 from tacpipe.report.markup import NONE
 from tacpipe.report.material import wording

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from tacpipe.report import plain
 from tacpipe.report.touch import clouds, overview
 from tacpipe.report.touch.methods import Run, grouped
-from tacpipe.touch_results import PREDICTIONS
+from tacpipe.tasks.touch.result_names import PREDICTIONS
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 TITLE = "prediction of fingertip readings from point clouds"
 

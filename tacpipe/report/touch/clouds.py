@@ -13,7 +13,7 @@ from tacpipe.report import markup
 from tacpipe.report.touch import figures
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 CLOUD, GRASP = "cloud", "grasp"
 SHOWN = 3
@@ -43,11 +43,11 @@ def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
     return f'<h3>Clouds and their grasps</h3><div class="pair">{"".join(drawn)}</div>{markup.note(note)}'
 
 
-def _whole(shard: Shard) -> bool:
+def _whole(shard: Recording) -> bool:
     return {CLOUD, GRASP} <= set(getattr(shard, "streams", ()))
 
 
-def _figure(shard: Shard, words: str) -> str:
+def _figure(shard: Recording, words: str) -> str:
     cloud, grasp = Cloud.of(shard.table(CLOUD)), Grasp.of(shard.table(GRASP))
     contacts = np.array([grasp.g1_m, grasp.g2_m])
     svg = figures.cloud(cloud.points_m.astype(np.float64), contacts, f"Cloud and grasp of {shard.name}")

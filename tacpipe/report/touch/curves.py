@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.report import epochs, markup
 from tacpipe.report.touch import forms, wording
 from tacpipe.report.touch.methods import PAPERS, Group, Method, Run

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe import biotac_sp, regression
+from tacpipe.channels import biotac_sp
+from tacpipe.metrics import regression
 from tacpipe.report import markup
 from tacpipe.report.touch import fingertip, scores, wording
 from tacpipe.report.touch.fingertip import Fingertip
 from tacpipe.report.touch.methods import Method, Run
 from tacpipe.report.touch.predictions import Predictions
-from tacpipe.touch_results import CONSTANT, MODEL
+from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 FINGERS = ("e_th", "e_mf")
 PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # by error, of the grasps that are drawn

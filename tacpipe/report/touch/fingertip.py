@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.report.drawing import COLOURS, FAINT, svg
 
 if TYPE_CHECKING:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tacpipe import headline as headline_of
-from tacpipe.headline import BETTER, UNCLEAR, WORSE, Headline
+from tacpipe.metrics import headline as headline_of
+from tacpipe.metrics.headline import BETTER, UNCLEAR, WORSE, Headline
 from tacpipe.report.markup import listed
 from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import DEFAULT, Group, Method

@@ -7,16 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe import biotac_sp, registry
-from tacpipe import params as params_of
+from tacpipe.channels import biotac_sp
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tacpipe.report import contents, provenance
 from tacpipe.report.naming import told_apart
 from tacpipe.report.touch import predictions
 from tacpipe.report.touch.predictions import Predictions
-from tacpipe.touch_results import PREDICTIONS
+from tacpipe.tasks.touch.result_names import PREDICTIONS
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
 

@@ -13,7 +13,7 @@ from tacpipe.report.touch import methods as by_method
 from tacpipe.report.touch.methods import Group, Method
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 BADGE = ' <span class="badge">simulated</span>'
 MIXED = " What is marked simulated is no evidence about a real sensor."

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
-from tacpipe.touch_results import GRASPS, MODEL, TRUE
+from tacpipe.channels import biotac_sp
+from tacpipe.tasks.touch.result_names import GRASPS, MODEL, TRUE
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
 Floats = NDArray[np.float64]
 Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
@@ -59,7 +59,7 @@ class Predictions:
         return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, said, t_ns)
 
 
-def read(shard: Shard) -> Predictions:
+def read(shard: Recording) -> Predictions:
     """Return what the recording ``predictions`` of a result says of grasps that its model has not seen."""
     grasps = shard.table(GRASPS)
     others = {name: _touch(shard.table(name)) for name in shard.streams if name != GRASPS}

@@ -8,7 +8,7 @@ from tacpipe.report import markup
 from tacpipe.report.touch import figures, wording
 from tacpipe.report.touch.figures import Scattered
 from tacpipe.report.touch.methods import Method
-from tacpipe.touch_results import CONSTANT, MODEL
+from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 PRESSURES = ("pdc_th", "pdc_mf")
 SHOWN = 800  # grasps of a figure

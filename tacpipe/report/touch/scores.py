@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp, regression
-from tacpipe.headline import Headline
-from tacpipe.headlines import touch as headlines
-from tacpipe.regression import Interval
+from tacpipe.channels import biotac_sp
+from tacpipe.metrics import regression
+from tacpipe.metrics.headline import Headline
+from tacpipe.metrics.regression import Interval
 from tacpipe.report.spread import Spread, spread
 from tacpipe.report.touch.methods import Method, Run
-from tacpipe.touch_results import CONSTANT, MODEL
+from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 Floats = NDArray[np.floating[Any]]
 

@@ -10,7 +10,7 @@ from tacpipe.report.markup import NONE
 from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import Group, Method, Run
 from tacpipe.report.touch.scores import Score
-from tacpipe.touch_results import MODEL, OBJECT_MEAN
+from tacpipe.tasks.touch.result_names import MODEL, OBJECT_MEAN
 
 HEADS = (
     "RMSE",

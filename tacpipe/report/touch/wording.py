@@ -11,7 +11,7 @@ from tacpipe.report.markup import NONE
 from tacpipe.report.touch import printed
 from tacpipe.report.touch.methods import PAPERS, Method, Run
 from tacpipe.report.touch.scores import Score
-from tacpipe.touch_results import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
+from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
 TARGETS = {
     "pdc_th": "PDC thumb",

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tacpipe import params
 from tacpipe.errors import UsageError
+from tacpipe.plugins import params
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.simulation.emulation import disguise
-from tacpipe.simulation.emulation.happening import Happening
+from tacpipe.simulation.emulation import undetectable_faults
+from tacpipe.simulation.emulation.poisson_events import Happening
 
 SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRUN, BAUD, STALL, GONE = (
     "", "noise", "cut", "flip", "burst", "drop", "duplicate", "reorder", "unplug", "replug", "overrun", "baud", "stall",
@@ -144,7 +144,7 @@ class Harm:
     def _judge(self, items: list[Item], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
             if item.cause in CHANGED:
-                items[row] = item._replace(invisible=disguise.passes(self.sensor, frames, row, item.data))
+                items[row] = item._replace(invisible=undetectable_faults.passes(self.sensor, frames, row, item.data))
 
     def _lose(self, items: list[Item]) -> list[Item]:
         if not self.faults.drop:

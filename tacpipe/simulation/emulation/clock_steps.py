@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.simulation.emulation.happening import Happening
+from tacpipe.simulation.emulation.poisson_events import Happening
 
 Times = NDArray[np.int64]
 

@@ -20,7 +20,7 @@ from typing import Self
 
 import numpy as np
 
-from tacpipe import params
+from tacpipe.plugins import params
 from tacpipe.recording.rig import Rig, Stream
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation import faults as clocks

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation import byte_faults, perfect
 from tacpipe.simulation.emulation.byte_faults import CAUSES, Item
-from tacpipe.simulation.emulation.disguise import one_by_one
 from tacpipe.simulation.emulation.source import Sampled
+from tacpipe.simulation.emulation.undetectable_faults import one_by_one
 
 if TYPE_CHECKING:
     import pyarrow as pa

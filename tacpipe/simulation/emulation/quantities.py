@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.formats import channels
+from tacpipe.channels import schema
 from tacpipe.simulation.emulation import pad as pad_of_taxels
 from tacpipe.simulation.emulation.world import World
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
@@ -71,7 +71,7 @@ def _tactile(view: View, fields: Sequence[pa.Field]) -> Floats:
         taxels = list(dict.fromkeys(places[row][1] for row in rows))
         force = pad_of_taxels.pressed(view.world, (view.finger + number) % 2, view.t_ns, len(taxels))
         columns = [taxels.index(places[row][1]) for row in rows]
-        axes = [channels.AXES.index(axis_of(fields[row]) or "z") for row in rows]
+        axes = [schema.AXES.index(axis_of(fields[row]) or "z") for row in rows]
         values[:, rows] = force[:, columns, axes]
     return values
 
@@ -93,12 +93,12 @@ def _force(view: View, fields: Sequence[pa.Field]) -> Floats:
     """Return what the hand's load cell feels: the contact's force with its sign turned; alone, the finger's pressure."""
     load = -view.world.contact(view.t_ns, lambda scene: scene.contact.force_n)
     normal = view.world.contact(view.t_ns, lambda scene: scene.contact.normal_n[:, view.finger])
-    return _vector(np.column_stack([load, normal]), fields, channels.AXES, 3)
+    return _vector(np.column_stack([load, normal]), fields, schema.AXES, 3)
 
 
 def _torque(view: View, fields: Sequence[pa.Field]) -> Floats:
     about_y = view.world.contact(view.t_ns, lambda scene: scene.contact.torque_nm)
-    return _vector(np.column_stack([0 * about_y, about_y, 0 * about_y]), fields, channels.AXES, 1)
+    return _vector(np.column_stack([0 * about_y, about_y, 0 * about_y]), fields, schema.AXES, 1)
 
 
 def _vibration(view: View, fields: Sequence[pa.Field]) -> Floats:
@@ -110,13 +110,13 @@ def _vibration(view: View, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _position(view: View, fields: Sequence[pa.Field]) -> Floats:
-    return _vector(view.world.arm(view.t_ns)[:, 1:4], fields, channels.AXES, 2)
+    return _vector(view.world.arm(view.t_ns)[:, 1:4], fields, schema.AXES, 2)
 
 
 def _orientation(view: View, fields: Sequence[pa.Field]) -> Floats:
     names = [axis_of(field) or field.name.rpartition("_")[2] for field in fields]
     arm = view.world.arm(view.t_ns)[:, 4:]
-    return arm[:, [channels.COMPONENTS.index(name) if name in channels.COMPONENTS else 3 for name in names]]
+    return arm[:, [schema.COMPONENTS.index(name) if name in schema.COMPONENTS else 3 for name in names]]
 
 
 def _width(view: View, fields: Sequence[pa.Field]) -> Floats:
@@ -131,13 +131,13 @@ def _difference(look_at: Callable[[Times], Floats], t_ns: Times) -> Floats:
 
 def _velocity(view: View, fields: Sequence[pa.Field]) -> Floats:
     velocity = _difference(lambda t_ns: view.world.arm(t_ns)[:, 1:4], view.t_ns)
-    return _vector(velocity, fields, channels.AXES, 2)
+    return _vector(velocity, fields, schema.AXES, 2)
 
 
 def _acceleration(view: View, fields: Sequence[pa.Field]) -> Floats:
     """Return what an accelerometer on the hand shows: at rest, gravity upwards."""
     at = view.world.contact(view.t_ns, lambda scene: scene.path.hand_acceleration_m_s2)
-    return _vector(at + np.array([0.0, 0.0, GRAVITY_M_S2]), fields, channels.AXES, 2)
+    return _vector(at + np.array([0.0, 0.0, GRAVITY_M_S2]), fields, schema.AXES, 2)
 
 
 def _angular_velocity(view: View, fields: Sequence[pa.Field]) -> Floats:
@@ -145,7 +145,7 @@ def _angular_velocity(view: View, fields: Sequence[pa.Field]) -> Floats:
         return view.world.contact(t_ns, lambda scene: scene.path.yaw_rad)[:, None]
 
     about_z = _difference(yaw, view.t_ns)
-    return _vector(np.hstack([0 * about_z, 0 * about_z, about_z]), fields, channels.AXES, 2)
+    return _vector(np.hstack([0 * about_z, 0 * about_z, about_z]), fields, schema.AXES, 2)
 
 
 def _joints(values: Floats, fields: Sequence[pa.Field]) -> Floats:

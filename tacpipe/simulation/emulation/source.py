@@ -175,9 +175,9 @@ def _grouped(fields: Sequence[pa.Field]) -> list[list[int]]:
 
 
 def _is_uskin(fields: Sequence[pa.Field]) -> bool:
-    from tacpipe.formats import channels
+    from tacpipe.channels import schema
 
-    return [one.name for one in fields] == [one.name for one in channels.uskin_fields()]
+    return [one.name for one in fields] == [one.name for one in schema.uskin_fields()]
 
 
 def _widths(sensor: Sensor, fields: Sequence[pa.Field]) -> list[int]:

@@ -7,7 +7,7 @@ import socket
 from collections.abc import Sequence
 from typing import Any
 
-from tacpipe import extras
+from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation.tcp import Connection, Tcp
 

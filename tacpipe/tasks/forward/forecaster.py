@@ -12,14 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tacpipe import model_files
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs.stretches import INCREMENTS
+from tacpipe.codecs import stored
+from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.excerpt import plain
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import ARM, POSE, Windows, motion
+from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.tasks.forward import tracks
@@ -29,7 +30,7 @@ from tacpipe.tasks.opened import Chain, opened
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 Floats = NDArray[np.floating[Any]]
 Config = dict[str, Any]
@@ -151,7 +152,7 @@ class Forecaster:
         config = model_files.tree(files, CONFIG, NEEDED)
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))
-        codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else codecs.load(files)
+        codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else stored.load(files)
         model = model_files.filled(
             lambda: network(config["params"], codec), model_files.tensors(files[WEIGHTS], WEIGHTS)
         )
@@ -188,13 +189,13 @@ class Forecaster:
                 raise ValueError("the baselines tell another number of steps or channels")
 
     @overload
-    def predict(self, recordings: Dataset | Shard, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
+    def predict(self, recordings: Dataset | Recording, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
 
     @overload
     def predict(self, window: Floats, plan: Floats, /) -> Floats: ...
 
     def predict(
-        self, given: Dataset | Shard | Floats, plan: Floats | None = None, /, *, steps: Sequence[int] = STEPS
+        self, given: Dataset | Recording | Floats, plan: Floats | None = None, /, *, steps: Sequence[int] = STEPS
     ) -> pa.Table | Floats:
         """Return predicted touch: of a dataset or one of its ``shards`` as a table, of arrays as an array.
 
@@ -218,11 +219,11 @@ class Forecaster:
         `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
         """
         if plan is None:
-            from tacpipe.tables import one_after_another
-            from tacpipe.tasks.forward import predicting  # which reads this module
+            from tacpipe.io.parquet import one_after_another
+            from tacpipe.tasks.forward import prediction  # which reads this module
 
-            recordings = opened(cast("Dataset | Shard", given), self.chain)
-            return one_after_another(predicting.tables(self, recordings, sorted(set(steps))))
+            recordings = opened(cast("Dataset | Recording", given), self.chain)
+            return one_after_another(prediction.tables(self, recordings, sorted(set(steps))))
         window = np.asarray(given)
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
@@ -230,14 +231,14 @@ class Forecaster:
         predicted = self._of_arrays(touch, arm, finger)
         return predicted[0] if single else predicted
 
-    def windows(self, recording: Shard) -> WindowArrays:
+    def windows(self, recording: Recording) -> WindowArrays:
         """Return all windows of a recording as `predict` reads them: ``window``, ``plan`` and ``t_ns``, when each was known.
 
         Rows in gaps are in none of them. The recorded motion stands for the plan. Raises as `predict`.
         """
-        from tacpipe.tasks.forward import predicting  # which reads this module
+        from tacpipe.tasks.forward import prediction  # which reads this module
 
-        return predicting.inputs(self, opened(recording.alone, self.chain))
+        return prediction.inputs(self, opened(recording.alone, self.chain))
 
     def _of_arrays(self, touch: Floats, arm: Floats, finger: Floats) -> Floats:
         """Return the touch to come (window, horizon, channel) of what `_parts` returns."""

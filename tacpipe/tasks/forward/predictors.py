@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs.stretches import INCREMENTS
+from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.models.windows import Windows, motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs import tactile
-from tacpipe.codecs.stretches import breaks
+from tacpipe.codecs import stored, tactile
+from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
@@ -20,7 +20,7 @@ from tacpipe.signals.windows import window_starts
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Shard
+    from tacpipe.datasets.dataset import Recording
 
 Floats = NDArray[np.floating[Any]]
 
@@ -70,7 +70,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes]) -> codecs.Codec:
     """
     latents = tactile.columns(table.schema, "latent")
     if codecs.DESCRIPTION in files:
-        codec = codecs.load(files)
+        codec = stored.load(files)
         if latents != codec.latents:
             raise TacpipeError(
                 f"The table has {len(latents)} latent columns where its codec makes {len(codec.latents)}. "
@@ -105,7 +105,7 @@ def inputs(table: pa.Table, names: Sequence[str]) -> Floats:
     return tactile.matrix(table, names)
 
 
-def track(shard: Shard, codec: codecs.Codec) -> Track:
+def track(shard: Recording, codec: codecs.Codec) -> Track:
     """Return the track of a recording; its latents are those stored, or its channels where ``codec`` is raw.
 
     Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the

@@ -16,7 +16,7 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs.stretches import INCREMENTS
+from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
@@ -41,7 +41,7 @@ from tacpipe.tasks.seen import seen
 from tacpipe.training import loop, scaling
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Floats = NDArray[np.floating[Any]]
 

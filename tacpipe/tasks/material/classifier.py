@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tacpipe import model_files
-from tacpipe.dataset import Dataset, Shard
+from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.excerpt import plain
 from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
@@ -22,6 +21,7 @@ from tacpipe.models.spatial_spectrum import Bands
 from tacpipe.models.strong import Strong
 from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
+from tacpipe.printable import plain
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.learning import JUDGED, Network
 from tacpipe.tasks.material.slides import Layout, Slides, difference
@@ -169,13 +169,13 @@ class Classifier:
                 raise ValueError(f"slides of {name} get scores of {told}, not of {len(self.classes)} classes")
 
     @overload
-    def predict(self, recordings: Dataset | Shard, /) -> pa.Table: ...
+    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
 
     @overload
     def predict(self, slides: Floats | NDArray[np.float64], /, sensor: str = "") -> Materials: ...
 
     def predict(
-        self, given: Dataset | Shard | Floats | NDArray[np.float64], /, sensor: str = ""
+        self, given: Dataset | Recording | Floats | NDArray[np.float64], /, sensor: str = ""
     ) -> pa.Table | Materials:
         """Return the material of slides: of a dataset or one of its ``shards`` as a table, of arrays as an array.
 
@@ -189,13 +189,13 @@ class Classifier:
         recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64. Raises
         `TacpipeError` for another shape than the model was trained on, and for values that are not finite.
         """
-        if isinstance(given, Dataset | Shard):
-            from tacpipe.tasks.material import predicting  # which reads this module
+        if isinstance(given, Dataset | Recording):
+            from tacpipe.tasks.material import prediction  # which reads this module
 
-            return predicting.predictions(self, opened(given, self.chain))
+            return prediction.predictions(self, opened(given, self.chain))
         return self.named(self.scores(given, sensor))
 
-    def frames(self, recording: Shard) -> tuple[Floats, str]:
+    def frames(self, recording: Recording) -> tuple[Floats, str]:
         """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.
 
         The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.

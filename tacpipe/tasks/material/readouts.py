@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from tacpipe.constraints import Assignments
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
 from tacpipe.models.level import Level
 from tacpipe.models.spatial_spectrum import Bands, Felt
 from tacpipe.models.strong import Strong
 from tacpipe.models.transfer import Transfer
+from tacpipe.plugins.constraints import Assignments
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, MEAN_LEVEL, PERMUTED_LABELS, WEIGHTS, Config
 from tacpipe.tasks.material.slides import Slides
 

@@ -14,7 +14,7 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 STREAM = "slide"
 TACTILE = "tactile"
@@ -83,7 +83,7 @@ def read(
     Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
     slides of one sensor differ in channels, frames or rate.
     """
-    found: dict[str, list[tuple[Shard, Layout, NDArray[np.float32]]]] = {}
+    found: dict[str, list[tuple[Recording, Layout, NDArray[np.float32]]]] = {}
     there: set[str] = set()
     for name, shard in sorted(recordings.shards.items()):
         sensor = shard.attributes.get("sensor")
@@ -103,7 +103,7 @@ def read(
     return {sensor: _bundle(several, labelled) for sensor, several in sorted(found.items())}
 
 
-def _frames(shard: Shard, sensor: str, quantities: Sequence[str]) -> tuple[Layout, NDArray[np.float32]]:
+def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, NDArray[np.float32]]:
     """Return the layout of a slide and its frames (time, channel)."""
     if STREAM not in shard.streams and "" not in shard.streams:
         raise TacpipeError(
@@ -134,7 +134,7 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> NDArray[np.float32]:
     return values
 
 
-def _bundle(several: Sequence[tuple[Shard, Layout, NDArray[np.float32]]], labelled: bool) -> Slides:
+def _bundle(several: Sequence[tuple[Recording, Layout, NDArray[np.float32]]], labelled: bool) -> Slides:
     """Return the slides of one sensor, alike in layout."""
     first, layout, _ = several[0]
     for shard, other, _ in several:
@@ -169,7 +169,7 @@ def difference(wanted: Layout, found: Layout) -> str:
     return f"has {found.rate_hz:g} frames a second, not {wanted.rate_hz:g}"
 
 
-def _material(shard: Shard, labelled: bool) -> int:
+def _material(shard: Recording, labelled: bool) -> int:
     """Return the number of a slide's material."""
     material = shard.attributes.get("material")
     if isinstance(material, int) and not isinstance(material, bool) and material >= 0:

@@ -13,11 +13,11 @@ import torch
 from safetensors.torch import save as save_tensors
 from torch import nn
 
-from tacpipe.constraints import Assignments, CommaList
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import headers, recurrent_autoencoder
 from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.tasks.material import readouts
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import (
@@ -42,7 +42,7 @@ from tacpipe.training import loop
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 HISTORY = "history.jsonl"
 RAEC = "raec"

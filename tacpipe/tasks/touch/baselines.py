@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.touch_results import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
+from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
 Floats = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud, require_columns
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def check(name: str, cloud: Cloud, grasp: Grasp) -> None:
             )
 
 
-def _geometry(shard: Shard) -> tuple[Cloud, Grasp, int]:
+def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
     missing = [stream for stream in STREAMS if stream not in shard.streams]
     if missing:
         raise TacpipeError(
@@ -118,7 +118,7 @@ def _geometry(shard: Shard) -> tuple[Cloud, Grasp, int]:
     return cloud, grasp, int(table.column("t_ns")[0].as_py())
 
 
-def _felt(shard: Shard) -> dict[str, Floats]:
+def _felt(shard: Recording) -> dict[str, Floats]:
     if READING not in shard.streams:
         raise TacpipeError(
             f"Recording {shard.name} has no reading of touch to learn from or to judge by. `tacpipe predict` needs none."

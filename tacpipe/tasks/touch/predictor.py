@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tacpipe import biotac_sp, model_files
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
-from tacpipe.excerpt import excerpt
 from tacpipe.models.forest import Forest
 from tacpipe.models.tensors import under
+from tacpipe.printable import excerpt
 from tacpipe.tasks.opened import Chain, opened
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
@@ -27,7 +28,7 @@ from tacpipe.training.scaling import Affine
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
+    from tacpipe.datasets.dataset import Dataset, Recording
 
 Floats = NDArray[np.float64]
 Config = dict[str, Any]
@@ -103,12 +104,12 @@ class Predictor:
         return {target: told[target] for target in self.targets}
 
     @overload
-    def predict(self, recordings: Dataset | Shard, /) -> pa.Table: ...
+    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
 
     @overload
     def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
 
-    def predict(self, given: Dataset | Shard | Cloud, grasp: Grasp | None = None, /) -> pa.Table | Touch:
+    def predict(self, given: Dataset | Recording | Cloud, grasp: Grasp | None = None, /) -> pa.Table | Touch:
         """Return what grasps would feel like: of a dataset or one of its ``shards`` as a table, of one cloud as `Touch`.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
@@ -123,9 +124,9 @@ class Predictor:
             if grasp is None:
                 raise UsageError("A cloud alone does not say where the fingers close. Give predict(cloud, grasp).")
             return self.predict_all(given, [grasp])[0]
-        from tacpipe.tasks.touch import predicting  # which reads this module
+        from tacpipe.tasks.touch import prediction  # which reads this module
 
-        return predicting.predictions(self, opened(given, self.chain))
+        return prediction.predictions(self, opened(given, self.chain))
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud; as `predict`, in one pass."""

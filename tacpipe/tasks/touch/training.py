@@ -16,11 +16,11 @@ from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
-from tacpipe.constraints import CommaList
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
+from tacpipe.plugins.constraints import CommaList
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
@@ -32,7 +32,7 @@ from tacpipe.training import loop
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
-    from tacpipe.dataset import Dataset
+    from tacpipe.datasets.dataset import Dataset
 
 Floats = NDArray[np.float64]
 Params = Mapping[str, Any]

@@ -8,13 +8,13 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.stage import Result, stage
+from tacpipe.plugins.stage import Result, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.dataset import Dataset, Shard
-    from tacpipe.stage import Fitted
+    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.plugins.stage import Fitted
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Nothing:
 
 
 @stage(version=1)
-def chance(params: Nothing, recording: Shard) -> pa.Table:
+def chance(params: Nothing, recording: Recording) -> pa.Table:
     """Return the stream with a random column."""
     import pyarrow as pa
 
@@ -53,7 +53,7 @@ def fit(params: Nothing, train: Dataset) -> Result:
 
 
 @stage(version=1, fit=fit)
-def fitted(params: Nothing, recording: Shard, codec: Fitted) -> pa.Table:
+def fitted(params: Nothing, recording: Recording, codec: Fitted) -> pa.Table:
     """Return the table beside what the fit gave."""
     import pyarrow as pa
 

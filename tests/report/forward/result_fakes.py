@@ -112,7 +112,7 @@ def result(
 
 
 def metrics(ratio: Mapping[str, float]) -> dict[str, Any]:
-    """Return ``metrics.json`` as `tacpipe.tasks.forward.scorecard` writes it, with known and unseen objects and ``seen``."""
+    """Return ``metrics.json`` as `tacpipe.tasks.forward.metrics` writes it, with known and unseen objects and ``seen``."""
     tree = _part(ratio, list(ratio))
     tree["known"] = _part(ratio, list(KNOWN))
     tree["unseen"] = _part(ratio, [name for name in ratio if name not in KNOWN])

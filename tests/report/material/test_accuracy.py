@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.proportions import wilson
+from tacpipe.metrics.proportions import wilson
 from tacpipe.report.material import accuracy
 from tacpipe.report.material.methods import Run
 from tests.report.material.material_fakes import result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tacpipe.proportions import wilson
+from tacpipe.metrics.proportions import wilson
 from tacpipe.report.material import grouping, reduction, tables, zero_shot
 from tacpipe.report.material.methods import Method, Run
 from tests.report.elements import cells

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.report.spread import Spread
 from tacpipe.report.touch import clouds, curves, electrodes, figures, fingertip, pressure
 from tacpipe.report.touch.figures import Scattered

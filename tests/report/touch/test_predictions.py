@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.report.touch import predictions
 from tests.report.touch.touch_fakes import KNOWN, NOVEL, PER_OBJECT, result
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp
 from tacpipe.report.touch import scores
 from tacpipe.report.touch.methods import Run, grouped
 from tests.report.touch.touch_fakes import KNOWN, NOVEL, result

@@ -17,7 +17,7 @@ from tests.simulation.emulation.rigs import FOLDER, awaited
 
 pytestmark = pytest.mark.rig
 
-COMMAND = [sys.executable, "-m", "tacpipe.cli", "sensors", "emulate"]
+COMMAND = [sys.executable, "-m", "tacpipe", "sensors", "emulate"]
 
 
 def test_a_rig_is_served_until_it_is_stopped_and_the_ledger_is_left(tmp_path: Path) -> None:

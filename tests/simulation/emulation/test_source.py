@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from tacpipe import registry
-from tacpipe.formats import channels
+from tacpipe.channels import schema
+from tacpipe.plugins import registry
 from tacpipe.recording import rig
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.tfmini import TfMini
@@ -171,4 +171,4 @@ def test_a_board_of_counts_stays_within_its_type() -> None:
 
 
 def test_columns_keep_the_names_of_published_recordings() -> None:
-    assert [field.name for field in Xela().fields()] == [field.name for field in channels.uskin_fields()]
+    assert [field.name for field in Xela().fields()] == [field.name for field in schema.uskin_fields()]

@@ -12,9 +12,10 @@ import pytest
 
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
-from tacpipe.registry import load as load_stage
+from tacpipe.plugins.registry import load as load_stage
 from tacpipe.signals import kinematics
-from tacpipe.tasks.forward import Forecaster, load, tracks
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.task import Forecaster, load
 from tests.conftest import sample_data
 from tests.report.stream_shard import StreamShard
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table

@@ -14,9 +14,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe import tables
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.forward import Forecaster, tracks
+from tacpipe.io import parquet
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.task import Forecaster
 from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
@@ -139,7 +140,7 @@ def test_the_model_beats_persistence_where_the_plan_tells_all(model: dict[str, b
 def test_the_sums_of_the_errors_table_are_the_means_of_the_metrics(model: dict[str, bytes]) -> None:
     shards = [*TEST, TRAIN[0]]
     metrics, result = judged(model, *shards)
-    found = tables.from_parquet(result.files["errors.parquet"]).to_pandas()
+    found = parquet.from_parquet(result.files["errors.parquet"]).to_pandas()
     assert set(found["recording"]) == {one.name for one in shards}
     assert set(found["object"]) == {"cup", "jug"}
     parts = {

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tacpipe import registry
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks import forward
+from tacpipe.plugins import registry
+from tacpipe.tasks.forward import task as forward
 from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, foretold, trained
 

@@ -14,7 +14,7 @@ from safetensors.numpy import load
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forecasts import ARCHITECTURES
-from tacpipe.tasks import forward
+from tacpipe.tasks.forward import task as forward
 from tacpipe.training import checkpoint
 from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, judged, params, trained

@@ -13,11 +13,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tacpipe import registry
 from tacpipe.codecs import codec as codecs
+from tacpipe.plugins import registry
+from tacpipe.plugins.stage import Result
 from tacpipe.signals import kinematics
-from tacpipe.stage import Result
-from tacpipe.tasks import forward
+from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Told, told

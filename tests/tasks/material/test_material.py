@@ -13,12 +13,12 @@ import pytest
 import torch
 from safetensors.torch import load as load_tensors
 
-from tacpipe import params as params_of
-from tacpipe import registry
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.proportions import wilson
-from tacpipe.tasks import material
+from tacpipe.metrics.proportions import wilson
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tacpipe.tasks.material import learning
+from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
 from tacpipe.training import loop
 from tests.tasks.material.textures import MATERIALS, dataset, judged, slide, slides, trained

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks import material
+from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, WEIGHTS
 from tests.tasks.material.textures import Slide, dataset, judged, params
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.hashing import digest
-from tacpipe.stage import Result
-from tacpipe.tasks import material
+from tacpipe.io.hashing import digest
+from tacpipe.plugins.stage import Result
+from tacpipe.tasks.material import task as material
 from tests.asked import fitting
 from tests.stages.conftest import FakeShard
 from tests.stages.learning_fakes import FakeDataset

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe import biotac_sp
+from tacpipe.channels import biotac_sp, schema
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import axes
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.formats import channels
-from tacpipe.hashing import digest
-from tacpipe.stage import Result
-from tacpipe.tasks import touch
+from tacpipe.io.hashing import digest
+from tacpipe.plugins.stage import Result
 from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch.grasps import Grasps
 from tests.asked import fitting
 from tests.stages.conftest import FakeShard
@@ -67,7 +66,7 @@ def reading(number: int, size_m: float) -> pa.Table:
         for index, name in enumerate(biotac_sp.columns(target)):
             share = 0.2 + 8 * size_m + 0.01 * index + rng.normal(0, 0.02)
             values[name] = round(low + share * (high - low))
-    return channels.stream(np.array([number]), [np.array([one]) for one in values.values()], biotac_sp.fields())
+    return schema.stream(np.array([number]), [np.array([one]) for one in values.values()], biotac_sp.fields())
 
 
 def recording(number: int, kind: str = "ball", *, felt: bool = True, **given: Any) -> GraspShard:

@@ -14,10 +14,11 @@ import pyarrow as pa
 import pytest
 from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_error
 
-from tacpipe import biotac_sp, regression
+from tacpipe.channels import biotac_sp
 from tacpipe.errors import TacpipeError
-from tacpipe.stage import Result
-from tacpipe.tasks import touch
+from tacpipe.metrics import regression
+from tacpipe.plugins.stage import Result
+from tacpipe.tasks.touch import task as touch
 from tests.tasks.touch.handmade import dataset, judged, recording, recordings, trained
 
 PREDICTORS = ("model", "constant", "object_mean", "nearest_in_time")

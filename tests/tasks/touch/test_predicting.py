@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks import touch
+from tacpipe.tasks.touch import task as touch
 from tests.tasks.touch.handmade import cloud, dataset, judged, recording, recordings, trained
 
 FAST = {"architecture": "trees", "targets": "pdc_th,e_mf"}

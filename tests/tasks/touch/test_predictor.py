@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks import touch
-from tacpipe.tasks.touch import Predictor, Touch, members
+from tacpipe.tasks.touch import members
+from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch.task import Predictor, Touch
 from tests.tasks.touch.handmade import OBJECTS, POINTNET, cloud, grasp, grasps, trained
 
 ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}

@@ -12,7 +12,7 @@ from safetensors.torch import load
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models.forest import Forest
-from tacpipe.tasks import touch
+from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch import training
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, HISTORY, WEIGHTS
 from tacpipe.training import checkpoint

@@ -1,0 +1,57 @@
+"""The streams of a recording, whether they lie apart, as recorded, or side by side in one synchronized table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from tacpipe.datasets.dataset import Recording
+
+NO_SIGNALS = ("events", "truth")  # streams of what went wrong, and of what a simulation knows
+TRUTH = "gt_"  # how columns with ground truth begin
+
+
+def streams_of(recording: Recording) -> dict[str, pa.Table]:
+    """Return the table of each stream, under the names that its columns had when they were recorded.
+
+    Ground truth and the masks of a synchronized table are left out.
+    """
+    if set(recording.streams) != {""}:
+        return {name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS}
+    table = recording.table()
+    columns: dict[str, list[str]] = {}
+    for field in table.schema:
+        metadata = field.metadata or {}
+        signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
+        if signal:
+            columns.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
+    return {
+        stream: table.select(["t_ns", *names]).rename_columns(["t_ns", *(_recorded(name, stream) for name in names)])
+        for stream, names in columns.items()
+    }
+
+
+def of_quantity(table: pa.Table, quantity: str) -> list[str]:
+    """Return the columns of a stream that hold ``quantity``."""
+    return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]
+
+
+def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[NDArray[np.int64], NDArray[Any]] | None:
+    """Return stamps (time,) and values (time, channel) of the first stream with ``quantity``; None if there is none."""
+    import numpy as np
+
+    for table in streams.values():
+        names = of_quantity(table, quantity)
+        if names:
+            values = np.column_stack([table.column(name).to_numpy() for name in names])
+            return table.column("t_ns").to_numpy(), values
+    return None
+
+
+def _recorded(name: str, stream: str) -> str:
+    return name.removeprefix(f"{stream}_") if stream else name

@@ -1,0 +1,243 @@
+"""``tacpipe acquire``: record a rig, look at it without recording, or seal what a crash left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tacpipe.errors import DONE, FAILED, DeviceError, TacpipeError, UsageError
+from tacpipe.io import terminal
+
+if TYPE_CHECKING:
+    from tacpipe.plugins.stage import Attribute
+    from tacpipe.recording.rig import Rig
+    from tacpipe.recording.trials import Recorded
+    from tacpipe.store.store import Store
+
+SCHEMA_VERSION = 1
+DRY_RUN_S = 3.0
+NAME = re.compile(r"[\w-][\w.-]*")
+RATE_OFF = 0.1  # share by which a rate may differ from what the rig file says before it is told
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the command to ``program``."""
+
+    @program.command(
+        "acquire",
+        help=f"{summary}\n\nExample: tacpipe acquire rig.toml -o data/recordings --duration 30 --label material=cork",
+    )
+    def acquire(
+        rig: Annotated[Path | None, typer.Argument(help="The rig file; docs/rig.md tells how to write one.")] = None,
+        output: Annotated[
+            Path | None,
+            typer.Option("-o", "--output", help="Dataset to append to; --recover seals what was recorded for it too."),
+        ] = None,
+        duration: Annotated[
+            float | None, typer.Option(help="Seconds a recording; without it until Ctrl-C or --stop.")
+        ] = None,
+        trials: Annotated[int, typer.Option(help="Recordings, one after another.")] = 1,
+        label: Annotated[list[str] | None, typer.Option(help="name=value, on every recording.")] = None,
+        note: Annotated[str | None, typer.Option(help="What the operator wants to say of it.")] = None,
+        name: Annotated[
+            str | None, typer.Option(help="Name of the recording; the time of its start by default.")
+        ] = None,
+        start: Annotated[str, typer.Option(help="What starts a trial: now, key, contact or tap.")] = "now",
+        stop: Annotated[str, typer.Option(help="What stops it, beside --duration: key, contact (its end) or tap.")] = (
+            "duration"
+        ),
+        contact_count: Annotated[
+            float, typer.Option(help="From rest, in the sensor's unit: beyond is contact.")
+        ] = 50.0,
+        tare: Annotated[
+            bool | None,
+            typer.Option("--tare/--no-tare", help="Have devices tare before each trial; by default with --trials."),
+        ] = None,
+        dry_run: Annotated[bool, typer.Option("--dry-run", help="Open, check rates for 3 s, record nothing.")] = False,
+        recover: Annotated[bool, typer.Option("--recover", help="Seal what a crash left behind, and end.")] = False,
+        keep_spool: Annotated[
+            bool,
+            typer.Option("--keep-spool", help="Keep the raw bytes of the links too; the spool's place is printed."),
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="Nothing on stderr but errors.")] = False,
+        as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    ) -> None:
+        from tacpipe.recording import rig as rig_of
+        from tacpipe.recording import trials as trials_of
+        from tacpipe.store import store as stores
+
+        store = stores.locate()
+        if rig is None and not recover:
+            raise UsageError("acquire needs a rig file, as in `tacpipe acquire rig.toml -o data/recordings`.")
+        found = rig_of.read(rig) if rig is not None else None
+        if found is not None and dry_run:
+            terminal.result(_dry_run(found, as_json=as_json))
+            return
+        if found is not None and output is None and not recover:
+            raise UsageError("acquire needs -o: the dataset of recordings to append to.")
+        began_s = time.monotonic()
+        sealed, left = _recovered(store, output, quiet=quiet)
+        if recover and not quiet:
+            _tell_others(store)
+        if found is None or output is None or recover:
+            _tell(output, sealed, began_s, as_json=as_json)
+            raise typer.Exit(FAILED if left else DONE)
+        plan = trials_of.Plan(
+            output,
+            name or time.strftime("%Y%m%d-%H%M%S", time.gmtime()),
+            duration,
+            trials,
+            start,
+            stop,
+            contact_count,
+            trials > 1 if tare is None else tare,
+            keep_spool,
+            _attributes(label or [], note),
+        )
+        recorded, lost = _record(found, store, plan, quiet=quiet)
+        failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
+        _tell(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
+        if lost and as_json:  # the object on stdout holds the error already
+            terminal.note(f"tacpipe: {failed}")
+            raise typer.Exit(failed.exit_code)
+        if lost:
+            raise failed
+
+
+def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
+    from tacpipe.datasets import directory
+    from tacpipe.io.termination import Ended
+    from tacpipe.recording import appending, header, trials, triggers
+    from tacpipe.recording.recorder import Recorder
+    from tacpipe.recording.view import View
+
+    for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
+        if value not in known:
+            raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
+    if not NAME.fullmatch(plan.name) or not header.is_name(plan.name):
+        raise UsageError(f"--name {plan.name!r} names no file; take letters, digits, _, - and dots, no dot in front.")
+    if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
+        raise UsageError("--trials and --duration must be above 0.")
+    if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
+        raise UsageError("--trials needs --duration or --stop, or the first trial never ends.")
+    store.prepare()
+    directory.check_output(store, plan.output)
+    appending.refuse_taken(plan.output, plan.names)
+    recorder = Recorder(rig)
+    with Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
+        recorder.await_first(ended)
+        recorded, lost = trials.run(recorder, store, plan, view, ended)
+    for one in recorded if not quiet else ():
+        terminal.note(one.line())
+    return recorded, lost
+
+
+def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
+    """Seal what earlier processes of this user left behind; what cannot be sealed is told and stays.
+
+    It keeps nobody from recording. ``output`` is the dataset that this command was given.
+    """
+    from tacpipe.printable import plain
+    from tacpipe.recording import spool, trials
+    from tacpipe.recording.appending import NothingError
+
+    sealed, left = [], 0
+    for folder in spool.abandoned(store.root):
+        try:
+            with spool.claimed(folder) as ours:
+                if not ours:
+                    continue
+                one = trials.recover(store, folder, output)
+        except NothingError:
+            continue  # it ended before a sample came
+        except Exception as error:  # whatever a damaged spool or another version's driver may raise
+            why = error if isinstance(error, TacpipeError) else plain(f"{type(error).__name__}: {error}", 300)
+            terminal.note(f"tacpipe: The spool {folder} stays as it is. {why}")
+            left += 1
+            continue
+        sealed.append(one)
+        if not quiet:
+            terminal.note(f"recovered {one.line()}")
+    return sealed, left
+
+
+def _tell_others(store: Store) -> None:
+    """Print whose the spools are that another user recorded, in a store that is shared."""
+    from tacpipe.recording import spool
+
+    with contextlib.suppress(OSError):  # of a disk that failed, which was said already
+        others = spool.owners(store.root)
+        ours = spool.users(store.root / spool.FOLDER, others.values())
+        for folder in [folder for folder, owner in others.items() if owner not in ours]:
+            owner = others[folder]
+            terminal.note(f"The spool {folder} belongs to {spool.user(owner)}, who alone can seal it.")
+
+
+def _dry_run(rig: Rig, *, as_json: bool) -> str:
+    """Open every stream and return what each does. Raises `DeviceError` for those that do not open or give nothing."""
+    from dataclasses import asdict
+
+    from tacpipe.io.termination import Ended
+    from tacpipe.recording import clock
+    from tacpipe.recording.recorder import Recorder
+    from tacpipe.recording.view import line
+
+    recorder = Recorder(rig)
+    with Ended() as ended, recorder.open():
+        recorder.await_first(ended)
+        until_s = clock.now_s() + DRY_RUN_S
+        recorder.run(lambda: ended() or clock.now_s() > until_s)
+        figures = {name: watch.figures(clock.now_ns()) for name, watch in recorder.watches.items()}
+    if as_json:
+        return json.dumps({"schema_version": SCHEMA_VERSION, "streams": {n: asdict(f) for n, f in figures.items()}})
+    lines = []
+    for name, found in figures.items():
+        wanted_hz = rig.streams[name].sensor.rate_hz
+        off = wanted_hz and abs(found.rate_hz / wanted_hz - 1) > RATE_OFF
+        lines.append(line(name, found) + (f"; {wanted_hz:g} Hz were expected" if off else ""))
+    return "\n".join(lines)
+
+
+def _attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
+    from tacpipe.datasets import labels as labels_of
+
+    try:
+        attributes = labels_of.parse(labels, None, include=False) if labels else {}
+    except UsageError as error:
+        raise UsageError(str(error).replace("--set", "--label")) from error
+    return {**attributes, **({"note": note} if note else {})}
+
+
+def _tell(
+    output: Path | None,
+    recorded: list[Recorded],
+    began_s: float,
+    *,
+    as_json: bool,
+    failed: TacpipeError | None = None,
+) -> None:
+    from dataclasses import asdict
+
+    if as_json:
+        seconds = round(time.monotonic() - began_s, 3)
+        told = [asdict(one) for one in recorded]
+        where = None if output is None else str(output)
+        rows = sum(sum(one.rows.values()) for one in recorded)
+        value = {
+            "schema_version": SCHEMA_VERSION,
+            "output": where,
+            "recordings": told,
+            "rows": rows,
+            "seconds": seconds,
+        }
+        error = {} if failed is None else {"error": str(failed), "exit_code": failed.exit_code}
+        terminal.result_json({**value, **error})
+        return
+    if output is not None:
+        terminal.result(output)

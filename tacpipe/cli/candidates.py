@@ -1,0 +1,216 @@
+"""The command ``tacpipe candidates``: grasps that could be made on an object, and the touch a model foretells for each."""
+
+from __future__ import annotations
+
+import csv
+import io
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tacpipe.datasets import replacing
+from tacpipe.errors import UsageError
+from tacpipe.io import terminal
+from tacpipe.printable import plain
+
+if TYPE_CHECKING:
+    from tacpipe.clouds.candidates import Candidate
+    from tacpipe.clouds.cloud import Cloud
+
+EXAMPLE = "\n\nExample: tacpipe candidates data/grasps --recording bleach-1561629162 --model models/touch"
+HEADER = "rank,score,off_deg,"  # how the CSV begins
+PICTURES = (".pdf", ".png", ".svg")
+Row = dict[str, float]
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the command ``candidates`` to ``program``."""
+    told = "\n\nOn a terminal a table is printed, elsewhere CSV; lengths are metres there, touch is in device counts."
+    program.command("candidates", help=summary + told + EXAMPLE)(candidates)
+
+
+def candidates(
+    cloud: Annotated[
+        Path, typer.Argument(help="A file (.ply, .pcd …) with the object's points, or a dataset of grasps.")
+    ],
+    recording: Annotated[str | None, typer.Option("--recording", help="Which one of a dataset.")] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="A model of task touch; tells what would be felt.")
+    ] = None,
+    count: Annotated[int, typer.Option("--count", help="At most so many, spread along the object.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", help="Of where the object is cut.")] = 0,
+    shift: Annotated[
+        float, typer.Option("--shift", help="Cuts lie so far from the centroid, as a share of the object's length.")
+    ] = 0.4,
+    opening_mm: Annotated[
+        tuple[float, float], typer.Option("--opening-mm", help="Least and most that the fingers are apart, mm.")
+    ] = (20, 130),
+    camera_m: Annotated[
+        tuple[float, float, float], typer.Option("--camera-m", help="Where the camera was in the cloud's frame, m.")
+    ] = (0, 0, 0),
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write CSV to this file.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="Draw the cloud and the grasps: .png, .svg.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Print grasps that could be made, best first."""
+    _require_names(output, picture)
+    foretell = None if model is None else _touch_model(model)
+    from tacpipe.clouds.candidates import candidates as find
+
+    seen = _cloud(cloud, recording)
+    found = find(seen, count, seed, shift, (opening_mm[0] / 1e3, opening_mm[1] / 1e3), camera_m)
+    rows = [_row(rank, candidate) for rank, candidate in enumerate(found, 1)]
+    if foretell is not None:
+        rows = [row | _touch(foretell.predict(seen, each.grasp)) for row, each in zip(rows, found, strict=True)]
+    if picture is not None:
+        from tacpipe.clouds.picture import draw
+
+        draw(seen, found, picture)
+    if output is not None:
+        _write(output, _csv(rows))
+    if as_json:
+        terminal.result_json({"schema_version": 1, "candidates": rows, "units": _units(rows)})
+    elif output is not None:
+        terminal.result(output)
+    elif _on_terminal():
+        _print_table(rows)
+    else:
+        terminal.result(_csv(rows).rstrip("\n"))
+
+
+def _on_terminal() -> bool:
+    return sys.stdout.isatty()
+
+
+def _cloud(path: Path, recording: str | None) -> Cloud:
+    """Return the cloud of a file, or of one recording of a dataset."""
+    from tacpipe.clouds import files
+    from tacpipe.clouds.cloud import Cloud
+    from tacpipe.engine import pipeline
+
+    if path.suffix.lower() in files.SUFFIXES or (path.is_file() and path.name != "manifest.json"):
+        if recording is not None:
+            raise UsageError(f"{path} is one cloud; --recording {recording} picks one of a dataset. Leave it out.")
+        return files.read(path)
+    shards = pipeline.open_dataset(path).shards
+    if recording is None and len(shards) != 1:
+        raise UsageError(f"{path} has {len(shards)} recordings; pick one with --recording: {_some(list(shards))}.")
+    name = next(iter(shards)) if recording is None else recording
+    if name not in shards:
+        raise UsageError(f"{path} has no recording {name}; it has {_some(list(shards))}.")
+    if "cloud" not in shards[name].streams:
+        raise UsageError(
+            f"Recording {name} of {path} has no cloud, only {', '.join(map(repr, shards[name].streams))}. Give what "
+            f"`tacpipe ingest` or `tacpipe segment grasps` made of grasps."
+        )
+    return Cloud.of(shards[name].table("cloud"))
+
+
+def _some(names: list[str]) -> str:
+    shown = ", ".join(names[:5])
+    return f"{shown} … (`tacpipe show --full` lists all {len(names)})" if len(names) > 5 else shown or "none"
+
+
+def _touch_model(path: Path) -> Any:
+    """Return the model of touch at ``path``. Raises `UsageError` if it is one of another task."""
+    import tacpipe
+    from tacpipe.datasets import model_files
+
+    files = tacpipe.open(path).files
+    task = model_files.tree(files, model_files.CONFIG).get("task") if model_files.CONFIG in files else None
+    if task is not None and task != "touch":
+        raise UsageError(
+            f"{path} is a model of task {plain(str(task))}; what a grasp would feel is foretold by one of task touch. "
+            f"`tacpipe train touch` makes one."
+        )
+    return tacpipe.load(path)
+
+
+def _row(rank: int, candidate: Candidate) -> Row:
+    """Return a candidate's values by column; the unit ends a column's name."""
+    from tacpipe.clouds.grasp import POINTS, WRIST
+
+    grasp = candidate.grasp
+    values: Row = {
+        "rank": rank,
+        "score": round(candidate.score, 4),
+        "off_deg": round(candidate.off_deg, 2),
+        "shift_m": round(candidate.shift_m, 6),
+        "opening_m": round(grasp.opening_m, 6),
+    }
+    points = (*grasp.g1_m, *grasp.g2_m)
+    values |= {name: round(float(value), 6) for name, value in zip(POINTS, points, strict=True)}
+    if grasp.wrist is not None:
+        values |= {name: round(float(value), 6) for name, value in zip(WRIST, grasp.wrist.T.ravel(), strict=True)}
+    return values
+
+
+def _touch(touch: Any) -> Row:
+    """Return the 50 values that a model foretells, device counts by column."""
+    values: Row = {}
+    for finger in ("th", "mf"):
+        values[f"pdc_{finger}_counts"] = round(float(getattr(touch, f"pdc_{finger}")), 1)
+        electrodes = enumerate(getattr(touch, f"e_{finger}"), 1)
+        values |= {f"e_{finger}_{n:02d}_counts": round(float(value), 1) for n, value in electrodes}
+    return values
+
+
+def _units(rows: list[Row]) -> dict[str, str]:
+    ends = {"m": "m", "deg": "degree", "counts": "count"}
+    return {name: ends.get(name.rpartition("_")[2], "1") for name in rows[0]}
+
+
+def _csv(rows: list[Row]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _require_names(output: Path | None, picture: Path | None) -> None:
+    """Raise `UsageError` before anything is computed if a file's ending is none that can be written, or it is foreign."""
+    if output is not None:
+        if output.suffix.lower() != ".csv":
+            raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
+        replacing.refuse_foreign(output, HEADER.encode())
+    if picture is not None and picture.suffix.lower() not in PICTURES:
+        raise UsageError(f"{picture} is no name for a picture; it must end in one of {', '.join(PICTURES)}.")
+
+
+def _write(path: Path, text: str) -> None:
+    from tacpipe.io.files import readable_errors, write_whole
+
+    with readable_errors(path.parent):
+        write_whole(str(path), text.encode(), f"{path}.draft")
+
+
+def _print_table(rows: list[Row]) -> None:
+    """Print what fits a terminal: points in millimetres, of each finger the pressure and the mean of its electrodes."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    columns = ["#", "score", "open mm", "off °", "g1 mm", "g2 mm", "approach"]
+    touched = "pdc_th_counts" in rows[0]
+    columns += ["PDC th", "PDC mf", "mean E th", "mean E mf"] if touched else []
+    table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1))
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        cells = [f"{row['rank']}", f"{row['score']:.2f}", f"{row['opening_m'] * 1e3:.0f}", f"{row['off_deg']:.0f}"]
+        cells += [" ".join(f"{row[f'{point}_{axis}_m'] * 1e3:.0f}" for axis in "xyz") for point in ("g1", "g2")]
+        cells.append(" ".join(f"{row[f'wrist_x_{axis}']:.2f}" for axis in "xyz"))
+        if touched:
+            cells += [f"{row[f'pdc_{finger}_counts']:.0f}" for finger in ("th", "mf")]
+            cells += [f"{sum(_electrodes(row, finger)) / 24:.0f}" for finger in ("th", "mf")]
+        table.add_row(*cells)
+    Console().print(table)
+
+
+def _electrodes(row: Row, finger: str) -> list[float]:
+    return [value for name, value in row.items() if name.startswith(f"e_{finger}_")]

@@ -1,0 +1,127 @@
+"""The commands beside the stages: what looks after datasets and the store."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tacpipe.io import terminal
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
+SUMMARIES = {
+    "acquire": "Record a rig: every stream that its rig file lists, without losing or inventing a sample.",
+    "label": "Change labels of recordings, or exclude them, without touching a shard.",
+    "show": "Show what is in a dataset: recordings and labels, a split's roles, a model, or a result's headline.",
+    "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
+    "sensors": "Look after sensors: list those that are known, find out which one speaks on a port, emulate a rig.",
+    "store": "Manage the store: status, list, checkout, verify, repair, gc, link, push, pull.",
+    "candidates": "List grasps that two fingers could make on an object, and what a model says each would feel.",
+    "demo": "Run the main job on the simulated rig, small, from recordings to a report.",
+}
+
+
+def _label(program: typer.Typer) -> None:
+    @program.command(
+        "label", help=SUMMARIES["label"] + "\n\nExample: tacpipe label data/recordings trial-003 --set material=foam"
+    )
+    def label(
+        dataset: Annotated[Path, typer.Argument(help="The recordings.")],
+        names: Annotated[list[str], typer.Argument(help="Names of recordings; * and ? stand for any letters.")],
+        set_: Annotated[list[str] | None, typer.Option("--set", help="name=value; a value of null removes it.")] = None,
+        exclude: Annotated[str | None, typer.Option("--exclude", help="Leave out of every stage, and why.")] = None,
+        include: Annotated[bool, typer.Option("--include", help="Take back an --exclude.")] = False,
+        as_json: AsJson = False,
+    ) -> None:
+        from tacpipe.datasets import labels
+
+        wanted = labels.parse(set_ or [], exclude, include=include)
+        changed = labels.change(dataset, names, wanted)
+        value = {
+            "schema_version": 1,
+            "output": str(changed.directory),
+            "recordings": changed.recordings,
+            "labels": wanted,
+        }
+        terminal.result_json(value) if as_json else terminal.result(changed.directory)
+
+
+def _show(program: typer.Typer) -> None:
+    @program.command("show", help=SUMMARIES["show"] + "\n\nExample: tacpipe show data/recordings")
+    def show(
+        dataset: Annotated[Path, typer.Argument(help="A dataset.")],
+        as_json: AsJson = False,
+        full: Annotated[
+            bool, typer.Option("--full", help="Every recording, not the first 20, and every label.")
+        ] = False,
+    ) -> None:
+        from tacpipe.cli import show as overview
+
+        most = None if full or as_json else overview.SHOWN
+        _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
+
+
+def _explain(program: typer.Typer) -> None:
+    @program.command("explain", help=SUMMARIES["explain"] + "\n\nExample: tacpipe explain results/forward")
+    def explain(dataset: Annotated[Path, typer.Argument(help="A dataset or report.")], as_json: AsJson = False) -> None:
+        from tacpipe.datasets import lineage
+
+        _print(lineage.of(dataset), lineage.to_text, as_json=as_json)
+
+
+def _demo(program: typer.Typer) -> None:
+    @program.command("demo", help=SUMMARIES["demo"] + "\n\nExample: tacpipe demo -o demo")
+    def demo(
+        output: Annotated[Path, typer.Option("-o", "--output", help="Where to write.")] = Path("demo"),
+        rig: Annotated[
+            Path | None, typer.Option("--rig", help="Emulate this rig, record it live, and run the chain on that.")
+        ] = None,
+    ) -> None:
+        from tacpipe.cli import demo as demonstration
+
+        terminal.result(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
+
+
+def _store(program: typer.Typer) -> None:
+    from tacpipe.cli import store
+
+    store.add(program, SUMMARIES["store"])
+
+
+def _sensors(program: typer.Typer) -> None:
+    from tacpipe.cli import sensors
+
+    sensors.add(program, SUMMARIES["sensors"])
+
+
+def _candidates(program: typer.Typer) -> None:
+    from tacpipe.cli import candidates
+
+    candidates.add(program, SUMMARIES["candidates"])
+
+
+def _acquire(program: typer.Typer) -> None:
+    from tacpipe.cli import acquire
+
+    acquire.add(program, SUMMARIES["acquire"])
+
+
+def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `tacpipe show DATASET | head` ends as it does for any Unix tool
+    terminal.result_json(value) if as_json else terminal.result(to_text(value, **options))
+
+
+NAMES: dict[str, Callable[[typer.Typer], None]] = {
+    "acquire": _acquire,
+    "label": _label,
+    "show": _show,
+    "explain": _explain,
+    "sensors": _sensors,
+    "store": _store,
+    "candidates": _candidates,
+    "demo": _demo,
+}

@@ -1,0 +1,61 @@
+"""The command ``tacpipe sensors emulate``: a rig without hardware, for as long as it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tacpipe.io import terminal
+
+SUMMARY = "Serve the streams of a rig file without hardware, each with its own bytes at its own rate."
+EXAMPLE = (
+    "\n\nFOLDER/rig.toml is the rig file with the addresses that were made: give it to `tacpipe acquire`. FOLDER/ledger "
+    "tells at the end what was sent and what was harmed.\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o "
+    "emulated --faults noise=0.5,drop=0.001"
+)
+MARK = b"\nsimulated = true\n"  # in the rig file of an emulated rig
+SWITCH_S = 0.0005  # that the planning thread may hold up the pacing one; Python's own 5 ms would be seen at 1 kHz
+
+
+def add(program: typer.Typer) -> None:
+    """Add the command ``emulate`` to ``program``."""
+    program.command("emulate", help=SUMMARY + EXAMPLE)(emulate)
+
+
+def emulate(
+    rig: Annotated[Path, typer.Argument(help="The rig file.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for rig.toml, pseudo-terminals and the ledger.")
+    ],
+    duration: Annotated[float | None, typer.Option("--duration", help="Seconds; without it, until Ctrl-C.")] = None,
+    faults: Annotated[
+        str, typer.Option("--faults", help="What goes wrong: noise=0.5,cut=0.2,flip=1,drop=0.001 …")
+    ] = "",
+    seed: Annotated[int, typer.Option("--seed", help="Of what happens in the world and goes wrong.")] = 0,
+) -> None:
+    """Serve a rig."""
+    from tacpipe.datasets import replacing
+    from tacpipe.io.files import readable_errors, write_whole
+    from tacpipe.io.termination import Ended
+    from tacpipe.recording.rig import read
+    from tacpipe.simulation.emulation import byte_faults, rig_file
+    from tacpipe.simulation.emulation.emulator import Emulator
+
+    asked, wrong, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
+    replacing.refuse_foreign(path, MARK)
+    sys.setswitchinterval(SWITCH_S)
+    with Ended() as ended, readable_errors(output):
+        with Emulator(asked, seed, wrong, output) as emulator:
+            write_whole(str(path), rig_file.text(emulator.rig).encode(), f"{path}.draft")
+            terminal.result(path)
+            for name, stream in emulator.rig.streams.items():
+                terminal.note(f"{name}: {stream.kind} at {stream.address}")
+            ended.wait(duration)
+        for ledger in emulator.ledger.values():
+            ledger.write(output / "ledger")
+    for name, ledger in emulator.ledger.items():
+        told = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
+        terminal.note(f"{name}: {told or 'nobody listened'}")

@@ -1,0 +1,205 @@
+"""The command line: one command a registered stage, and those that look after datasets and the store.
+
+Only the command that was asked for is built, and only its module imported: ``tacpipe --help`` and a hit must not wait for
+torch, pyarrow, pandas, scikit-learn or open3d. What it takes to build one comes once wishes to end are heeded.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.cli import addresses
+from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
+from tacpipe.io import memory, terminal, termination
+from tacpipe.io.files import told
+from tacpipe.plugins import extras, failures
+
+if TYPE_CHECKING:
+    import typer
+
+HELP = """From a tactile sensor's cable to a table of results that can be traced back to its bytes.
+
+Stages read and write datasets: `tacpipe STAGE INPUT... -o OUTPUT`. What was computed before is not computed again.
+Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data, 5 device missing or lost,
+6 lock wait timed out, 130 interrupted.
+"""
+SUMMARIES = {
+    "ingest": "Read published recordings into a dataset.",
+    "segment": "Mark what matters in recordings.",
+    "compress": "Turn tactile channels into latents.",
+    "train": "Train a model.",
+    "simulate": "Write recordings of the simulated rig, with ground truth.",
+}
+
+
+def app(arguments: Sequence[str]) -> typer.Typer:
+    """Return the program that can answer ``arguments``: with the one command they name, or all of them for help."""
+    import typer
+
+    from tacpipe.cli import commands
+    from tacpipe.plugins import registry
+
+    program = typer.Typer(
+        help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    )
+
+    @program.callback()
+    def version(show: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
+        if show:
+            from importlib.metadata import version as installed
+
+            terminal.result(installed("tacpipe"))
+            raise typer.Exit
+
+    first = next((argument for argument in arguments if not argument.startswith("-")), None)
+    if first == "--version" or "--version" in arguments[:1]:
+        program.info.invoke_without_command = True
+    names = registry.stages()
+    groups = {name.partition(".")[0] for name in names}
+    if first in commands.NAMES:
+        commands.NAMES[first](program)
+    elif first in groups:
+        _add_stages(program, first, [name for name in names if name.partition(".")[0] == first], arguments)
+    else:
+        _add_summaries(program, names, groups)
+    return program
+
+
+def main() -> None:
+    """Run the command line of this process, which ends within a second of Ctrl-C; exit with the documented codes."""
+    code = INTERRUPTED
+    try:
+        terminal.prepare()
+        memory.guard()
+        termination.heed()
+        code = _printed(answer(sys.argv[1:]))
+    except KeyboardInterrupt:  # as it began, or after it was done
+        termination.tell()
+    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be told apart
+        short = memory.shortage(error)
+        if short is None:
+            raise
+        _complain(str(short))
+        code = FAILED
+    sys.exit(termination.done(code))
+
+
+def _printed(code: int) -> int:
+    """Return the exit code of a command once what it printed is written; one whose result could not be has failed."""
+    failure = terminal.unprinted()
+    if failure is None or code != DONE:
+        return code
+    _complain(
+        f"What the command made is kept, but its result could not be written to standard output: {failure.strerror}. "
+        f"Write that to another place."
+    )
+    return FAILED
+
+
+def answer(arguments: Sequence[str]) -> int:
+    """Run one command line and return its exit code, one of those that are documented.
+
+    With ``--json`` among the arguments an error is one object on stdout too: ``schema_version``, ``error``, ``exit_code``.
+    """
+    try:
+        code, sentence = _call(arguments)
+    except TacpipeError as error:
+        code, sentence = error.exit_code, str(error)
+        _complain(sentence)
+    except KeyboardInterrupt:
+        code, sentence = INTERRUPTED, ""
+    except BrokenPipeError:
+        return DONE
+    except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
+        code, sentence = FAILED, str(memory.shortage(error) or told(error))
+        _complain(sentence)
+    except Exception as error:
+        found = str(memory.shortage(error) or "") or failures.text(error)
+        if found is None and not termination.wished():
+            raise
+        code, sentence = FAILED, str(found)
+        _complain(sentence)
+    if code == INTERRUPTED or (code != DONE and termination.wished()):
+        termination.tell()
+        code, sentence = INTERRUPTED, "The command was interrupted."
+    if sentence and "--json" in arguments:
+        terminal.result_json({"schema_version": 1, "error": sentence, "exit_code": code})
+    return code
+
+
+def _complain(sentence: str) -> None:
+    if not termination.wished():
+        terminal.note(f"tacpipe: {sentence}")
+
+
+def _call(arguments: Sequence[str]) -> tuple[int, str]:
+    """Return the exit code of a command line, and what was wrong with how it is written."""
+    import typer
+
+    program = app(arguments)
+    addresses.refuse(program)
+    try:
+        with extras.named("This command"):
+            code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
+    except typer.Abort:
+        return FAILED, ""
+    except _misuse() as error:
+        text = io.StringIO()
+        error.show(text)
+        terminal.note(text.getvalue().rstrip("\n"))
+        return error.exit_code, error.format_message()
+    return code if isinstance(code, int) else DONE, ""
+
+
+def _misuse() -> type[Any]:
+    """Return what click raises for a command line that it cannot read; typer may bring a click of its own."""
+    import typer
+
+    return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+
+def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: Sequence[str]) -> None:
+    import typer
+
+    from tacpipe.cli import stages
+    from tacpipe.plugins import registry
+
+    if names == [group]:
+        stages.add(program, group, group)
+        return
+    methods = typer.Typer(help=SUMMARIES.get(group), no_args_is_help=True, rich_markup_mode=None)
+    by_method = {name.partition(".")[2]: name for name in names}
+    asked = [method for method in by_method if method in arguments]
+    for method in asked:  # and no other: a broken method spoils itself alone
+        stages.add(methods, by_method[method], method)
+    for method in () if asked else by_method:
+        methods.command(method, help=registry.summary(by_method[method]))(_nothing)
+    program.add_typer(methods, name=group)
+
+
+def _add_summaries(program: typer.Typer, names: dict[str, str], groups: set[str]) -> None:
+    """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
+    from tacpipe.cli import commands
+    from tacpipe.plugins import registry
+
+    lines = {
+        group: SUMMARIES.get(group) or registry.summary(group if group in names else _first(names, group))
+        for group in groups
+    }
+    for name in (*ORDER, *sorted(groups - set(ORDER)), *commands.NAMES):
+        if name in lines or name in commands.NAMES:
+            program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
+
+
+ORDER = ("ingest", "simulate", "synchronize", "segment", "split", "compress", "train", "evaluate", "predict", "report")
+
+
+def _first(names: dict[str, str], group: str) -> str:
+    return next(name for name in names if name.startswith(f"{group}."))
+
+
+def _nothing() -> None:
+    """Stand for a command that was not asked for."""

@@ -1,0 +1,228 @@
+"""What a model is and what a result says: read from JSON and the headers of weights, so that nothing heavy is imported."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from tacpipe.datasets import manifest
+from tacpipe.datasets.dataset import Dataset
+from tacpipe.datasets.manifest import Found
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import headline
+from tacpipe.store.store import Store
+
+CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
+WEIGHTS = ".safetensors"
+SHOWN = 8  # entries of a list, or of a nested mapping: longer ones are counted
+_APART = ("task", "architecture", "params", "counts", "validation", "trained_on", "parameters", "seconds")
+_ROLES = ("train", "val", "test")
+
+
+def is_model(opened: Dataset) -> bool:
+    """Return whether a dataset is a model: it has a configuration that names a task, and nothing was measured."""
+    return CONFIG in opened.files and METRICS not in opened.files and "task" in _tree(opened, CONFIG)
+
+
+def is_result(opened: Dataset) -> bool:
+    """Return whether a dataset is the result of an evaluation."""
+    return METRICS in opened.files
+
+
+def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
+    """Return what a person asks of a model: task, architecture, what it was trained on and how, and its validation."""
+    config, history = _tree(opened, CONFIG), _history(opened)
+    return {
+        **_learned(config),
+        "parameters": config.get("parameters") or _parameters(opened),
+        "epochs": len(history) or None,
+        "validation": config.get("validation") or _best(history),
+        "params": config.get("params", dict(opened.source.params)),
+        "inputs": _inputs(opened.source.inputs, store),
+        "chain": [f"{step['stage']} {step['version']}" for step in opened.source.chain],
+    }
+
+
+def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
+    """Return what a person asks of a result: how the model compares with its baselines, on how much, and of which role."""
+    config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
+    headlines = headline.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
+    identity = _identity(store, found.digest)
+    return {
+        **{name: config.get(name) for name in ("task", "architecture")},
+        "headline": None if headlines is None else [one.to_json() for one in headlines],
+        "baselines": list(dict.fromkeys(row.name for one in headlines or () for row in one.baselines)),
+        "evaluated_on": metrics.get("counts", {}),
+        "by_part": {name: one["counts"] for name, one in metrics.items() if isinstance(one, dict) and "counts" in one},
+        "fold": identity.get("fold"),
+        "role": (identity.get("role") or "test") if "split" in opened.source.inputs else None,
+        "trained_on": _learned(config)["trained_on"],
+        "inputs": _inputs(opened.source.inputs, store),
+    }
+
+
+def model_text(value: Mapping[str, Any]) -> list[str]:
+    """Return the lines that `of_model` is shown as."""
+    told = [
+        ("task", value["task"]),
+        ("architecture", value["architecture"]),
+        ("parameters", f"{value['parameters']:,}" if value["parameters"] else None),
+        *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
+        ("epochs", value["epochs"]),
+        ("validation", flat(value["validation"]) if value["validation"] else None),
+        *value["about"].items(),
+        ("params", flat(value["params"])),
+        ("behind", ", then ".join(value["chain"]) or None),
+        *_from(value["inputs"]),
+    ]
+    return _aligned(told)
+
+
+def result_text(value: Mapping[str, Any]) -> list[str]:
+    """Return the lines that `of_result` is shown as: the headline table first."""
+    if value["headline"] is None:
+        lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
+    else:
+        lines = headline.text([headline.Headline.from_json(one) for one in value["headline"]]).splitlines()
+    parts = {name: flat(one) for name, one in value["by_part"].items()}
+    fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
+    told = [
+        ("task", value["task"]),
+        ("architecture", value["architecture"]),
+        ("evaluated on", flat(value["evaluated_on"])),
+        *((f"  {name}", text) for name, text in parts.items()),
+        ("role", f"{value['role']}{fold}" if value["role"] else None),
+        ("baselines", ", ".join(value["baselines"]) or None),
+        *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
+        *_from(value["inputs"]),
+    ]
+    return [*lines, "", *_aligned(told)]
+
+
+def flat(value: Any) -> str:
+    """Return a nested value on one line; long lists are counted.
+
+    >>> flat({"train": {"a": 35, "b": 33}, "val": 2, "names": []}), flat(list(range(20))), flat(None), flat(0.5)
+    ('train a 35, train b 33, val 2', '20 values', '–', '0.5')
+    """
+    return ", ".join(f"{name} {told}".strip() for name, told in _leaves(value)) or headline.NONE
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for key, one in value.items():
+            yield from _leaves(one, f"{name} {key}".strip().replace("_", " "))
+    elif isinstance(value, list):
+        if len(value) > SHOWN:
+            yield name, f"{len(value)} values"
+        elif value:
+            yield name, " ".join(map(str, value))
+    elif isinstance(value, float):
+        yield name, f"{value:.6g}"
+    elif value is not None and value != "":
+        yield name, str(value)
+
+
+def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return task, architecture, what was trained on, and what else a configuration says in few words."""
+    trained = config.get("trained_on")
+    return {
+        **{name: config.get(name) for name in ("task", "architecture")},
+        "trained_on": {
+            "recordings": len(trained) if isinstance(trained, Mapping) else None,  # of all roles that training read
+            "roles": {role: one for role, one in config.get("counts", {}).items() if role in _ROLES},
+        },
+        "about": {
+            name.replace("_", " "): told
+            for name, one in config.items()
+            if name not in _APART and (told := _short(one)) is not None
+        },
+    }
+
+
+def _short(value: Any) -> str | None:
+    """Return an entry of a configuration in few words; None for one that is empty, or large and says nothing so."""
+    if isinstance(value, Mapping):
+        if all(not isinstance(one, Mapping | list) for one in value.values()) and len(value) <= SHOWN:
+            return flat(value) if value else None
+        if all(isinstance(one, Mapping) for one in value.values()) and len(value) <= SHOWN:
+            return ", ".join(value)
+        return None
+    if isinstance(value, list):
+        if not value or not all(isinstance(one, str | int) for one in value):
+            return None
+        names = list(dict.fromkeys(map(str, value)))
+        return ", ".join(names) if len(names) <= SHOWN else f"{', '.join(names[:SHOWN])} … ({len(names)})"
+    return flat(value) if value not in (None, "") else None
+
+
+def _trained(trained: Mapping[str, Any]) -> list[str]:
+    lines = [f"{role}: {flat(one) if isinstance(one, Mapping) else one}" for role, one in trained["roles"].items()]
+    count = trained["recordings"]
+    return [*lines, *([headline.counted(count, "recordings") + " of training and validation"] if count else [])]
+
+
+def _from(inputs: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(name if not at else "", told) for name, several in inputs.items() for at, told in enumerate(several)]
+
+
+def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
+    """Return where each input lies now, as far as the store knows, and its digest."""
+    places = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
+    return {
+        name: [f"{places.get(one['manifest'], 'in no known location')} [{one['dataset'][:12]}]" for one in several]
+        for name, several in inputs.items()
+    }
+
+
+def _identity(store: Store, name: str) -> Mapping[str, Any]:
+    """Return what the run that gave a manifest was asked for; empty where no record of it is left."""
+    for _, record in store.records():
+        file = record["result"]["files"].get(manifest.NAME)
+        if file is not None and file["digest"] == name:
+            found: Mapping[str, Any] = record["identity"]
+            return found
+    return {}
+
+
+def _tree(opened: Dataset, name: str) -> dict[str, Any]:
+    if name not in opened.files:
+        return {}
+    try:
+        found = json.loads(opened.files[name])
+    except ValueError:
+        raise TacpipeError(f"{name} is not JSON. Run the stage that made it again.") from None
+    return found if isinstance(found, dict) else {}
+
+
+def _history(opened: Dataset) -> list[dict[str, Any]]:
+    lines = opened.files[HISTORY].splitlines() if HISTORY in opened.files else []
+    return [json.loads(line) for line in lines if line.strip()]
+
+
+def _best(history: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the epoch of least validation loss, None where the history has none."""
+    validated = [line for line in history if isinstance(line.get("val_loss"), int | float)]
+    best = min(validated, key=lambda line: line["val_loss"], default=None)
+    return {"epoch": best.get("epoch"), "loss": best["val_loss"]} if best else None
+
+
+def _parameters(opened: Dataset) -> int | None:
+    """Return how many numbers the weights hold, from the headers of the model's own safetensors files."""
+    count = 0
+    for name in opened.files:
+        if name.endswith(WEIGHTS) and name.startswith("model"):
+            content = opened.files[name]
+            size = int.from_bytes(content[:8], "little")
+            header = json.loads(content[8 : 8 + size])
+            count += sum(math.prod(one["shape"]) for key, one in header.items() if key != "__metadata__")
+    return count or None
+
+
+def _aligned(told: list[tuple[str, Any]]) -> list[str]:
+    """Return names and values in two columns; what is None is left out."""
+    shown = [(name, str(value)) for name, value in told if value is not None and value != ""]
+    width = max((len(name) for name, _ in shown), default=0)
+    return [f"{name:<{width}}  {value}" for name, value in shown]

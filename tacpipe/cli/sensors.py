@@ -1,0 +1,180 @@
+"""The commands of ``tacpipe sensors``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tacpipe.errors import DEVICE, TacpipeError
+from tacpipe.io import terminal
+from tacpipe.plugins import registry
+
+if TYPE_CHECKING:
+    from tacpipe.links.link import Address
+    from tacpipe.links.probing import Report
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+SCHEMA_VERSION = 1
+EMULATION = "tacpipe.cli.emulate"
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the group ``sensors`` to ``program``."""
+    group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
+    group.command("list")(list_)
+    group.command("probe")(probe)
+    if find_spec("tacpipe.simulation.emulation") and find_spec(EMULATION):
+        from tacpipe.cli import emulate
+
+        emulate.add(group)
+    program.add_typer(group, name="sensors")
+
+
+def list_(as_json: AsJson = False) -> None:
+    """List the sensors that a rig file may name: how they are reached, how fast they are, what they are.
+
+    Example: tacpipe sensors list
+    """
+    rows = [_row(name) for name in registry.sensors()]
+    if as_json:
+        terminal.result_json({"schema_version": SCHEMA_VERSION, "sensors": rows})
+        return
+    head = {"name": "sensor", "links": "links", "rate_hz": "rate", "baud": "baud", "summary": "what it is"}
+    table = [[head[key] for key in head], *([_cell(key, row[key]) for key in head] for row in rows)]
+    widths = [max(len(line[column]) for line in table) for column in range(len(head))]
+    for line in table:
+        terminal.result("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+
+
+def probe(
+    port: Annotated[
+        str | None, typer.Argument(help="An address such as serial:/dev/ttyACM0, or a path; all that are there.")
+    ] = None,
+    passive: Annotated[bool, typer.Option("--passive", help="Only listen; write nothing to a device.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say which sensor speaks on a port, and what speaks for it: listen first, then ask as each driver does.
+
+    What is asked are the questions with which a recording begins. Ports that are not USB are only listened to unless named.
+    Exits with 5 if nothing was recognised anywhere.
+
+    Example: tacpipe sensors probe serial:/dev/ttyACM0
+    """
+    from tacpipe.links import probing
+
+    found = [(_address(port), _usb_id(port))] if port else list(probing.found_ports())
+    reports = []
+    for address, usb_id in found:
+        unasked = passive or (port is None and not usb_id)  # a machine's own port may lead anywhere, a console even
+        reports.append(probing.probe(address, usb_id, passive=unasked, tell=_tell))
+        if not as_json:
+            terminal.result(_text(reports[-1]))
+    if as_json:
+        terminal.result_json({"schema_version": SCHEMA_VERSION, "ports": [_json(report) for report in reports]})
+    elif not found:
+        terminal.result("There is no serial port and no HID device. Plug one in, or name an address.")
+    if not any(report.findings for report in reports):
+        raise typer.Exit(DEVICE)
+
+
+def _row(name: str) -> dict[str, Any]:
+    try:
+        kind = registry.load_sensor(name)
+    except TacpipeError as error:  # a plug-in's, which must not hide the others
+        return {"name": name, "links": [], "rate_hz": None, "baud": None, "summary": str(error), "exclusive": ""}
+    defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+    told = {key: value for key, value in defaults.items() if value is not dataclasses.MISSING}
+    baud = told.get("baud") if "serial" in kind.links else None
+    return {
+        "name": name,
+        "links": list(kind.links),
+        "rate_hz": told.get("rate_hz"),
+        "baud": baud,
+        "summary": kind.summary,
+        "exclusive": kind.exclusive,
+    }
+
+
+def _cell(key: str, value: Any) -> str:
+    if not value:
+        return "-"
+    if key == "links":
+        return ", ".join(value)
+    return f"{value:g} Hz" if key == "rate_hz" else f"{value:,}" if key == "baud" else str(value)
+
+
+def _address(port: str) -> Address:
+    from tacpipe.links import link
+
+    return link.parse(f"serial:{port}" if port.startswith("/") else port)
+
+
+def _usb_id(port: str) -> str:
+    from tacpipe.links import ports
+
+    if not port.startswith(("/", "serial:")):
+        return ""
+    return next((there.usb_id for there in ports.serial_ports() if there.address == str(_address(port))), "")
+
+
+def _tell(step: str) -> None:
+    if sys.stderr.isatty():
+        terminal.note(step)
+
+
+def _text(report: Report) -> str:
+    if report.error:
+        return f"{report.address}: {report.error}"
+    if not report.heard and not report.findings:
+        return f"{report.address}: silent, whoever asks. Check that the device is switched on."
+    if not report.findings:
+        return f"{report.address}: {report.heard:,} bytes came that no driver can explain; describe it with `generic`."
+    first, *others = report.findings
+    at = f" at {report.baud:,} baud" if report.baud else ""
+    when = " once asked" if report.asked else ""
+    lines = [f"{report.address} speaks {first}{at}{when}."]
+    lines += [f"    or {other}" for other in others]
+    return "\n".join([*lines, *(f"    {line}" for line in _stanza(report))])
+
+
+def _stanza(report: Report) -> list[str]:
+    """Return what to write into a rig file for the likeliest sensor."""
+    candidate = report.findings[0].candidate
+    options = dict(candidate.options)
+    if report.baud and report.baud != type(candidate.sensor).__dict__.get("baud"):
+        options["baud"] = report.baud
+    written = ", ".join(f"{name} = {json.dumps(value)}" for name, value in options.items())
+    return [
+        "[[stream]]",
+        f'name = "{candidate.kind.replace("-", "_")}"',
+        f'sensor = "{candidate.kind}"',
+        f'transport = "{report.address}"',
+        *([f"options = {{ {written} }}"] if written else []),
+    ]
+
+
+def _json(report: Report) -> dict[str, Any]:
+    return {
+        "address": report.address,
+        "baud": report.baud,
+        "asked": report.asked,
+        "bytes": report.heard,
+        "error": report.error or None,
+        "certain": report.certain,
+        "findings": [
+            {
+                "sensor": finding.name,
+                "options": dict(finding.candidate.options),
+                "frames": finding.frames,
+                "rate_hz": round(finding.rate_hz, 3),
+                "explained": round(finding.explained, 6),
+                "chance": round(finding.chance, 6),
+            }
+            for finding in report.findings
+        ],
+    }

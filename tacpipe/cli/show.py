@@ -1,0 +1,197 @@
+"""What is in a dataset: the streams of recordings, a split's roles, what a model learned from, how a result came out.
+
+What is shown follows from what the dataset holds, whichever stage made it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from tacpipe import printable
+from tacpipe.cli import model_overview
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.engine import execution
+from tacpipe.metrics.headline import counted
+from tacpipe.plugins.stage import ROLES
+from tacpipe.recording import ending
+from tacpipe.store.store import locate
+
+SHOWN = 20  # recordings listed before the rest is counted
+_TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
+_SPLIT = ("recording", "fold", "role")  # columns of a split
+_GAP_FACTOR = 3.0  # a step this many times the median step is a gap
+
+
+def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
+    """Return what is in the dataset at ``path``: its ``kind`` (recordings, split, model, result), files, and the rest by it.
+
+    Of recordings, labels, and numbers a stream of the first ``most`` by name (None: of all), whose shards alone are read; of
+    a split, recordings by fold and role; of a model and of a result, what
+    `tacpipe.cli.model_overview` finds.
+    """
+    found = manifest_of.find(path)
+    store = locate(found.directory)
+    sizes = dict(found.manifest.sizes())
+    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),), sizes))
+    about = _about(opened)
+    if model_overview.is_result(opened):
+        return {"kind": "result", **about, **model_overview.of_result(opened, found, store)}
+    if model_overview.is_model(opened):
+        return {"kind": "model", **about, **model_overview.of_model(opened, store)}
+    folds = _folds(opened)
+    if folds:
+        return {"kind": "split", **about, "params": dict(opened.source.params), "folds": folds}
+    return {
+        "kind": "recordings",
+        **about,
+        "recordings": {name: _recording(opened.shards[name]) for name in sorted(opened.shards)[:most]},
+        "attributes": {name: dict(shard.attributes) for name, shard in opened.shards.items()},
+        "excluded": _excluded(opened),
+    }
+
+
+def _about(opened: Dataset) -> dict[str, Any]:
+    """Return what every dataset has: who made it, files and sizes."""
+    manifest = opened.source
+    return {
+        "stage": manifest.stage,
+        "digest": manifest.digest,
+        "skipped": dict(manifest.skipped),
+        "files": {name: file["bytes"] for name, file in manifest.files.items()},
+        "bytes": sum(shard["bytes"] for entry in manifest.recordings.values() for shard in entry["shards"].values()),
+        "rows": manifest.rows,
+    }
+
+
+def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
+    """Return how many recordings have each role, by fold, where the dataset is a split; else nothing."""
+    shards = list(opened.shards.values())
+    if len(shards) != 1 or shards[0].streams != ("",):
+        return {}
+    table = shards[0].table()
+    if not set(_SPLIT) <= set(table.column_names):
+        return {}
+    found: dict[str, dict[str, int]] = {}
+    for fold, role in zip(table["fold"].to_pylist(), table["role"].to_pylist(), strict=True):
+        counts = found.setdefault(str(fold), {})
+        counts[str(role)] = counts.get(str(role), 0) + 1
+    return found
+
+
+def _excluded(opened: Dataset) -> dict[str, str]:
+    entries = opened.source.recordings
+    return {name: str(why) for name, entry in entries.items() if (why := entry["attributes"].get("excluded"))}
+
+
+def _recording(shard: Recording) -> dict[str, Any]:
+    return {stream: _stream(shard, stream) for stream in shard.streams}
+
+
+def _stream(shard: Recording, stream: str) -> dict[str, Any]:
+    import numpy as np
+    import pyarrow as pa
+
+    table = shard.table(stream)
+    found: dict[str, Any] = {"rows": table.num_rows, "columns": table.num_columns}
+    if "t_ns" in table.column_names and table.num_rows > 1:
+        step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
+        median_ns = float(np.median(step_ns))
+        found["duration_s"] = round(float(step_ns.sum()) / 1e9, 3)
+        found["rate_hz"] = round(1e9 / median_ns, 3) if median_ns else None
+        found["gaps"] = int((step_ns > _GAP_FACTOR * median_ns).sum())
+        if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
+            steps = np.diff(table["seq"].to_numpy())
+            found["rate_hz"] = round(float(steps.sum() / step_ns.sum()) * 1e9, 3)
+            found["gaps"] = int((steps > 1).sum())
+    integers = [
+        table[field.name].to_numpy()
+        for field in table.schema
+        if pa.types.is_integer(field.type) and (field.metadata or {}).get(b"quantity") == b"tactile"
+    ]
+    if integers and table.num_rows > 1:
+        values = np.column_stack(integers)  # (time, channel)
+        limits = np.iinfo(values.dtype)
+        found["held_share"] = round(float((values[1:] == values[:-1]).all(axis=1).mean()), 4)
+        found["saturated"] = int(((values == limits.max) | (values == limits.min)).sum())
+    return found
+
+
+def to_text(value: dict[str, Any], *, full: bool = False) -> str:
+    """Return the overview as lines: one a stream of each recording that was read, then labels; then files and totals."""
+    told = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
+    if value["kind"] in told:
+        made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
+        return printable.lines([*told[value["kind"]](value), *_files(value), made])
+    return printable.lines(_recordings_text(value, full))
+
+
+def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
+    shown, count = sorted(value["recordings"]), len(value["attributes"])
+    lines = [
+        f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "
+        f"{'gaps':>5} {'held':>5} {'saturated':>9}"
+    ]
+    for name in shown:
+        cell = printable.padded(printable.shown(name), 24)
+        for stream, found in value["recordings"][name].items():
+            held = f"{found['held_share']:.0%}" if "held_share" in found else ""
+            lines.append(
+                f"{cell} {stream or '-':<10} {found['rows']:>7} {found['columns']:>7} {found.get('duration_s', ''):>8} "
+                f"{found.get('rate_hz', '') or '':>8} {found.get('gaps', ''):>5} {held:>5} {found.get('saturated', ''):>9}"
+            )
+    if count > len(shown):
+        lines.append(f"… and {count - len(shown)} more (--full)")
+    lines += ["", *_labels(value["attributes"], full)]
+    lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
+    lines += ending.lines(value["attributes"], value["recordings"])
+    lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
+    lines += _files(value)
+    lines.append(
+        f"{counted(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
+        f"made by {value['stage']} [{value['digest'][:12]}]"
+    )
+    return lines
+
+
+def _split_text(value: dict[str, Any]) -> list[str]:
+    """Return how many recordings have each role, a line a fold."""
+    roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
+    lines = [f"{'fold':<6}" + "".join(f"{role:>8}" for role in roles)]
+    for fold, counts in value["folds"].items():
+        lines.append(f"{fold:<6}" + "".join(f"{counts.get(role, 0):>8}" for role in roles))
+    return [*lines, f"params: {model_overview.flat(value['params'])}"]
+
+
+def _role_order(role: str) -> tuple[int, str]:
+    return (ROLES.index(role) if role in ROLES else len(ROLES)), role
+
+
+def _files(value: dict[str, Any]) -> list[str]:
+    return [f"file: {name}, {size} bytes" for name, size in value["files"].items()]
+
+
+def _labels(attributes: dict[str, dict[str, Any]], full: bool) -> list[str]:
+    """Return one line a label that takes few values, with how often it takes each; a simulator's truth on one in all."""
+    lines = []
+    names = sorted({label for labels in attributes.values() for label in labels})
+    truth = [name for name in names if name.startswith(_TRUTH)]
+    if truth and not full:
+        names = [name for name in names if name not in truth]
+        lines.append(
+            f"{_TRUTH}*: {counted(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
+        )
+    for label in names:
+        values = [labels[label] for labels in attributes.values() if label in labels]
+        if any(isinstance(value, float) for value in values):
+            numbers = [value for value in values if isinstance(value, int | float)]
+            lines.append(f"{label}: {min(numbers):g} to {max(numbers):g}")
+            continue
+        counts = Counter(str(value) for value in values)
+        if len(counts) <= SHOWN:
+            lines.append(f"{label}: " + ", ".join(f"{value} ({count})" for value, count in sorted(counts.items())))
+        else:
+            lines.append(f"{label}: {len(counts)} values")
+    return lines

@@ -1,0 +1,274 @@
+"""A stage as a command: arguments from its signature, options from its params."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import typer
+
+from tacpipe.engine import pipeline
+from tacpipe.engine.outcome import Outcome
+from tacpipe.engine.request import Request
+from tacpipe.errors import FAILED
+from tacpipe.io import progress, terminal
+from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.plugins.constraints import NonNegativeInt
+from tacpipe.plugins.stage import Stage
+
+_PLACES = {  # what examples call the datasets
+    "ingest": "data/recordings",
+    "simulate": "data/recordings",
+    "synchronize": "data/synced",
+    "segment": "data/segments",
+    "split": "data/split",
+    "compress": "data/latents",
+    "segment.grasps": "data/grasps",
+    "segment.slides": "data/slides",
+    "train": "models/forward",
+    "train.material": "models/material",
+    "evaluate": "results/forward",
+    "report": "report.html",
+}
+_BEFORE = {
+    "synchronize": "recordings",
+    "segment": "synced",
+    "segment.grasps": "recordings",
+    "segment.slides": "recordings",
+    "train.material": "slides",
+    "split": "segments",
+    "compress": "segments",
+    "train": "latents",
+    "evaluate": "latents",
+}
+_CHECKED = {"jobs": NonNegativeInt, "fold": NonNegativeInt | None, "role": Literal["train", "val", "test"] | None}
+
+
+def add(program: typer.Typer, name: str, command: str) -> None:
+    """Add stage ``name`` to ``program`` as ``command``."""
+    stage = registry.load(name)
+    fields = params_of.fields(stage)
+    parameters = [*_arguments(stage), *_shared(stage), *_options(stage, fields)]
+
+    def call(**given: Any) -> None:
+        _call(name, stage, given, [field for field in fields if given.get(field) is not None])
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    program.command(command, help=_help(name, stage))(call)
+
+
+def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) -> None:
+    progress.set_quiet(given["quiet"])
+    for flag, kind in _CHECKED.items():
+        fields_of.check(given.get(flag), kind, f"--{flag}")
+    params = params_of.build(
+        name,
+        stage,
+        file=_params_file(given),
+        block=given["block"],
+        preset=given["preset"],
+        sets=given["set_"] or (),
+        options={field: _parsed(given[field], params_of.fields(stage)[field]) for field in named},
+    )
+    if given["print_params"]:
+        terminal.result(json.dumps(params_of.to_json(params), indent=1))
+        return
+    if given["output"] is None:
+        raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
+    paths = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend", "init")}
+    request = Request(
+        name,
+        params,
+        given["output"],
+        datasets=given.get("datasets") or (),
+        fold=given.get("fold") or 0,
+        role=given.get("role"),
+        jobs=given["jobs"],
+        skip_bad=given["skip_bad"],
+        check=given["check"],
+        compare=given["compare"],
+        rerun=given["rerun"],
+        replace=given["replace"],
+        **paths,
+    )
+    shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
+    _report(pipeline.run(request), shown, as_json=given["json_"], quiet=given["quiet"])
+
+
+def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
+    for note in outcome.notes:
+        terminal.note(f"tacpipe: {note}")
+    for name, why in outcome.bad.items():
+        terminal.note(f"tacpipe: left out {name}: {why}")
+    if not quiet:
+        terminal.note(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s")
+    told: dict[str, Any] = {}
+    if headline is not None and (as_json or not quiet):
+        from tacpipe.cli import headline_table
+
+        found = headline_table.of_output(outcome.output, headline)
+        told["headline"] = [one.to_json() for one in found]
+        if not quiet:
+            headline_table.show(found)
+    if as_json:
+        terminal.result_json({"schema_version": 1, **outcome.to_json(), **told})
+    else:
+        terminal.result(outcome.output)
+    if outcome.differs:
+        terminal.note(f"tacpipe: {outcome.describe_differences()}")
+        raise typer.Exit(FAILED)
+
+
+def _params_file(given: dict[str, Any]) -> Path | None:
+    if given["params_file"] is not None:
+        return Path(given["params_file"])
+    default = Path("params.yaml")
+    return default if given["block"] is not None or default.exists() else None
+
+
+def _arguments(stage: Stage) -> list[inspect.Parameter]:
+    kinds = set(stage.arguments.values())
+    found = []
+    if "Files" in kinds:
+        found.append(_parameter("source", Path, typer.Argument(help="Folder of the published recordings.")))
+    if stage.reads_model:
+        found.append(_parameter("model", Path, typer.Argument(help="A trained model.")))
+    if kinds & {"Recording", "Dataset", "Datasets"}:
+        found.append(
+            _parameter("datasets", list[Path], typer.Argument(help="Datasets to read; several are read as one."))
+        )
+    return found
+
+
+def _shared(stage: Stage) -> list[inspect.Parameter]:
+    kinds = set(stage.arguments.values())
+    found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
+    if stage.needs_split or stage.reads_model:
+        found += [
+            _parameter(
+                "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
+            ),
+            _parameter("fold", int, typer.Option(0, "--fold", help="Fold of the split.")),
+        ]
+    if stage.reads_model:
+        found.append(
+            _parameter("role", str | None, typer.Option(None, "--role", help="Role to read: train, val or test."))
+        )
+    if stage.fit is not None:
+        text = "A dataset whose fitted codec to apply."
+        found.append(_parameter("codec", Path | None, typer.Option(None, "--codec", help=text)))
+    if "init" in stage.arguments:
+        text = "A model to begin with."
+        found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+    if "Roles" in kinds:
+        text = "An older split whose roles to keep."
+        found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
+    return found
+
+
+def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+    helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
+    found = []
+    for name, wanted in fields.items():
+        kind = fields_of.bare(wanted)
+        many = get_origin(kind) is tuple
+        flag = f"--{name.replace('_', '-')}"
+        flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
+        annotation = bool | None if kind is bool else list[str] | None if many else str | None  # parsed as --set is
+        text = _about(stage, name, helps.get(name, ""))
+        metavar = None if kind is bool else _metavar(wanted)
+        option = typer.Option(None, *flags, help=text, show_default=False, metavar=metavar)
+        found.append(_parameter(name, annotation, option))
+    more: list[tuple[str, Any, Any]] = [
+        (
+            "preset",
+            str | None,
+            typer.Option(None, "--preset", help=f"Preset of params: {', '.join(params_of.presets(stage)) or 'none'}."),
+        ),
+        (
+            "params_file",
+            Path | None,
+            typer.Option(None, "--params", help="File of params [params.yaml if there is one]."),
+        ),
+        ("block", str | None, typer.Option(None, "--block", help="Block of the params file, as forward.synchronize.")),
+        ("set_", list[str] | None, typer.Option(None, "--set", help="Set a param: --set name=value.")),
+        (
+            "print_params",
+            bool,
+            typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
+        ),
+        ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
+        ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Go on without recordings that cannot be read.")),
+        ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
+        (
+            "compare",
+            bool,
+            typer.Option(False, "--recompute-and-compare", help="Run again what is stored and name what differs."),
+        ),
+        ("rerun", bool, typer.Option(False, "--rerun", help="Compute what is stored too, and keep the new result.")),
+        (
+            "replace",
+            bool,
+            typer.Option(False, "--replace", help="Replace what -o holds: another dataset, recordings, labels."),
+        ),
+        ("json_", bool, typer.Option(False, "--json", help="Print one JSON object.")),
+        ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),
+    ]
+    return [*found, *(_parameter(*item) for item in more)]
+
+
+def _parsed(given: Any, wanted: Any) -> Any:
+    """Return what was given for an option, as its annotation has it where that is possible."""
+    if isinstance(given, list):
+        return [fields_of.parsed(text, get_args(fields_of.bare(wanted))[0]) for text in given]
+    return fields_of.parsed(given, wanted) if isinstance(given, str) else given
+
+
+def _about(stage: Stage, name: str, comment: str) -> str:
+    """Return the help of an option: its comment, what it may be, which choices have it, and its default."""
+    wanted = params_of.fields(stage)[name]
+    told = [comment] if comment else []
+    if fields_of.constraints(wanted):
+        told.append(fields_of.describe(wanted))
+    if owners := params_of.having(stage, name):
+        told.append(f"only with {params_of.tag(stage)} {', '.join(owners)}")
+    return f"{'; '.join(told)} [{' or '.join(map(str, params_of.defaults(stage, name)))}]".strip()
+
+
+def _metavar(wanted: Any) -> str:
+    """Return what stands for an option's value in its help: the choices, or the type."""
+    kind = fields_of.bare(wanted)
+    if get_origin(kind) is tuple:
+        return f"{_metavar(get_args(kind)[0])}..."
+    if get_origin(kind) is Literal:
+        return f"[{'|'.join(map(str, get_args(kind)))}]"
+    return {int: "INTEGER", float: "NUMBER"}.get(kind, "TEXT")
+
+
+def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _help(name: str, stage: Stage) -> str:
+    text = inspect.cleandoc(stage.function.__doc__ or sys.modules[stage.function.__module__].__doc__ or "")
+    return f"{text}\n\nExample: {example(name, stage)}"
+
+
+def example(name: str, stage: Stage) -> str:
+    """Return a command line that shows the stage at work."""
+    group = name.partition(".")[0]
+    words = ["tacpipe", *name.split(".")]
+    kinds = set(stage.arguments.values())
+    words += ["published/recordings"] if "Files" in kinds else []
+    words += ["models/forward"] if stage.reads_model else []
+    words += [f"data/{_BEFORE.get(name, _BEFORE.get(group, 'recordings'))}"] if kinds & {"Recording", "Dataset"} else []
+    words += ["results/forward"] if "Datasets" in kinds else []
+    words += ["--split", "data/split"] if stage.needs_split or stage.reads_model else []
+    return " ".join([*words, "-o", _PLACES.get(name, _PLACES.get(group, "data/out"))])

@@ -1,0 +1,209 @@
+"""The commands of ``tacpipe store``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tacpipe.errors import DAMAGED, UsageError
+from tacpipe.io import terminal
+from tacpipe.maintenance import garbage
+from tacpipe.printable import plain
+from tacpipe.store.roots import PUSHED
+from tacpipe.store.store import Store, locate
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
+Remote = Annotated[Path, typer.Argument(help="The other store, a directory.")]
+OtherStore = Annotated[Path | None, typer.Option("--store", help="Another store than the project's, as one pushed to.")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")]
+Ancestors = Annotated[bool, typer.Option("--ancestors", help="With the shards of all that the datasets descend from.")]
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the group ``store`` to ``program``."""
+    group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
+    for command in (status, list_, checkout, verify, repair, gc, link, push, pull):
+        group.command(command.__name__.rstrip("_"))(command)
+    program.add_typer(group, name="store")
+
+
+def status(as_json: AsJson = False) -> None:
+    """Show where the store is, how much lies in it, and which paths hold which manifest.
+
+    Example: tacpipe store status
+    """
+    from tacpipe.maintenance import repair as upkeep
+
+    value = upkeep.status(locate())
+    _print(value, as_json=as_json, text=upkeep.status_text(value))
+
+
+def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
+    """List the datasets that the store knows: stage, time, recordings, labels, last path. Replaced ones are among them.
+
+    Example: tacpipe store list
+    """
+    from tacpipe.maintenance import checkout as checkouts
+    from tacpipe.maintenance import transfer
+
+    listed = checkouts.known(locate() if store is None else transfer.remote_store(store))
+    _print(checkouts.to_json(listed), as_json=as_json, text=checkouts.to_text(listed))
+
+
+def checkout(
+    dataset: Annotated[
+        str, typer.Argument(help="Digest, its first digits, or last path, as `store list` prints them.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")],
+    store: OtherStore = None,
+    replace: Replace = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a dataset that the store knows to a directory, with the labels that were set by hand.
+
+    Example: tacpipe store checkout 3f2a91c0d4e5 -o data/recordings
+    """
+    from tacpipe.maintenance import checkout as checkouts
+    from tacpipe.maintenance import transfer
+
+    source = None if store is None else transfer.remote_store(store)
+    made = checkouts.checkout(dataset, output, replace=replace, source=source)
+    value = {"schema_version": 1, "output": str(output), "stage": made.stage, "recordings": len(made.recordings)}
+    _print({**value, "labelled": len(made.labels)}, as_json=as_json, text=str(output))
+
+
+def verify(as_json: AsJson = False) -> None:
+    """Read every object and record; exit with 4 if one is damaged or missing. Damaged ones are quarantined.
+
+    Example: tacpipe store verify
+    """
+    from tacpipe.maintenance import repair as upkeep
+
+    found = upkeep.verify(locate())
+    _print(asdict(found), as_json=as_json, text=found.to_text())
+    if not found.clean:
+        raise typer.Exit(DAMAGED)
+
+
+def repair(as_json: AsJson = False) -> None:
+    """Make again what is damaged or missing; exit with 4 if something cannot be made again.
+
+    Example: tacpipe store repair
+    """
+    from tacpipe.maintenance import repair as upkeep
+
+    found = upkeep.repair(locate())
+    _print(asdict(found), as_json=as_json, text=found.to_text())
+    if found.lost:
+        raise typer.Exit(DAMAGED)
+
+
+def gc(
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be removed.")] = False,
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Also recordings that nothing names any more.")
+    ] = False,
+    grace_days: Annotated[
+        float, typer.Option("--grace-days", help="How long a dataset counts whose path cannot be reached.")
+    ] = garbage.GRACE_DAYS,
+    forget: Annotated[
+        list[str] | None, typer.Option("--forget", help="A dataset, pushed or gone, that need not be kept any longer.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Remove what no dataset, nothing that one descends from, and no running process needs.
+
+    Example: tacpipe store gc --dry-run
+    """
+    store = locate()
+    _forget(store, forget or [], dry_run=dry_run)
+    found = garbage.collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
+    verb = "would remove" if dry_run else "removed"
+    text = (
+        f"{verb} {found.objects} objects ({found.bytes / 1e6:.1f} MB), {found.records} records, {found.drafts} drafts"
+    )
+    if found.kept_recordings:
+        text += f"; kept {found.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
+    _print(asdict(found), as_json=as_json, text=text)
+
+
+def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
+    from tacpipe.maintenance import pushed
+
+    for name in names:
+        roots = store.roots.all()
+        local = [root for root in roots if root["kind"] != PUSHED and str(root["path"]) == str(Path(name).absolute())]
+        for root in local if not dry_run else ():
+            store.roots.remove(root)
+        if not pushed.forget(store, name, dry_run=dry_run) and not local:
+            known = sorted(pushed.label(root, roots) for root in roots)
+            raise UsageError(f"{store.root} keeps no dataset {name}; it keeps {', '.join(known) or 'nothing'}.")
+
+
+def link(datasets: Paths) -> None:
+    """Link shards beside their manifest anew, for programs that read the files directly.
+
+    Example: tacpipe store link data/synced
+    """
+    from tacpipe.maintenance import repair as upkeep
+
+    for path in datasets:
+        count = upkeep.link(path)
+        terminal.result(f"{path}: {count} linked anew")
+
+
+def push(
+    remote: Remote,
+    datasets: Paths,
+    ancestors: Ancestors = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Also read what is there already, not only its size.")
+    ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option("--replace", help="Push although another computer pushed there since; that stays in the history."),
+    ] = False,
+    project: Annotated[
+        str, typer.Option("--project", metavar="NAME", help="Push as this project of the other store, now and later.")
+    ] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Copy what datasets need to another store, as snapshots of this project. Those before stay there.
+
+    Example: tacpipe store push /mnt/lab/store models/forward data/latents data/split
+    """
+    from tacpipe.maintenance import transfer
+
+    done = transfer.push(remote, datasets, ancestors=ancestors, verify=verify, replace=replace, project=project)
+    _print(asdict(done), as_json=as_json, text=_moved("pushed", done))
+
+
+def pull(
+    remote: Remote,
+    datasets: Annotated[list[Path], typer.Argument(help="Datasets; PROJECT:PATH is that of another project.")],
+    ancestors: Ancestors = False,
+    replace: Replace = False,
+    as_json: AsJson = False,
+) -> None:
+    """Copy what datasets need from another store: those whose manifest is here, else what was pushed from that path.
+
+    Example: tacpipe store pull /mnt/lab/store models/forward data/latents data/split
+    """
+    from tacpipe.maintenance import transfer
+
+    done = transfer.pull(remote, datasets, ancestors=ancestors, replace=replace)
+    _print(asdict(done), as_json=as_json, text=_moved("pulled", done))
+
+
+def _moved(verb: str, done: Any) -> str:
+    names = plain(", ".join(done.datasets), 1000)
+    text = f"{verb} {names}: {done.objects} objects ({done.bytes / 1e6:.1f} MB); {done.there} were there already"
+    return f"{text}; replaced {done.replaced} that were damaged there" if done.replaced else text
+
+
+def _print(value: Any, *, as_json: bool, text: str) -> None:
+    terminal.result_json(value) if as_json else terminal.result(text)

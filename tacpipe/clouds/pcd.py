@@ -1,0 +1,274 @@
+"""Clouds of points as PCD files, the format of the Point Cloud Library, version 0.7, read strictly.
+
+A header of lines tells the fields of a point; behind its last line, ``DATA``, the points follow as lines of numbers or as
+they lay in memory. Colour is one of the fields, ``rgb``: the bytes of 0x00RRGGBB, most often declared a float. Source: "The
+PCD (Point Cloud Data) file format", documentation of the Point Cloud Library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.errors import TacpipeError
+from tacpipe.io import regular
+from tacpipe.printable import plain
+
+KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+VERSIONS = ("0.7", ".7")
+KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}  # letter: numpy's, sizes in bytes
+POSITION = ("x", "y", "z")
+COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alpha is left out
+LONGEST_HEADER = 65_536  # bytes; a file without the line DATA in so many is none
+DIGITS = 18  # of a number in a header
+LONGEST_NUMBER = 64  # letters of a number in a file of text
+LARGEST_POINT = 65_536  # bytes, fields that are skipped included
+LZF_MOST = 88  # by which compression makes points smaller at most: three bytes stand for 264
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file says of its points."""
+
+    point: np.dtype[np.void]  # the fields of a point, packed
+    points: int
+    data: str  # ascii, binary or binary_compressed
+    length: int  # bytes of the header, its last line end included
+
+    @property
+    def colour(self) -> str | None:
+        """The name of the field that holds the colour, or None."""
+        return next((name for name in COLOURS if name in (self.point.names or ())), None)
+
+
+def read(path: Path) -> Cloud:
+    """Return the cloud of a PCD file, its points in the unit of the file, metres by convention; further fields are skipped.
+
+    Raises `TacpipeError`, naming the file, where it is no PCD 0.7, has no x, y and z of floats or no points, is shorter
+    than its header says or longer by more than padding, is compressed, or holds points that are not finite.
+    """
+    xyz, colours = parsed(path, regular.source(path))
+    finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
+    if not finite.all():
+        raise TacpipeError(
+            f"{path} holds {np.count_nonzero(~finite)} of {len(finite)} points that are not finite (NaN), the first "
+            f"being point {int(np.argmin(finite))}; each must have been seen. Remove such points and save it again."
+        )
+    return Cloud(xyz, colours)
+
+
+def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
+
+    Raises `TacpipeError`, naming the file, as `read` does but for points that are not finite.
+    """
+    header = read_header(path, content)
+    if header.data == "binary_compressed":
+        raise TacpipeError(
+            f"{path} holds compressed points (DATA binary_compressed); save it as DATA binary: "
+            f"`pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1` does."
+        )
+    if header.points == 0:
+        raise TacpipeError(f"{path} holds no point (POINTS 0). Copy the file again or leave its recording out.")
+    points = _of_bytes(path, content, header) if header.data == "binary" else _of_text(path, content, header)
+    with np.errstate(over="ignore"):  # what no float32 holds is not finite then, and refused or left out as such
+        xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)  # (point, xyz)
+    if header.colour is None:
+        return xyz, None
+    return xyz, unpacked(np.ascontiguousarray(points[header.colour]).view("<u4"))
+
+
+def read_header(path: Path, content: bytes | None = None) -> Header:
+    """Return the header of a PCD file, ``content`` being the file's if it was read already.
+
+    Raises `TacpipeError`, naming the file and what its header lacks or says wrong.
+    """
+    lines, length = _header_lines(path, regular.source(path) if content is None else content)
+    missing = [keyword for keyword in ("VERSION", "FIELDS", "SIZE", "TYPE", "POINTS") if keyword not in lines]
+    if missing:
+        raise TacpipeError(
+            f"{path} has no {' and no '.join(missing)} in its header; it must be a PCD file of version 0.7."
+        )
+    if lines["VERSION"] not in [[version] for version in VERSIONS]:
+        raise TacpipeError(
+            f"{path} is a PCD file of version {plain(' '.join(lines['VERSION']))}; 0.7 can be read. Save it again as that."
+        )
+    points = _whole(path, "POINTS", lines["POINTS"])
+    if "WIDTH" in lines and "HEIGHT" in lines:
+        width, height = (_whole(path, keyword, lines[keyword]) for keyword in ("WIDTH", "HEIGHT"))
+        if width * height != points:
+            raise TacpipeError(
+                f"{path} says WIDTH {width}, HEIGHT {height} and POINTS {points}; points must be width times height. "
+                f"Copy the file again."
+            )
+    data = " ".join(lines["DATA"])
+    if data not in ("ascii", "binary", "binary_compressed"):
+        raise TacpipeError(f"{path} says DATA {plain(data)}; it must be ascii, binary or binary_compressed.")
+    return Header(_point(path, lines), points, data, length)
+
+
+def require_compressed(path: Path, content: bytes, header: Header) -> None:
+    """Raise `TacpipeError` where compressed points are not as many as their header says, or more than they can be.
+
+    In front of them stand their size and that of the points they stand for, four bytes each.
+    """
+    needed, there = header.points * header.point.itemsize, len(content) - header.length - 8
+    size, told = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
+    if there < size or told != needed or needed > size * LZF_MOST:
+        raise TacpipeError(
+            f"{path} tells {header.points} points of {header.point.itemsize} bytes, and {max(there, 0)} bytes follow that "
+            f"say they are {size}, and {told} once unpacked: it was cut off or its header is wrong. Copy the file again."
+        )
+
+
+def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Return colours (point, rgb), 0 to 255, of numbers 0x00RRGGBB (point,).
+
+    >>> unpacked(np.array([0x00FF8001], np.uint32)).tolist()
+    [[255, 128, 1]]
+    """
+    return np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+
+
+def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:
+    """Return the words behind each keyword of the header, and how many bytes it has."""
+    lines: dict[str, list[str]] = {}
+    place = 0
+    while "DATA" not in lines:
+        end = content.find(b"\n", place, LONGEST_HEADER)
+        if end < 0:
+            raise TacpipeError(
+                f"{path} is no PCD file or was cut off: its header ends without a line DATA. Give a PCD file of version "
+                f"0.7, or copy it again."
+            )
+        words = content[place:end].decode("latin-1").split()
+        place = end + 1
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0] not in KEYWORDS or words[0] in lines:
+            raise TacpipeError(
+                f"{path} is no PCD file: its header has the line {' '.join(words)[:60]!r}, where one of "
+                f"{', '.join(KEYWORDS)} must begin each line, once. Give a PCD file of version 0.7."
+            )
+        lines[words[0]] = words[1:]
+    return lines, place
+
+
+def _whole(path: Path, keyword: str, words: list[str]) -> int:
+    if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()) or len(words[0]) > DIGITS:
+        raise TacpipeError(
+            f"{path} says {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
+            f"Copy the file again."
+        )
+    return int(words[0])
+
+
+def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
+    """Return the fields of a point. Raises `TacpipeError` where they are not told, or position and colour are no such."""
+    names = lines["FIELDS"]
+    counts = lines.get("COUNT", ["1"] * len(names))
+    for keyword, words in (("SIZE", lines["SIZE"]), ("TYPE", lines["TYPE"]), ("COUNT", counts)):
+        if len(words) != len(names):
+            raise TacpipeError(
+                f"{path} has {len(names)} FIELDS ({plain(' '.join(names))}) and {len(words)} in {keyword}; each "
+                f"field needs one."
+            )
+    fields: list[tuple[str, str, tuple[int, ...]]] = []
+    total = 0
+    for place, (name, kind, size, count) in enumerate(zip(names, lines["TYPE"], lines["SIZE"], counts, strict=True)):
+        letter, sizes = KINDS.get(kind, ("", ()))
+        width, many = _whole(path, "SIZE", [size]), _whole(path, "COUNT", [count])
+        if width not in sizes:
+            told = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
+            raise TacpipeError(f"{path} has {told}; there is no such number.")
+        wrong_place = name in POSITION and (letter != "f" or many != 1)
+        if wrong_place or (name in COLOURS and (width != 4 or many != 1)):
+            right = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"
+            raise TacpipeError(
+                f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count}; it must be {right}."
+            )
+        total += width * many
+        if not many > 0 or total > LARGEST_POINT:
+            raise TacpipeError(
+                f"{path} has the field {plain(name)} of COUNT {count}; a point has {LARGEST_POINT} bytes at most, and each "
+                f"field one number or more. Copy the file again."
+            )
+        own = name if name in (*POSITION, *COLOURS) else f"skipped{place}"  # PCL names all its padding "_"
+        fields.append((own, f"<{letter}{width}", () if many == 1 else (many,)))
+    missing = [axis for axis in POSITION if names.count(axis) != 1]
+    if missing or any(names.count(name) > 1 for name in COLOURS):
+        raise TacpipeError(
+            f"{path} has the FIELDS {plain(' '.join(names))}; x, y, z must be there once, and rgb at most once."
+        )
+    return np.dtype(fields)
+
+
+def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
+    """Return the points (point,) that follow a header; the library pads files with zeros to whole pages of memory."""
+    size = header.point.itemsize
+    there, needed = len(content) - header.length, header.points * size
+    if there < needed:
+        raise TacpipeError(
+            f"{path} was cut off or its header is wrong: it tells {header.points} points of {size} bytes, and "
+            f"{there // size} follow. Copy the file again."
+        )
+    if any(content[header.length + needed :]):
+        raise TacpipeError(
+            f"{path} tells {header.points} points of {size} bytes, and behind them {there - needed} bytes follow that are "
+            f"no padding with zeros. Copy the file again."
+        )
+    return np.frombuffer(content, header.point, header.points, header.length)
+
+
+def _of_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
+    """Return the points (point,) of the lines behind a header, a line a point."""
+    try:
+        text = content[header.length :].decode("ascii")
+    except UnicodeDecodeError as error:
+        raise TacpipeError(
+            f"{path} says DATA ascii, and bytes follow that are no text. Copy the file again."
+        ) from error
+    rows = [line.split() for line in text.splitlines() if line.strip()]
+    if len(rows) != header.points:
+        raise TacpipeError(
+            f"{path} was cut off or its header is wrong: it tells {header.points} points, and {len(rows)} lines follow. "
+            f"Copy the file again."
+        )
+    names = header.point.names or ()
+    widths = [int(np.prod(header.point[name].shape)) for name in names]
+    for row, words in enumerate(rows):
+        if len(words) != sum(widths):
+            raise TacpipeError(
+                f"{path}, point {row}: the line has {len(words)} numbers; it must have {sum(widths)}. Copy the file again."
+            )
+    found = np.zeros(header.points, header.point)
+    for place, name in enumerate(names):
+        if name in (*POSITION, *COLOURS):
+            found[name] = _column(path, [words[sum(widths[:place])] for words in rows], header.point[name])
+    return found
+
+
+def _column(path: Path, words: list[str], kind: np.dtype[np.void]) -> NDArray[np.void]:
+    """Return the numbers of a column of text. Raises `TacpipeError`, naming the point, for what is none."""
+    long = next((row for row, word in enumerate(words) if len(word) > LONGEST_NUMBER), None)
+    if long is not None:  # an array of words makes room in each row for the longest
+        raise TacpipeError(
+            f"{path}, point {long}: a number of {len(words[long])} letters is longer than {LONGEST_NUMBER}. Copy the file "
+            f"again."
+        )
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # what the type does not hold is not finite then
+            return np.array(words).astype(kind)
+    except (ValueError, OverflowError) as error:
+        for row, word in enumerate(words):
+            try:
+                np.array([word]).astype(kind)
+            except (ValueError, OverflowError):
+                raise TacpipeError(
+                    f"{path}, point {row}: {word[:40]!r} is no number of the declared type. Copy the file again."
+                ) from error
+        raise

@@ -1,0 +1,169 @@
+"""Clouds of points as PLY files, of bytes that are at hand: what a depth camera's program saves while it is recorded.
+
+Binary of either order of bytes, or text. The vertices must have x, y and z; red, green and blue are colours, other
+properties are skipped. Source: Greg Turk, "The PLY Polygon File Format" (1994).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.clouds.cloud import COLOUR
+from tacpipe.errors import TacpipeError
+from tacpipe.printable import excerpt, listed, plain
+
+LETTERS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+POSITION = ("x", "y", "z")
+LONGEST_HEADER = 65_536  # bytes
+DIGITS = 18  # of a number in a header
+LONGEST_NUMBER = 64  # letters of a number in a file of text
+
+
+@dataclass(frozen=True)
+class _Header:
+    form: str
+    vertex: np.dtype[np.void]
+    points: int
+    length: int  # bytes, the line end behind end_header included
+    alone: bool  # nothing but vertices follows
+    skipped: int  # bytes of other elements in front of the vertices, or numbers where it is text
+
+
+def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
+
+    Raises `TacpipeError`, naming the file, where it is no PLY file, its vertices are not its first element or have no x, y
+    and z, colours are no bytes, or points are missing.
+    """
+    header = _header(path, content)
+    if not header.points:
+        raise TacpipeError(f"{path} holds no point (element vertex 0). Copy it again or leave it out.")
+    body = content[header.length + (0 if header.form == "ascii" else header.skipped) :]
+    if header.form == "ascii":
+        points = _of_text(path, body, header)
+    else:
+        _require(path, header, len(body), header.vertex.itemsize, "bytes")
+        points = np.frombuffer(body, header.vertex, header.points)
+    with np.errstate(over="ignore"):  # what no float32 holds is not finite then, and refused or left out as such
+        xyz = np.column_stack([points[axis] for axis in POSITION]).astype(np.float32)
+    if not set(COLOUR) <= set(header.vertex.names or ()):
+        return xyz, None
+    return xyz, np.column_stack([points[name] for name in COLOUR])
+
+
+def packed(points_m: NDArray[np.float32], colours: NDArray[np.uint8] | None) -> bytes:
+    """Return the binary PLY file of points (point, xyz) and colours (point, rgb)."""
+    vertex = np.dtype([(axis, "<f4") for axis in POSITION] + [(name, "u1") for name in COLOUR if colours is not None])
+    rows = np.zeros(len(points_m), vertex)
+    for axis, column in zip(POSITION, points_m.T, strict=True):
+        rows[axis] = column
+    for name, column in zip(COLOUR, () if colours is None else colours.T, strict=colours is not None):
+        rows[name] = column
+    kinds = [f"property {'float' if name in POSITION else 'uchar'} {name}" for name in vertex.names or ()]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *kinds, "end_header", ""]
+    return "\n".join(lines).encode() + rows.tobytes()
+
+
+def _header(path: Path, content: bytes) -> _Header:
+    end = content.find(b"end_header", 0, LONGEST_HEADER)
+    stop = content.find(b"\n", end) + 1
+    lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
+    if end < 0 or not stop or lines[:1] != [["ply"]]:
+        raise TacpipeError(f"{path} is no PLY file or was cut off: it must begin with ply and end its header.")
+    form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
+    starts = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
+    elements = [lines[start:end] for start, end in itertools.pairwise([*starts, len(lines)])]
+    place = next((number for number, (first, *_) in enumerate(elements) if first[1:2] == ["vertex"]), 0)
+    first = elements[place][0] if elements else []
+    before = [_size(element, form) for element in elements[:place]]
+    if form not in ORDERS or first[1:2] != ["vertex"] or len(first) != 3 or not _is_count(first[2]) or None in before:
+        told = elements[0][0][1:] if elements else []
+        raise TacpipeError(
+            f"{path} has the format {excerpt(form)} and the first element {excerpt(' '.join(told))}; a cloud is of "
+            f"the format {', '.join(ORDERS)}, and its vertices come first."
+        )
+    rows = [row for row in elements[place] if row[:1] == ["property"]]
+    skipped = sum(size for size in before if size is not None)
+    return _Header(form, _vertex(path, rows, form), int(first[2]), stop, len(elements) == 1, skipped)
+
+
+def _size(element: list[list[str]], form: str) -> int | None:
+    """Return how many bytes an element has, or numbers where it is text; None where that is not told, as of lists."""
+    (_, *told), *rows = element
+    kinds = [words[1:] for words in rows if words[:1] == ["property"]]
+    if len(told) != 2 or not _is_count(told[1]) or not all(len(kind) == 2 and kind[0] in LETTERS for kind in kinds):
+        return None
+    width = len(kinds) if form == "ascii" else sum(int(LETTERS[kind[0]][1]) for kind in kinds)
+    return int(told[1]) * width
+
+
+def _vertex(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.void]:
+    kinds: dict[str, str] = {}
+    for words in rows:
+        if len(words) != 3 or words[1] not in LETTERS or words[2] in kinds:
+            raise TacpipeError(
+                f"{path} has the vertices' {excerpt(' '.join(words))}; it must be a type, one number, and a name."
+            )
+        kinds[words[2]] = LETTERS[words[1]]
+    floats = all(kinds.get(axis, "")[:1] == "f" for axis in POSITION)
+    coloured = all(kinds.get(name, "u1") == "u1" for name in COLOUR)
+    if not floats or not coloured:
+        raise TacpipeError(
+            f"{path} has vertices of {listed(kinds)}; they must have x, y and z of floats, and colours, "
+            f"where there are any, of uchar."
+        )
+    return np.dtype([(name, ORDERS[form] + letters) for name, letters in kinds.items()])
+
+
+def _of_text(path: Path, body: bytes, header: _Header) -> NDArray[np.void]:
+    names = header.vertex.names or ()
+    words = body.split()[header.skipped :]
+    _require(path, header, len(words), len(names), "numbers")
+    words = words[: header.points * len(names)]
+    longest = max(map(len, words), default=0)
+    if longest > LONGEST_NUMBER:  # an array of words makes room in each row for the longest
+        raise TacpipeError(f"{path} has a number of {longest} letters, {LONGEST_NUMBER} are allowed. Copy it again.")
+    found: NDArray[np.void] = np.zeros(header.points, header.vertex)
+    try:
+        numbers: NDArray[Any] = np.array(words, dtype="S").astype(np.float64).reshape(header.points, len(names))
+    except ValueError as error:
+        raise TacpipeError(
+            f"{path} has a word among its points that is no number ({plain(str(error), 100)}). Copy it again."
+        ) from error
+    for name, column in zip(names, numbers.T, strict=True):
+        if name in POSITION:
+            found[name] = column
+        elif name in COLOUR:
+            if not ((column >= 0) & (column <= 255)).all():
+                raise TacpipeError(f"{path} has a {name} that is no colour; it must be from 0 to 255. Copy it again.")
+            found[name] = column
+    return found
+
+
+def _is_count(word: str) -> bool:
+    return word.isascii() and word.isdigit() and len(word) <= DIGITS
+
+
+def _require(path: Path, header: _Header, held: int, width: int, unit: str) -> None:
+    """Raise `TacpipeError` where too little follows the header for its points, or too much though nothing else may."""
+    needed = header.points * width
+    if held < needed or (header.alone and held > needed):
+        raise TacpipeError(
+            f"{path} tells of {header.points} points, which are {needed} {unit}, and {held} follow. Copy it again."
+        )

@@ -1,0 +1,1 @@
+"""What a user opens: datasets, their manifests, labels, splits and lineage."""

@@ -1,0 +1,233 @@
+"""The directory of a dataset: shards linked beside the manifest, for programs that read files."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import uuid
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+
+from tacpipe.datasets import adoption, replacing
+from tacpipe.datasets.manifest import NAME, Manifest, parse
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import regular
+from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole
+from tacpipe.io.hashing import bytes_digest, digest, file_digest
+from tacpipe.store.store import MissingError, Store
+
+_DRAFT = ".draft"
+_OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}{_DRAFT}", re.DOTALL)
+
+
+def publish(store: Store, manifest: Manifest, directory: Path) -> None:
+    """Make ``directory`` show ``manifest``: a root in the store, then shards linked (recordings copied), the manifest last.
+
+    The root comes first so that what a killed run left behind is known to be ours.
+    What an earlier manifest named and this one does not is removed. Raises `UsageError` if the directory holds
+    something that tacpipe did not write.
+    """
+    directory = directory.absolute()
+    if shown(store, manifest, directory):
+        store.roots.set(directory, bytes_digest(manifest.content))
+        return
+    with changing(store, directory):
+        publish_alone(store, manifest, directory)
+
+
+def shown(store: Store, manifest: Manifest, directory: Path) -> bool:
+    """Return whether ``directory`` shows ``manifest`` already, with all that it names."""
+    return _current(directory, manifest.content) and not _stale(store, manifest, directory)
+
+
+@contextlib.contextmanager
+def changing(store: Store, directory: Path) -> Iterator[None]:
+    """Change what ``directory`` shows while nobody else does, whoever reads its manifest first to change it included."""
+    directory = directory.absolute()
+    with store.leases.hold(digest(["output", *store.roots.named(directory)]), f"the output {directory}"):
+        yield
+
+
+def publish_alone(
+    store: Store, manifest: Manifest, directory: Path, *, may_lack: Collection[str] = (), relabelled: bool = False
+) -> None:
+    """Do as `publish` does, in the block of `changing`.
+
+    Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
+    What the dataset before held and cannot be computed again stays in the store, and so does its manifest. Of one that was
+    ``relabelled`` nothing is gone and no shard is looked at: a label costs what it changes.
+    """
+    directory = directory.absolute()
+    check_output(store, directory)
+    wanted = dict(manifest.objects())
+    current = _current(directory, manifest.content)
+    stale = [] if relabelled else _stale(store, manifest, directory) if current else list(wanted)
+    gone = set() if relabelled else _named(directory) - set(wanted)
+    refuse_links(directory, {*stale, *gone})
+    with writing(directory):
+        before = None if current else replacing.outgoing(store, directory)
+        lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
+        if before is not None and lasting:
+            adoption.adopt(store, directory, before)
+        store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
+        sweep(directory, shards=bool(stale))
+        for path in stale:
+            with contextlib.suppress(*([MissingError] if path in may_lack else [])):
+                place(store, wanted[path], directory / path, copy=manifest.recorded)
+        _remove(directory, gone)
+        if not current:
+            write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
+        if manifest.recorded:
+            _settle(store, directory, stale)
+
+
+def sweep(directory: Path, *, shards: bool = True) -> None:
+    """Remove what a process left that was killed while it wrote here: drafts by our names for them, and nothing else.
+
+    Without ``shards`` those of the manifest alone.
+    """
+    for folder in (directory, *(listed(directory) if shards else ())):
+        if folder == directory or (folder.is_dir() and not folder.is_symlink()):
+            for path in listed(folder, f".*{_DRAFT}"):
+                if _OURS.fullmatch(path.name):
+                    _remove_draft(path)
+
+
+def sweep_beside(path: Path) -> None:
+    """Do as `sweep` for what was to become the file ``path``; what else lies in its folder is not ours."""
+    for draft in listed(path.parent, f".*{_DRAFT}"):
+        ours = _OURS.fullmatch(draft.name)
+        if ours and ours["name"] == path.name[:100]:
+            _remove_draft(draft)
+
+
+def _remove_draft(path: Path) -> None:
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+
+
+def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
+    """Have what was written in ``directory`` outlast a loss of power: recordings and their labels cannot be made again."""
+    for folder in {(directory / path).parent for path in paths} - {directory}:
+        sync_folder(str(folder))
+    project = store.root.parent
+    sync_folders(str(directory), str(project if directory.is_relative_to(project) else directory.parent))
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the file system says of an output into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise TacpipeError(
+            f"{path} cannot be written: {error.strerror or error}. The result is kept in the store: run the same command "
+            f"again when that is mended."
+        ) from error
+
+
+def _stale(store: Store, manifest: Manifest, directory: Path) -> list[str]:
+    return [path for path, name in manifest.objects() if not _matches(directory / path, store, name)]
+
+
+def refuse_links(directory: Path, paths: Iterable[str]) -> None:
+    """Refuse folders within a dataset that are links: what is written or removed there may be anybody's."""
+    for folder in {folder for path in paths for folder in list(Path(path).parents)[:-1]}:
+        if (directory / folder).is_symlink():
+            raise UsageError(
+                f"{directory / folder} is a symbolic link out of its dataset. Remove it, or give -o another directory."
+            )
+
+
+def _remove(directory: Path, paths: set[str]) -> None:
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            (directory / path).unlink()
+    for folder in {(directory / path).parent for path in paths} - {directory}:
+        with contextlib.suppress(OSError):  # not empty, or gone already
+            folder.rmdir()
+
+
+def check_output(store: Store, directory: Path) -> None:
+    """Refuse to write a dataset over something that tacpipe did not write."""
+    directory = directory.absolute()
+    if directory.is_file():
+        raise UsageError(f"{directory} is a file; give -o a directory.")
+    if (directory / NAME).exists() or store.roots.get(directory) is not None:
+        return
+    around = next((folder for folder in directory.parents if (folder / NAME).is_file()), None)
+    if around is not None:
+        raise UsageError(f"{directory} lies within the dataset {around}. Give -o a directory outside of it.")
+    if not directory.is_dir():
+        return
+    below = (Path(place, name) for place, _, names in walk(directory, links=False) for name in names)
+    for path in below:  # a project that was moved: its shards are known, its path is not
+        if path.name == NAME and path.is_file():
+            raise UsageError(f"{directory} holds the dataset {path.parent}. Give -o a directory of its own.")
+        if path.is_file() and path.name != ".gitignore" and not store.has(file_digest(path)):
+            raise UsageError(
+                f"{directory} has no {NAME} and holds {path.relative_to(directory)}, which tacpipe did not write. "
+                f"Give -o a new directory."
+            )
+
+
+def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
+    """Put the object ``name`` at ``path``: by reflink, hard link or copy, in this order; only by copy if ``copy``.
+
+    It is verified first. Raises `MissingError` if it is not in the store, or was damaged there.
+    """
+    content = store.read(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex[:12]}{_DRAFT}")
+    source = store.object_path(name)
+    try:
+        if copy or not _link(source, draft):
+            write_whole(str(path), content, str(draft))
+        else:
+            draft.replace(path)
+    except FileNotFoundError:
+        raise MissingError(f"Object {name[:12]} vanished from the store; run the same command again.") from None
+    finally:
+        with contextlib.suppress(OSError):  # one that stays is swept up by the next who writes here
+            draft.unlink()
+
+
+def _link(source: str, target: Path) -> bool:
+    import fcntl
+
+    with regular.opened(source, follow=False) as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
+        fcntl.ioctl(writing.fileno(), 0x40049409, reading.fileno())  # FICLONE
+        return True
+    target.unlink()
+    with contextlib.suppress(OSError):
+        os.link(source, target)
+        return True
+    return False
+
+
+def _matches(path: Path, store: Store, name: str) -> bool:
+    """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
+    try:
+        there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
+        stored = os.lstat(store.object_path(name))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    same = (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino)
+    return same or (there.st_size == stored.st_size and file_digest(path) == name)
+
+
+def _current(directory: Path, content: bytes) -> bool:
+    try:
+        return regular.content(directory / NAME, regular.JSON_BYTES) == content
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
+def _named(directory: Path) -> set[str]:
+    """Return the paths that the manifest in ``directory`` names; none if there is no readable one."""
+    try:
+        content = regular.content(directory / NAME, regular.JSON_BYTES)
+        return {path for path, _ in parse(content, str(directory)).objects()}
+    except (FileNotFoundError, TacpipeError):
+        return set()

@@ -1,0 +1,94 @@
+"""What a lab notices afterwards: labels set by hand, without touching a shard."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from math import isfinite
+from pathlib import Path
+
+from tacpipe.datasets import directory as directory_of
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets.manifest import Found, Manifest
+from tacpipe.errors import UsageError
+from tacpipe.plugins.stage import Attribute
+from tacpipe.store.store import locate
+
+
+def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
+    """Return the labels of ``name=value`` texts; numbers and true, false, null are read as YAML does."""
+    labels: dict[str, Attribute] = {}
+    for text in sets:
+        name, equals, value = text.partition("=")
+        if not equals or not name.isidentifier():
+            raise UsageError(f"--set {text} should read name=value, as in --set material=foam.")
+        labels[name] = _value(value) if value else ""
+    if exclude is not None and include:
+        raise UsageError("--exclude and --include contradict each other; give one.")
+    if exclude is not None:
+        labels["excluded"] = exclude or "excluded"
+    if include:
+        labels["excluded"] = None
+    if not labels:
+        raise UsageError("Nothing to change: give --set name=value, --exclude REASON or --include.")
+    return labels
+
+
+def _value(text: str) -> Attribute:
+    """Return what a text stands for, where that is a number, true, false or null; else the text."""
+    from tacpipe.io import yaml_text
+
+    try:
+        found = yaml_text.load(text)
+    except ValueError:
+        return text
+    if isinstance(found, float) and not isfinite(found):
+        return text
+    return found if isinstance(found, str | int | float | None) else text
+
+
+@dataclass(frozen=True)
+class Changed:
+    """The dataset whose labels were changed, and the recordings that have new ones."""
+
+    directory: Path
+    recordings: list[str]
+
+
+def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Changed:
+    """Set ``labels`` on the recordings whose names match and return the dataset's directory and their names.
+
+    Raises `UsageError` if a pattern matches no recording.
+    """
+    found = manifest_of.find(path)
+    store, directory = locate(found.directory), found.directory
+    _refuse_made(found.manifest, directory)
+    with store.at_work([found.digest]), directory_of.changing(store, directory):
+        found = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
+        names = _matching(found, patterns)
+        changed = found.manifest.labelled({name: dict(labels) for name in names})
+        store.put(found.content)
+        store.put(changed.content, durable=True)
+        directory_of.publish_alone(store, changed, directory, may_lack=dict(changed.objects()), relabelled=True)
+    return Changed(directory, names)
+
+
+def _refuse_made(manifest: Manifest, directory: Path) -> None:
+    if manifest.inputs:
+        raise UsageError(
+            f"{directory} was made by {manifest.stage} from other datasets, and the next run would undo its labels. "
+            f"Label the recordings that it comes from; `tacpipe explain {directory}` names them."
+        )
+
+
+def _matching(found: Found, patterns: Sequence[str]) -> list[str]:
+    recordings = found.manifest.recordings
+    names: set[str] = set()
+    for pattern in patterns:
+        matching = {name for name in recordings if fnmatchcase(name, pattern)}
+        if not matching:
+            some = ", ".join(sorted(recordings)[:5])
+            raise UsageError(f"{found.directory} has no recording {pattern}; it has {len(recordings)}: {some} …")
+        names |= matching
+    return sorted(names)

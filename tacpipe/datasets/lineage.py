@@ -1,0 +1,176 @@
+"""Where a dataset comes from, down to the raw files, and which part of its key changed against the last run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tacpipe import printable
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.printable import listed
+from tacpipe.store.store import Store, locate
+
+_SHOWN = 5  # names listed before the rest is counted
+
+
+def of(path: Path) -> dict[str, Any]:
+    """Return the lineage of the dataset (or report) at ``path`` as a tree, and what changed against the run before."""
+    store = locate(path if path.is_dir() else path.absolute().parent)
+    root = store.roots.get((path.parent if path.name == manifest_of.NAME else path).absolute())
+    if path.is_file() and path.name != manifest_of.NAME:
+        if root is None:
+            raise UsageError(f"{path} was not written by tacpipe, or into another store than {store.root}.")
+        found = manifest_of.Found(path.parent, store.read(root["manifest"]))
+    else:
+        found = manifest_of.find(path)
+    places = {other["manifest"]: other["path"] for other in store.roots.all()}
+    tree = _node(store, found.manifest, found.digest, places)
+    changed = _changes(store, root, found.manifest)
+    return {**tree, "provenance": _provenance(store, found.digest), "changes": changed}
+
+
+def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> dict[str, Any]:
+    inputs: dict[str, list[dict[str, Any]]] = {}
+    for argument, several in manifest.inputs.items():
+        inputs[argument] = []
+        for given in several:
+            try:
+                found = manifest_of.parse(store.read(given["manifest"]), given["manifest"])
+                inputs[argument].append(_node(store, found, given["manifest"], places))
+            except TacpipeError as error:
+                inputs[argument].append({"manifest": given["manifest"], "digest": given["dataset"], "lost": str(error)})
+    return {
+        "stage": manifest.stage,
+        "version": manifest.version,
+        "params": dict(manifest.params),
+        "digest": manifest.digest,
+        "manifest": name,
+        "path": places.get(name),
+        "recordings": len(manifest.recordings),
+        "rows": manifest.rows,
+        "files": {file: value["digest"] for file, value in manifest.files.items()},
+        "labels": {recording: dict(labels) for recording, labels in manifest.labels.items()},
+        "skipped": dict(manifest.skipped),
+        "sources": {recording: dict(files) for recording, files in manifest.sources.items()},
+        "inputs": inputs,
+    }
+
+
+def _provenance(store: Store, manifest: str) -> dict[str, Any] | None:
+    for _, record in store.records():
+        file = record["result"]["files"].get(manifest_of.NAME)
+        if file is not None and file["digest"] == manifest:
+            return dict(record["provenance"])
+    return None
+
+
+def _changes(store: Store, root: dict[str, Any] | None, now: Manifest) -> list[str] | None:
+    """Return in words what is other than in the run before; None if there was none."""
+    if root is None or root.get("previous") is None:
+        return None
+    try:
+        before = manifest_of.parse(store.read(root["previous"]), "the manifest before", verified=True)
+    except TacpipeError:
+        return ["the manifest of the run before is no longer in the store"]
+    return changes(store, before, now)
+
+
+def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
+    """Return in words in which parts of their keys two datasets differ: stage, version, params, inputs, labels."""
+    found = []
+    if before.stage != now.stage:
+        found.append(f"stage: {before.stage} became {now.stage}")
+    if before.version != now.version:
+        found.append(f"version: {before.version} became {now.version}")
+    found += [
+        f"params.{name}: {before.params.get(name)} became {now.params.get(name)}"
+        for name in sorted({*before.params, *now.params})
+        if before.params.get(name) != now.params.get(name)
+    ]
+    found += _compared("sources", dict(before.sources), dict(now.sources))
+    for argument in sorted({*before.inputs, *now.inputs}):
+        found += _input_changes(store, argument, before.inputs.get(argument, []), now.inputs.get(argument, []))
+    found += _compared("labels", dict(before.labels), dict(now.labels))
+    if not found and before.digest != now.digest:
+        found.append("result: the same key gave other bytes")
+    return found
+
+
+def _input_changes(store: Store, argument: str, before: list[dict[str, str]], now: list[dict[str, str]]) -> list[str]:
+    if [given["dataset"] for given in before] == [given["dataset"] for given in now]:
+        return []
+    try:
+        old, new = (
+            [manifest_of.parse(store.read(given["manifest"]), argument, verified=True) for given in several]
+            for several in (before, now)
+        )
+    except TacpipeError:
+        return [f"inputs.{argument}: another dataset, whose manifest is no longer in the store"]
+    found = []
+    for part in ("shards", "attributes"):
+        left, right = (
+            {name: entry[part] for manifest in several for name, entry in manifest.recordings.items()}
+            for several in (old, new)
+        )
+        found += _compared(f"inputs.{argument}.{part}", left, right, quiet_names=part == "attributes")
+    files = ({name: file for manifest in several for name, file in manifest.files.items()} for several in (old, new))
+    return [*found, *_compared(f"inputs.{argument}.files", *files)]
+
+
+def _compared(what: str, before: dict[str, Any], now: dict[str, Any], *, quiet_names: bool = False) -> list[str]:
+    groups = {
+        "new": [] if quiet_names else sorted(set(now) - set(before)),
+        "gone": [] if quiet_names else sorted(set(before) - set(now)),
+        "other": sorted(name for name in set(before) & set(now) if before[name] != now[name]),
+    }
+    return [f"{what}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
+
+
+def to_text(tree: dict[str, Any]) -> str:
+    """Return the tree as indented lines, what changed before it."""
+    lines = []
+    if tree["changes"] is None:
+        lines.append("First run here: there is nothing to compare with.")
+    else:
+        lines.append("Against the last run: " + ("; ".join(tree["changes"]) or "nothing changed."))
+    made = tree["provenance"]
+    if made:
+        libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
+        commit = f" at commit {made['git_commit'][:10]}" if made["git_commit"] else ""
+        lines.append(f"Made on {made['host']}{commit} with {libraries}.")
+    return printable.lines([*lines, "", *_lines(tree, 0, set())])
+
+
+def _lines(node: dict[str, Any], depth: int, told: set[str], argument: str = "") -> list[str]:
+    """Return the lines of a node and what it descends from; one that was ``told`` already is only named."""
+    pad = "  " * depth
+    label = f"{argument}: " if argument else ""
+    if "lost" in node:
+        return [f"{pad}{label}dataset {node['digest'][:12]}, whose manifest is not in this store"]
+    place = f"{pad}{label}{node['path'] or '(no longer at a path)'}  [{node['digest'][:12]}]"
+    if node["manifest"] in told:
+        return [f"{place}  as above"]
+    told.add(node["manifest"])
+    what = f"{node['recordings']} recordings, {node['rows']} rows" if node["recordings"] else ", ".join(node["files"])
+    params = ", ".join(f"{name}={value}" for name, value in node["params"].items())
+    lines = [
+        f"{place}  {what}",
+        f"{pad}  {node['stage']} version {node['version']}" + (f" ({params})" if params else ""),
+    ]
+    if node["sources"]:
+        files = [digest for several in node["sources"].values() for digest in several.values()]
+        first = next(iter(sorted(node["sources"])))
+        name, digest = next(iter(sorted(node["sources"][first].items())))
+        lines.append(
+            f"{pad}  from {len(files)} raw files of {len(node['sources'])} recordings, as {first}/{name}  [{digest[:12]}]"
+        )
+    if node["labels"]:
+        lines.append(f"{pad}  labelled by hand: {listed(sorted(node['labels']), _SHOWN)}")
+    if node["skipped"]:
+        lines.append(f"{pad}  left out: {listed(sorted(node['skipped']), _SHOWN)}")
+    for name, several in node["inputs"].items():
+        for given in several:
+            lines += _lines(given, depth + 1, told, name)
+    return lines

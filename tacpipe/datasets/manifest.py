@@ -1,0 +1,298 @@
+"""The manifest: what a dataset is, told in one deterministic JSON file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import DamagedError, UsageError
+from tacpipe.io import places, regular
+from tacpipe.io.hashing import DIGEST, bytes_digest, digest
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import excerpt, plain
+
+FORMAT = 1
+NAME = "manifest.json"
+ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
+NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add to it
+_PART = r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*"
+_PATH = re.compile(rf"{_PART}(?:/{_PART})*")
+_PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
+Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a dataset is: recordings, files, and how they came to be."""
+
+    stage: str
+    version: int
+    params: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)
+    chain: Sequence[Mapping[str, Any]] = ()
+    recordings: Mapping[str, Entry] = field(default_factory=dict)
+    files: Mapping[str, Any] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
+
+    @cached_property
+    def digest(self) -> str:
+        """The dataset's digest: of names, attributes, shards and files, and not of how they were made."""
+        recordings = {
+            name: {
+                "attributes": entry["attributes"],
+                "shards": {stream: shard["digest"] for stream, shard in entry["shards"].items()},
+            }
+            for name, entry in self.recordings.items()
+        }
+        return digest({"recordings": recordings, "files": {name: file["digest"] for name, file in self.files.items()}})
+
+    @cached_property
+    def content(self) -> bytes:
+        """The bytes of ``manifest.json``: the same manifest gives the same bytes."""
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        value = {"format": FORMAT, "digest": self.digest, **fields}
+        return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode() + b"\n"
+
+    @property
+    def recorded(self) -> bool:
+        """Whether this is a dataset of recordings: it was made from no other dataset."""
+        return bool(self.recordings) and not self.inputs
+
+    @property
+    def included(self) -> dict[str, Entry]:
+        """The recordings that nobody excluded."""
+        return {name: entry for name, entry in self.recordings.items() if not entry["attributes"].get("excluded")}
+
+    def labelled(self, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
+        """Return the manifest with attributes set by hand; labels of recordings that are not here are dropped."""
+        kept = {
+            name: {**self.labels.get(name, {}), **values} for name, values in labels.items() if name in self.recordings
+        }
+        recordings = dict(self.recordings)
+        for name, values in kept.items():
+            attributes = {**recordings[name]["attributes"], **values}
+            known = {key: value for key, value in attributes.items() if value is not None}
+            recordings[name] = {**recordings[name], "attributes": known}
+        return replace(self, recordings=recordings, labels={**self.labels, **kept})
+
+    def objects(self) -> Iterable[tuple[str, str]]:
+        """Yield (path in the directory, digest) of every shard and file."""
+        for name, entry in self.recordings.items():
+            for stream, shard in entry["shards"].items():
+                yield shard_path(name, stream), shard["digest"]
+        for name, file in self.files.items():
+            yield name, file["digest"]
+
+    def sizes(self) -> Iterable[tuple[str, int]]:
+        """Yield digest and size in bytes of every shard and file."""
+        for entry in self.recordings.values():
+            for shard in entry["shards"].values():
+                yield shard["digest"], shard["bytes"]
+        for file in self.files.values():
+            yield file["digest"], file["bytes"]
+
+    @property
+    def rows(self) -> int:
+        """How many rows all shards have together."""
+        return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
+
+
+def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
+    """Return the manifest of these bytes; ``verified`` ones come from the store and need no second look.
+
+    Raises `DamagedError` if they are no manifest, or if what they name does not give their digest.
+    """
+    regular.expect_parsed(where, len(content))
+    try:
+        value = json.loads(content)
+        found, stored = value.pop("format"), value.pop("digest")
+        if found != FORMAT:
+            if type(found) is not int or found < FORMAT:
+                raise ValueError(f"its format is {excerpt(found)}")
+            raise UsageError(
+                f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}. Install a newer tacpipe."
+            )
+        manifest = Manifest(**value)
+        manifest.__dict__["content"] = content  # primes the cached property: the bytes are at hand
+        computed = stored if verified else manifest.digest
+        check(manifest)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DamagedError(
+            f"{where} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
+            f"again."
+        ) from None
+    if computed != stored:
+        raise DamagedError(
+            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it says {excerpt(stored)[1:13]}. "
+            f"Run the stage that made it again; labels are changed with `tacpipe label`."
+        )
+    return manifest
+
+
+def safe_path(path: str) -> bool:
+    """Return whether a path stays within the directory that it is relative to, and every file system takes it.
+
+    >>> [safe_path(path) for path in ("trial-01/xela1.parquet", "../x", "/x", ".git/x", "a//b", "a\\nb", "")]
+    [True, False, False, False, False, False, False]
+    """
+    try:
+        short = all(len(part.encode()) <= NAME_BYTES for part in path.split("/"))
+    except UnicodeEncodeError:  # half a character: no file has such a name
+        return False
+    return short and _PATH.fullmatch(path) is not None
+
+
+def check(manifest: Manifest) -> None:
+    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: a stranger may have written it."""
+    _check_lineage(manifest)
+    contents = list(manifest.files.values())
+    for entry in manifest.recordings.values():
+        for name, value in entry["attributes"].items():
+            if not isinstance(value, str | int | float | None):
+                raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
+        contents += entry["shards"].values()
+    counts = [one["bytes"] for one in contents] + [one["rows"] for one in contents[len(manifest.files) :]]
+    for count in counts:
+        if type(count) is not int or count < 0:
+            raise ValueError(f"{str(count)[:80]!r} is no count of rows or bytes")
+    for one in contents:
+        _expect_digest(one["digest"])
+    _check_paths([path for path, _ in manifest.objects()])
+
+
+def _check_paths(paths: list[str]) -> None:
+    text = "\n".join(paths)  # a thousand at once: a hit does not wait for a thousand calls
+    plain = text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
+    if not plain or max(map(len, paths), default=0) > NAME_BYTES:
+        for path in paths:
+            if not safe_path(path):
+                raise ValueError(f"the path {path[:80]!r} leads out of the dataset, or no file can have it")
+    if len(set(paths)) < len(paths) or NAME in paths:
+        raise ValueError(f"two of its shards and files share a path, or one is called {NAME}")
+
+
+def _check_lineage(manifest: Manifest) -> None:
+    for several in manifest.inputs.values():
+        for given in several:
+            _expect_digest(given["manifest"])
+            _expect_digest(given["dataset"])
+    for step in ({"stage": manifest.stage, "version": manifest.version, "params": manifest.params}, *manifest.chain):
+        if not isinstance(step["stage"], str) or not isinstance(step["version"], int):
+            raise TypeError("a stage or its version is not named")
+        _expect_mapping(step["params"], "params")
+        _expect_mapping(step.get("fitted") or {}, "fitted")
+    for labels in manifest.labels.values():
+        _expect_mapping(labels, "labels")
+    _expect_mapping(manifest.skipped, "skipped")
+    _expect_mapping(manifest.sources, "sources")
+
+
+def _expect_mapping(value: object, what: str) -> None:
+    if not isinstance(value, Mapping):
+        raise TypeError(f"its {what} are a {type(value).__name__}")
+
+
+def _expect_digest(name: object) -> None:
+    if not isinstance(name, str) or not DIGEST.fullmatch(name):
+        raise ValueError(f"{str(name)[:80]!r} is no digest")
+
+
+def shard_path(recording: str, stream: str) -> str:
+    """Return the path of a shard within its dataset directory.
+
+    >>> shard_path("trial-01", "xela1"), shard_path("trial-01", "")
+    ('trial-01/xela1.parquet', 'trial-01.parquet')
+    """
+    return f"{recording}/{stream}.parquet" if stream else f"{recording}.parquet"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A manifest as it was found: the directory of its dataset, and its bytes."""
+
+    directory: Path
+    content: bytes
+
+    @cached_property
+    def digest(self) -> str:
+        """The digest of the manifest file."""
+        return bytes_digest(self.content)
+
+    @cached_property
+    def manifest(self) -> Manifest:
+        """The manifest, checked. Raises `DamagedError` if it was edited by hand."""
+        return parse(self.content, str(self.directory / NAME))
+
+
+def find(path: Path | str) -> Found:
+    """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself)."""
+    given = places.local(path)
+    file = given if given.name == NAME else given / NAME
+    try:
+        return Found(file.parent, regular.content(file, regular.JSON_BYTES))
+    except regular.IrregularError as error:
+        raise UsageError(f"{error} There is no dataset.") from None
+    except PermissionError as error:
+        raise UsageError(f"{file} cannot be read ({error.strerror}). Ask its owner for leave to read it.") from None
+    except (FileNotFoundError, NotADirectoryError):
+        what = "is empty or not there" if not given.exists() else f"has no {NAME}"
+        raise UsageError(
+            f"{given} {what}, so it is no dataset. Give the directory that a tacpipe command wrote with -o."
+        ) from None
+
+
+def merge(manifests: Sequence[Manifest]) -> Manifest:
+    """Return several datasets of one kind read as one.
+
+    Raises `UsageError` if two recordings share a name, if the files differ, or if other chains of stages lie behind them.
+    """
+    if len(manifests) == 1:
+        return manifests[0]
+    recordings: dict[str, Entry] = {}
+    files: dict[str, Any] = {}
+    for manifest in manifests:
+        for name in manifest.recordings:
+            if name in recordings:
+                raise UsageError(
+                    f"Two of the datasets hold a recording named {name}. Names must be unique; leave one dataset out."
+                )
+        if manifest.chain != manifests[0].chain:
+            raise UsageError(
+                f"These datasets were made in different ways and cannot be read as one: "
+                f"{chain_difference(manifests[0].chain, manifest.chain)}."
+            )
+        recordings.update(manifest.recordings)
+        files.update(manifest.files)
+    first = manifests[0]
+    return Manifest(first.stage, first.version, first.params, {}, first.chain, recordings, files)
+
+
+def chain_difference(wanted: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> str:
+    """Return in words where two chains of stages part.
+
+    >>> step = {"stage": "synchronize", "version": 1, "params": {"rate_hz": 50.0}, "fitted": None}
+    >>> chain_difference([step], [{**step, "params": {"rate_hz": 100.0}}])
+    'synchronize has rate_hz 100.0 instead of 50.0'
+    """
+    for ours, theirs in zip(wanted, found, strict=False):
+        if ours["stage"] != theirs["stage"]:
+            return f"{theirs['stage']} stands where {ours['stage']} should"
+        if ours["version"] != theirs["version"]:
+            return f"{ours['stage']} has version {theirs['version']} instead of {ours['version']}"
+        for name in sorted({*ours["params"], *theirs["params"]}):
+            left, right = ours["params"].get(name), theirs["params"].get(name)
+            if left != right:
+                return f"{ours['stage']} has {name} {right} instead of {left}"
+        if ours["fitted"] != theirs["fitted"]:
+            return f"{ours['stage']} was fitted on other recordings"
+    if len(wanted) != len(found):
+        longer = wanted if len(wanted) > len(found) else found
+        return f"only one of them went through {longer[min(len(wanted), len(found))]['stage']}"
+    return "they are the same"

@@ -1,0 +1,176 @@
+"""The files of a model or codec, which may come from a stranger: JSON and safetensors, looked at before they are believed.
+
+Neither can hold a program. What a configuration claims is held against the tensors that are there: a network is built
+without memory first, and gets it once each of its tensors is in the file in the same shape.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.printable import excerpt, plain
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+CONFIG = "config.json"
+MOST = 100_000  # rows, points, units: what no model of touch comes near
+NONE = type(None)
+_KINDS = {
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    list: "a list",
+    dict: "a mapping",
+    bool: "true or false",
+}
+_MISFITS = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RuntimeError,
+    OverflowError,
+    AssertionError,
+    MemoryError,
+)
+Kind = type | tuple[type, ...]
+
+
+@contextlib.contextmanager
+def believed(what: str) -> Iterator[None]:
+    """Turn what goes wrong with files that were made or changed by hand into a sentence that names ``what`` they are of."""
+    try:
+        yield
+    except TacpipeError:
+        raise
+    except (*_MISFITS, RecursionError) as error:
+        told = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise TacpipeError(
+            f"The files of {what} do not fit one another ({plain(told, 200)}). Copy them again from whoever made them, "
+            f"or train one."
+        ) from error
+
+
+def task(files: Mapping[str, bytes], where: str = "This") -> Any:
+    """Return the module of the task that a model among ``files`` was trained for. Raises `TacpipeError` where none is."""
+    from tacpipe.plugins import registry
+
+    if CONFIG not in files:
+        raise UsageError(f"{where} is no model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
+    return registry.load_task(tree(files, CONFIG, {"task": str})["task"])
+
+
+def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> dict[str, Any]:
+    """Return the mapping that a JSON file holds, in which each of ``needed`` (names with dots) is of its kind.
+
+    Raises `TacpipeError` where it holds none, and for what is missing, of another kind, or absurdly large.
+    """
+    try:
+        found = json.loads(files[name])
+    except (ValueError, RecursionError) as error:
+        raise TacpipeError(f"{name} is no JSON ({plain(str(error), 100)}). Copy the model again.") from error
+    if not isinstance(found, dict):
+        raise TacpipeError(f"{name} holds {excerpt(found)}; it must be a mapping. Copy the model again.")
+    for path, kind in (needed or {}).items():
+        _require(name, path, _at(found, path), kind)
+    return found
+
+
+def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
+    """Return the tensors of a safetensors file, all finite. Raises `TacpipeError` where it is none."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    with _readable(name, SafetensorError):
+        found: dict[str, torch.Tensor] = load(content)
+        _require_finite(name, {key: bool(value.isfinite().all()) for key, value in found.items()})
+    return found
+
+
+def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a safetensors file, all finite ``but`` those whose names end so.
+
+    Raises `TacpipeError` where it is none.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    with _readable(name, SafetensorError):
+        found: dict[str, NDArray[Any]] = load(content)
+        told = {key: value for key, value in found.items() if but is None or not key.endswith(but)}
+        _require_finite(name, {key: bool(np.isfinite(value).all()) for key, value in told.items()})
+    return found
+
+
+def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Tensor]) -> torch.nn.Module:
+    """Return the network that ``build`` makes, with these ``weights``; what it makes takes no memory until they fit.
+
+    Raises `TacpipeError` where a tensor is missing, too many, or of another shape.
+    """
+    import torch
+
+    with believed("the model"), torch.device("meta"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of layers of no width, which fit nothing
+        network = build()
+    wanted = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    there = {name: tuple(value.shape) for name, value in weights.items()}
+    for name in sorted({*wanted, *there}):
+        if wanted.get(name) != there.get(name):
+            raise TacpipeError(
+                f"The model's weights do not fit its {CONFIG}: {plain(name)} is {there.get(name, 'not there')} and should "
+                f"be {wanted.get(name, 'not there')}. Copy its files again from whoever made them."
+            )
+    network.to_empty(device="cpu").load_state_dict(weights)
+    return network
+
+
+@contextlib.contextmanager
+def _readable(name: str, kind: type[Exception]) -> Iterator[None]:
+    try:
+        yield
+    except (kind, ValueError, TypeError, LookupError, OverflowError, AttributeError, RuntimeError) as error:
+        raise TacpipeError(
+            f"{name} is no safetensors file that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
+            f"from whoever made it."
+        ) from error
+
+
+def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
+    wrong = next((key for key, fine in finite.items() if not fine), None)
+    if wrong is not None:
+        raise TacpipeError(
+            f"{name} holds values that are not finite (NaN) in {plain(wrong)}; nothing can be foretold from them. Train the "
+            f"model again, or copy it from whoever made it."
+        )
+
+
+def _at(found: Any, path: str) -> Any:
+    for part in path.split("."):
+        found = found.get(part) if isinstance(found, dict) else None
+    return found
+
+
+def _require(name: str, path: str, value: Any, kind: Kind) -> None:
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    right = any(_is(value, one) for one in kinds)
+    if not right:
+        told = "is missing" if value is None else f"is {excerpt(value)}"
+        wanted = " or ".join(_KINDS[one] for one in kinds if one is not NONE)
+        raise TacpipeError(f"{name}: {path} {told}; it must be {wanted}. Copy the model again from whoever made it.")
+    if isinstance(value, int) and not 0 <= value <= MOST:
+        raise TacpipeError(f"{name}: {path} is {excerpt(value)}; it must be from 0 to {MOST}.")
+
+
+def _is(value: Any, kind: type) -> bool:
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < float("inf")
+    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))

@@ -1,0 +1,286 @@
+"""What a command would replace at its output, and whether it may: recordings and labels cannot be computed again.
+
+The rules, each with exit code 2:
+
+- an output that is one of the command's inputs is always refused;
+- a dataset of another stage, and recordings or hand-set labels that the new dataset would not hold, need ``--replace``;
+- a stage may write its own dataset again: other params and other inputs are what it is for.
+
+What was replaced stays in the store and is listed by `tacpipe store list`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets import recording_names
+from tacpipe.datasets.manifest import ACQUIRE, Manifest
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.io import places, regular
+from tacpipe.io.hashing import bytes_digest, digest
+from tacpipe.printable import listed, plain
+from tacpipe.store.store import Store
+
+if TYPE_CHECKING:
+    from tacpipe.engine.request import Request
+
+_SHOWN = 5  # names listed before the rest is counted
+_BACK = "What is there now stays in the store, and `tacpipe store list` names it."
+_KEEP = f"Give -o another directory, or --replace. {_BACK}"
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Names of recordings that a new dataset lacks or has with other content, and of those whose labels it lacks."""
+
+    recordings: Sequence[str] = ()
+    labels: Sequence[str] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.recordings or self.labels)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a command knows of its result before it computes anything."""
+
+    stage: str
+    version: int
+    params: Mapping[str, Any] = field(default_factory=dict)
+    sources: Mapping[str, Any] = field(default_factory=dict)  # of ingest: recording to file to digest
+
+
+def refuse_inputs(request: Request) -> None:
+    """Raise `UsageError` if the output of ``request`` is one of its inputs, or an address."""
+    places.local(request.output)
+    named = {name: getattr(request, name) for name in ("model", "split", "codec", "extend", "init", "source")}
+    inputs = [*request.datasets, *(path for path in named.values() if path is not None)]
+    for path in inputs:
+        if _same(request.output, path.parent if path.name == manifest_of.NAME else path):
+            raise UsageError(
+                f"{request.output} is an input of this command, and writing there would replace it. Give -o another "
+                f"directory."
+            )
+
+
+def _same(output: Path, given: Path) -> bool:
+    return output.resolve() == given.resolve()
+
+
+def refuse_foreign(path: Path, mark: bytes) -> None:
+    """Raise `UsageError` if there is a file at ``path`` whose first 64 KiB lack ``mark``: another program wrote it."""
+    if not path.exists():
+        return
+    found = b""
+    if path.is_file():
+        with regular.opened(path) as file:
+            found = file.read(2**16)
+    if mark not in found:
+        raise UsageError(f"{path} is there already and this command did not write it. Give -o another place.")
+
+
+def occupant(store: Store, output: Path) -> Manifest | None:
+    """Return the manifest of the dataset at ``output``, None if there is none.
+
+    One that is damaged is read from the store. Raises `DamagedError` where that is not possible: nobody knows then what
+    would be replaced.
+    """
+    if not (output / manifest_of.NAME).exists():
+        return None
+    try:
+        return manifest_of.find(output).manifest
+    except TacpipeError as error:
+        known = former(store, output)
+        if known is None:
+            raise DamagedError(
+                f"{error} Labels that were set by hand may be in it, and would be lost: bring it back with git, or remove "
+                f"it to go on without them."
+            ) from None
+        return known
+
+
+def former(store: Store, output: Path) -> Manifest | None:
+    """Return the manifest that was last written at ``output``, whatever is there now; None if the store has none."""
+    root = store.roots.get(output.absolute())
+    try:
+        if root is not None:
+            return manifest_of.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
+    except TacpipeError:
+        pass
+    return None
+
+
+def irreplaceable(manifest: Manifest) -> bool:
+    """Return whether the recordings were ingested or acquired: no stage can compute them from anything in the store."""
+    return manifest.stage == ACQUIRE or bool(manifest.sources)
+
+
+def lasting(manifest: Manifest) -> bool:
+    """Return whether a dataset holds recordings or labels set by hand, which no stage can compute again."""
+    return irreplaceable(manifest) or bool(manifest.labels)
+
+
+def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield what ``manifest`` holds that cannot be computed again, in a form in which manifests can be compared.
+
+    Each is (what it is, value): a recording by name and content, and a label by that and its own name, with its value.
+    """
+    for name, entry in manifest.recordings.items():
+        content = digest({stream: shard["digest"] for stream, shard in entry["shards"].items()})
+        if irreplaceable(manifest):
+            yield (name, content), None
+        for label, value in manifest.labels.get(name, {}).items():
+            yield (name, content, label), value
+
+
+def losses(before: Manifest, after: Manifest) -> Losses:
+    """Return what of ``before`` cannot be computed again and is not in ``after``."""
+    gone = [] if not irreplaceable(before) else [name for name in before.recordings if _gone(name, before, after)]
+    unlabelled = [
+        name
+        for name, labels in before.labels.items()
+        if name not in gone and any(after.labels.get(name, {}).get(key) != value for key, value in labels.items())
+    ]
+    return Losses(sorted(gone), sorted(unlabelled))
+
+
+def _gone(name: str, before: Manifest, after: Manifest) -> bool:
+    """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name.
+
+    An acquired recording has no raw files: its source is the rig file, which it shares with others.
+    """
+    if name not in after.recordings:
+        return True
+    same_files = name in before.sources and before.sources[name] == after.sources.get(name) and before.stage != ACQUIRE
+    return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
+
+
+def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
+    """Raise `UsageError` if ``plan`` would replace what it must not, as far as that is known before anything is computed."""
+    if before is None:
+        return
+    if before.stage != plan.stage:
+        raise UsageError(f"{output} holds {_described(before)}; {plan.stage} would replace it. {_KEEP}")
+    changed = [name for name in plan.sources if before.sources.get(name, plan.sources[name]) != plan.sources[name]]
+    alone = f"or --replace, after which {output} holds the recordings of this source alone. {_BACK}"
+    if changed:
+        raise UsageError(
+            f"{output} holds recordings of the same name that came from other files: {listed(sorted(changed), _SHOWN)}. "
+            f"Rename the new ones, or give -o another directory, {alone}"
+        )
+    _refuse_alike(before, output, plan, alone)
+    others = sorted(set(before.recordings) - set(plan.sources))
+    if plan.sources and others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
+        raise UsageError(
+            f"{output} holds {len(others)} recordings that this source does not have ({listed(others, _SHOWN)}), and they "
+            f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
+            f"together, or give -o another directory, {alone}"
+        )
+
+
+def _refuse_alike(before: Manifest, output: Path, plan: Plan, alone: str) -> None:
+    """Raise `UsageError` where a new recording has the raw files of one at ``output``, or its name but for case."""
+    new = [name for name in plan.sources if name not in before.recordings]
+    names = {recording_names.folded(name): name for name in before.recordings}
+    files = {frozenset(dict(digests).items()): name for name, digests in before.sources.items()}
+    for name in new:
+        same = files.get(frozenset(dict(plan.sources[name]).items()))
+        if same is not None:
+            raise UsageError(
+                f"{output} holds the files of {plain(name)} already, as the recording {plain(same)}. Name the folder as it "
+                f"was, or give -o another directory, {alone}"
+            )
+        if (other := names.get(recording_names.folded(name))) is not None:
+            raise UsageError(
+                f"{output} holds the recording {plain(other)}, which differs from {plain(name)} only in case. Rename the "
+                f"new one, or give -o another directory, {alone}"
+            )
+
+
+def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> None:
+    """Raise `UsageError` if ``after`` would replace another stage's dataset, or lose recordings or labels of ``before``."""
+    refuse_plan(before, output, Plan(after.stage, after.version, after.params))
+    lost = Losses() if before is None else losses(before, after)
+    if lost.recordings:
+        count = len(lost.recordings)
+        raise UsageError(
+            f"{output} holds {count} recordings that the new dataset does not have ({listed(lost.recordings, _SHOWN)}). "
+            f"{_KEEP}"
+        )
+    if lost.labels:
+        raise UsageError(
+            f"{output} holds labels that were set by hand on recordings that the new dataset does not have or labels "
+            f"differently ({listed(lost.labels, _SHOWN)}). {_KEEP}"
+        )
+
+
+def appended(before: Manifest, made: Manifest) -> Manifest:
+    """Return the ingested recordings ``made`` with those of ``before``; where both have a name, ``made`` holds.
+
+    Recordings that could not be read this time stay as they were.
+    """
+    recordings = dict(sorted({**before.recordings, **made.recordings}.items()))
+    skipped = {name: why for name, why in {**before.skipped, **made.skipped}.items() if name not in recordings}
+    sources = dict(sorted({**before.sources, **made.sources}.items()))
+    return replace(made, recordings=recordings, skipped=skipped, sources=sources)
+
+
+def returning_labels(
+    store: Store, output: Path, before: Manifest | None, made: Manifest
+) -> dict[str, Mapping[str, Any]]:
+    """Return hand-set labels of recordings that are in ``made``, not the same in ``before``, and lay at ``output`` earlier.
+
+    A recording that comes back, with the same content or raw files, has the labels that it had there last.
+    """
+    coming = {
+        one for one in made.recordings if before is None or one not in before.recordings or _gone(one, before, made)
+    }
+    root = store.roots.get(output.absolute()) if coming else None
+    if root is None:
+        return {}
+    # what a manifest held that is not lasting, the one after it holds too
+    names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
+    found: dict[str, Mapping[str, Any]] = {}
+    for name in names if before is None else [name for name in names if name != bytes_digest(before.content)]:
+        with contextlib.suppress(TacpipeError):
+            known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
+            if known.stage != made.stage:
+                continue
+            back = {one for one in coming & set(known.recordings) if not _gone(one, known, made)}
+            found |= {one: known.labels[one] for one in back & set(known.labels)}
+            coming -= back
+    return found
+
+
+def outgoing(store: Store, directory: Path) -> Manifest | None:
+    """Return the manifest that a publication at ``directory`` replaces, None if there is none.
+
+    It is known to the store afterwards, so that it can be checked out: one that git brought, or a copy, is stored.
+    """
+    try:
+        found = manifest_of.find(directory)
+        here = found.manifest
+    except TacpipeError:
+        return former(store, directory)
+    root = store.roots.get(directory)
+    if root is None or root["manifest"] != found.digest:
+        known = former(store, directory)
+        store.put(found.content, durable=here.recorded)
+        store.roots.set(directory, found.digest, lasting=known is not None and bool(losses(known, here)))
+    return here
+
+
+def _described(manifest: Manifest) -> str:
+    count = len(manifest.recordings)
+    recordings = f"{count} recording{'s' if count != 1 else ''}" if count else "files"
+    labels = f" with labels set by hand on {len(manifest.labels)}" if manifest.labels else ""
+    return f"{recordings} written by {manifest.stage}{labels}"
+
+
+def _params(params: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in params.items()) or "no params"

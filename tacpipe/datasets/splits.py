@@ -1,0 +1,390 @@
+"""Who is trained on, who is watched, who is tested: roles of whole recordings, never of windows.
+
+Windows of one recording overlap and resemble each other, so a split among them would test on what was trained on.
+Everything here follows from names, attributes and a seed; the order in which names are given does not matter.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins.stage import ROLES, Attribute
+
+SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
+SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # of validation recordings, that are advised where there are too few
+UNUSED = "unused"  # role of those that a few-shot split takes out of training
+Attributes = Mapping[str, Attribute]
+Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """How recordings are dealt out."""
+
+    name: str = "random"
+    val: float = 0.15  # share of the recordings, or of those left for training where the scheme picks the test ones
+    test: float = 0.15  # share of the recordings; of no effect where the scheme picks them
+    seed: int = 0
+    folds: int = 5  # of kfold
+    by: str = "object"  # attribute whose values leave-one-out leaves out one by one
+    stratify: str = ""  # attributes, with commas between, whose values are spread evenly over the roles; empty for none
+    apart: str = ""  # of kfold: attribute whose values are dealt into the folds too, there unknown; empty for none
+    repeats: int = 1  # of random: folds, each another draw
+    reverse: bool = False  # of blocked: test the first and train on the last
+    few: int = 0  # at most so many train, all others that would are unused; 0 for all
+    few_by: str = ""  # attribute of whose every value ``few`` train; empty for ``few`` altogether
+    few_of: str = ""  # attribute=value of those that ``few`` is about, as sensor=roboskin; empty for all
+
+
+def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
+    """Return the role of each recording in each fold; ``attributes`` holds those of each recording by name.
+
+    ============== =====================================================================================
+    random         shares ``test`` and ``val`` drawn at random, anew in each of ``repeats`` folds
+    kfold          in fold k the k-th of ``folds`` even parts is tested, ``val`` of the others drawn at random
+    blocked        in the order of names, which is that of time for most sets: train, then val, then test;
+                   with ``reverse`` test, then val, then train
+    leave-one-out  in fold k the recordings of the k-th value of ``by`` are tested
+    authors        what the attribute ``authors_role`` says; with no val among them, ``val`` of train is drawn.
+                   Where some have ``authors_fold``, a fold a block: see below
+    ============== =====================================================================================
+
+    Blocks of ``authors_fold`` take turns: where some recordings have the ``authors_role`` test, these are tested in every
+    fold, and the k-th block is val in fold k. Where none has, the k-th block is tested, and ``val`` of the others is
+    drawn. Recordings with neither attribute are dealt into as many even parts, which take the same turns.
+
+    With ``apart``, fold k of kfold tests all recordings of the k-th even part of that attribute's values, so that nothing
+    of these values is in train or val, and of the other recordings those of their own k-th part. So unknown and known
+    values are tested side by side, and over the folds every value is unknown once.
+
+    With ``few``, so many of those that would train do, spread evenly over the values of ``stratify``, and the others get
+    the role ``unused``. Those of a smaller ``few`` are among those of a larger one.
+
+    ``keep`` holds roles of an older split: they stay, and only recordings without any are dealt out. Raises
+    `TacpipeError` for a scheme, share or attribute that cannot be, and where no recording is left to train on.
+    """
+    _check(attributes, scheme)
+    fresh = sorted(name for name in attributes if not any(kept == name for kept, _ in keep))
+    if scheme.name == "random":
+        folds = [_drawn(fresh, attributes, scheme, draw) for draw in range(scheme.repeats)]
+    elif scheme.name == "blocked":
+        folds = [_blocked(fresh, attributes, scheme)]
+    elif scheme.name == "authors":
+        folds = _authors(fresh, attributes, scheme)
+    elif scheme.name == "kfold":
+        folds = _kfold(fresh, attributes, scheme, keep)
+    else:
+        folds = _leave_one_out(attributes, scheme, keep)
+    roles = {(name, fold): role for fold, found in enumerate(folds) for name, role in found.items()}
+    kept = _kept(attributes, keep, len(folds), scheme)
+    roles |= kept
+    if scheme.few:
+        roles |= _few(roles, kept, attributes, scheme)
+    for fold in range(len(folds)):
+        if not any(role == "train" for (_, at), role in roles.items() if at == fold):
+            raise TacpipeError(
+                f"Fold {fold} of the {scheme.name} split leaves none of {len(attributes)} recordings to train on. "
+                f"Lower val and test, or add recordings."
+            )
+    return dict(sorted(roles.items(), key=lambda item: (item[0][1], item[0][0])))
+
+
+def without_val(roles: Mapping[tuple[str, int], str]) -> list[int]:
+    """Return the folds in which no recording has the role val, sorted.
+
+    >>> without_val({("a", 0): "train", ("b", 0): "val", ("a", 1): "test", ("b", 1): "train"})
+    [1]
+    """
+    return sorted({fold for _, fold in roles} - {fold for (_, fold), role in roles.items() if role == "val"})
+
+
+def sufficient_val(
+    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}
+) -> float | None:
+    """Return the smallest of some larger shares ``val`` that leaves no fold without validation recordings, or None.
+
+    Arguments are those of `assign`.
+    """
+    for val in SHARES:
+        try:
+            if val > scheme.val and not without_val(assign(attributes, replace(scheme, val=val), keep)):
+                return val
+        except TacpipeError:  # so large a share leaves nothing to train on
+            continue
+    return None
+
+
+def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
+    if scheme.name not in SCHEMES:
+        raise TacpipeError(f"There is no split scheme {scheme.name}; there are {', '.join(SCHEMES)}.")
+    if not attributes:
+        raise TacpipeError("A split of no recordings has no roles to give; give it a dataset with recordings.")
+    if not (0 <= scheme.val < 1 and 0 <= scheme.test < 1 and scheme.val + scheme.test < 1):
+        raise TacpipeError(
+            f"val {scheme.val} and test {scheme.test} leave nothing to train on; both must lie in [0, 1) "
+            f"and their sum below 1."
+        )
+    if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
+        raise TacpipeError(
+            f"{scheme.folds} folds cannot be made of {len(attributes)} recordings; folds must lie between 2 and that."
+        )
+    _check_options(scheme)
+
+
+def _check_options(scheme: Scheme) -> None:
+    if scheme.apart and scheme.name != "kfold":
+        raise TacpipeError(
+            f"apart {scheme.apart} goes with the scheme kfold alone, not with {scheme.name}. "
+            f"To keep values apart one by one, choose leave-one-out by {scheme.apart}."
+        )
+    if scheme.repeats < 1 or (scheme.repeats > 1 and scheme.name != "random"):
+        raise TacpipeError(
+            f"repeats {scheme.repeats} cannot be with the scheme {scheme.name}; it must be 1 or more, and 1 with all "
+            f"schemes but random."
+        )
+    if scheme.reverse and scheme.name != "blocked":
+        raise TacpipeError(f"reverse goes with the scheme blocked alone, not with {scheme.name}; leave it out.")
+    if scheme.few < 0 or (not scheme.few and (scheme.few_by or scheme.few_of)):
+        raise TacpipeError(
+            f"few is {scheme.few}; it must be the number of recordings to train on, or 0 for all, without few_by and "
+            f"few_of."
+        )
+    if scheme.few_of and not all(scheme.few_of.partition("=")):
+        raise TacpipeError(f"few_of is {scheme.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
+
+
+def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
+    """Return roles with the shares ``test`` and ``val``, each value of ``stratify`` spread evenly over them."""
+    order = _order(names, attributes, scheme, np.random.default_rng([scheme.seed, draw]))
+    tests, vals = round(scheme.test * len(names)), round(scheme.val * len(names))
+    return {name: "test" if i < tests else "val" if i < tests + vals else "train" for i, name in enumerate(order)}
+
+
+def _order(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, rng: np.random.Generator
+) -> list[str]:
+    """Return the names in an order that, cut anywhere, cuts every stratum at the same share, to within one recording.
+
+    Recordings are shuffled within their stratum and put at (rank + 1/2) / size of it.
+    """
+    places: dict[str, float] = {}
+    for stratum in _strata(names, attributes, scheme).values():
+        shuffled = rng.permutation(len(stratum))
+        places |= {stratum[i]: (rank + 0.5) / len(stratum) for rank, i in enumerate(shuffled)}
+    ties = dict(zip(names, rng.random(len(names)), strict=True))
+    return sorted(names, key=lambda name: (places[name], ties[name]))
+
+
+def _few(
+    roles: Roles, kept: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
+) -> Roles:
+    """Return the role ``unused`` for those that would train beyond ``few``; what an older split trains on counts."""
+    attribute, _, value = scheme.few_of.partition("=")
+    meant = [name for name in sorted(attributes) if not attribute or _value(name, attributes, attribute) == value]
+    if not meant:
+        raise TacpipeError(f"No recording has {attribute} {value}, of which few was to leave {scheme.few} to train on.")
+    groups: dict[str, list[str]] = {}
+    for name in meant:
+        groups.setdefault(_value(name, attributes, scheme.few_by) if scheme.few_by else "", []).append(name)
+    unused: Roles = {}
+    for fold in sorted({fold for _, fold in roles}):
+        for group in _ordered(set(groups)):
+            trained = [name for name in groups[group] if roles.get((name, fold)) == "train"]
+            fresh = [name for name in trained if (name, fold) not in kept]
+            room = max(scheme.few - (len(trained) - len(fresh)), 0)
+            order = _order(fresh, attributes, scheme, np.random.default_rng([scheme.seed, fold, 1]))
+            unused |= {(name, fold): UNUSED for name in order[room:]}
+    return unused
+
+
+def _val_of(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
+    """Return roles of recordings that are not tested: the share ``val`` of them, the rest train."""
+    return _drawn(names, attributes, Scheme(val=scheme.val, test=0, seed=scheme.seed, stratify=scheme.stratify), draw)
+
+
+def _blocked(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
+    roles: dict[str, str] = {}
+    for stratum in _strata(names, attributes, scheme).values():
+        tests, vals = round(scheme.test * len(stratum)), round(scheme.val * len(stratum))
+        trains = len(stratum) - tests - vals
+        order = reversed(stratum) if scheme.reverse else stratum
+        roles |= {n: "train" if i < trains else "val" if i < trains + vals else "test" for i, n in enumerate(order)}
+    return roles
+
+
+def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> list[dict[str, str]]:
+    blocks = sorted({_block(name, attributes) for name in attributes if _has_block(attributes[name])})
+    if blocks:
+        return _authors_folds(names, attributes, scheme, blocks)
+    roles = {}
+    for name in names:
+        role = attributes[name].get("authors_role")
+        if role not in ROLES:
+            held = f"has authors_role {role!r}" if role is not None else "has no attribute authors_role"
+            raise TacpipeError(
+                f"Recording {name} {held}; the scheme authors needs {', '.join(ROLES)} there. Ingest with "
+                f"--authors-role, set it with `tacpipe label`, or choose another scheme."
+            )
+        roles[name] = str(role)
+    if "val" not in roles.values():
+        roles |= _val_of([name for name in names if roles[name] == "train"], attributes, scheme, 0)
+    return [roles]
+
+
+def _authors_folds(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, blocks: Sequence[int]
+) -> list[dict[str, str]]:
+    """Return a fold a block: the block is val where the authors name whom to test, and tested where they do not."""
+    own = {name: attributes[name].get("authors_role") for name in names}
+    fixed = {name: str(own[name]) for name in names if own[name] == "test"}
+    fixed |= {name: str(own[name]) for name in names if own[name] in ROLES and not _has_block(attributes[name])}
+    published = any(one.get("authors_role") == "test" for one in attributes.values())
+    part = {name: blocks.index(_block(name, attributes)) for name in names if _has_block(attributes[name])}
+    part |= _parts([name for name in names if name not in part and name not in fixed], attributes, scheme, len(blocks))
+    folds = []
+    for fold in range(len(blocks)):
+        turn = [name for name in names if name not in fixed and part[name] == fold]
+        rest = [name for name in names if name not in fixed and part[name] != fold]
+        if published:
+            folds.append(fixed | dict.fromkeys(rest, "train") | dict.fromkeys(turn, "val"))
+        else:
+            folds.append(fixed | _val_of(rest, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test"))
+    return folds
+
+
+def _has_block(attributes: Attributes) -> bool:
+    return attributes.get("authors_fold") is not None
+
+
+def _block(name: str, attributes: Mapping[str, Attributes]) -> int:
+    block = str(attributes[name]["authors_fold"])
+    if not block.isdecimal():
+        raise TacpipeError(f"Recording {name} has authors_fold {block}; it must be a whole number, 0 or more.")
+    return int(block)
+
+
+def _kfold(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
+) -> list[dict[str, str]]:
+    part = _parts(names, attributes, scheme, scheme.folds)
+    unknown = _unknown(attributes, scheme, keep) if scheme.apart else {}
+    folds = []
+    for fold in range(scheme.folds):
+        tested = [name for name in names if fold in (part[name], unknown.get(name))]
+        rest = _val_of([name for name in names if name not in set(tested)], attributes, scheme, fold + 1)
+        folds.append(rest | dict.fromkeys(tested, "test"))
+    return folds
+
+
+def _parts(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int) -> dict[str, int]:
+    """Deal the shuffled recordings out in turn, stratum after stratum, so that parts differ by one at most."""
+    rng = np.random.default_rng(scheme.seed)
+    strata = _strata(names, attributes, scheme).values()
+    order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
+    return {name: i % count for i, name in enumerate(order)}
+
+
+def _unknown(
+    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
+) -> dict[str, int]:
+    """Return the fold in which the value of ``apart`` that a recording has is unknown, by recording.
+
+    Values are shuffled, and each goes to the fold that has fewest; those of an older split stay where they were.
+    """
+    values = {name: _value(name, attributes, scheme.apart) for name in sorted(attributes)}
+    distinct = _ordered(set(values.values()))
+    if len(distinct) < scheme.folds:
+        raise TacpipeError(
+            f"{len(distinct)} values of {scheme.apart} cannot be kept apart in {scheme.folds} folds, because a fold "
+            f"would have none; make at most {len(distinct)} folds."
+        )
+    fold_of = _unknown_before(values, scheme, keep)
+    held = Counter(fold_of.values())
+    for i in np.random.default_rng([scheme.seed, 0]).permutation(len(distinct)):
+        if distinct[i] not in fold_of:
+            fold_of[distinct[i]] = min(range(scheme.folds), key=lambda fold: (held[fold], fold))
+            held[fold_of[distinct[i]]] += 1
+    return {name: fold_of[value] for name, value in values.items()}
+
+
+def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tuple[str, int], str]) -> dict[str, int]:
+    """Return the fold in which an older split tests all recordings of a value, by value."""
+    tested: dict[str, set[int]] = {}
+    for name in sorted({name for name, _ in keep if name in values}):
+        folds = {fold for (kept, fold), role in keep.items() if kept == name and role == "test"}
+        tested[values[name]] = tested.get(values[name], folds) & folds
+    known = [value for value, folds in tested.items() if not folds]
+    if known:
+        raise TacpipeError(
+            f"The older split has no fold that tests all recordings of {scheme.apart} {known[0]}, so it did not keep "
+            f"{scheme.apart} apart. Make a split anew, or leave apart as it was."
+        )
+    return {value: min(folds) for value, folds in tested.items()}
+
+
+def _leave_one_out(
+    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
+) -> list[dict[str, str]]:
+    """One fold a value, sorted; values that an older split tested keep their fold."""
+    values = {name: _value(name, attributes, scheme.by) for name in sorted(attributes)}
+    old = {fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values}
+    left_out = [old[fold] for fold in sorted(old)]
+    left_out += [value for value in _ordered(set(values.values())) if value not in left_out]
+    if len(left_out) < 2:
+        raise TacpipeError(f"All recordings have {scheme.by} {left_out[0]}; leaving it out leaves none to train on.")
+    folds = []
+    for fold, value in enumerate(left_out):
+        rest = _val_of([name for name in values if values[name] != value], attributes, scheme, fold + 1)
+        folds.append(rest | {name: "test" for name in values if values[name] == value})
+    return folds
+
+
+def _kept(
+    attributes: Mapping[str, Attributes], keep: Mapping[tuple[str, int], str], folds: int, scheme: Scheme
+) -> Roles:
+    """Return the older roles of recordings that are still there. Raises where they do not fit the scheme."""
+    old = {fold for _, fold in keep}
+    grown = scheme.name == "leave-one-out" and len(old) <= folds  # a new value adds a fold
+    if keep and old != set(range(folds)) and not grown:
+        raise TacpipeError(
+            f"The older split has {len(old)} folds and the scheme {scheme.name} makes {folds}; they must be as many. "
+            f"Give the scheme and the folds of the older split."
+        )
+    return {(name, fold): role for (name, fold), role in keep.items() if name in attributes}
+
+
+def _strata(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme
+) -> dict[tuple[str, ...], list[str]]:
+    """Return the recordings of each value of the attributes ``stratify``, values and names sorted."""
+    wanted = [attribute.strip() for attribute in scheme.stratify.split(",") if attribute.strip()]
+    strata: dict[tuple[str, ...], list[str]] = {}
+    for name in sorted(names):
+        strata.setdefault(tuple(_value(name, attributes, attribute) for attribute in wanted), []).append(name)
+    return {values: strata[values] for values in sorted(strata, key=lambda values: [_place(one) for one in values])}
+
+
+def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:
+    value = attributes[name].get(attribute)
+    if value is None:
+        known = ", ".join(sorted(attributes[name])) or "none"
+        raise TacpipeError(
+            f"Recording {name} has no attribute {attribute}; it has {known}. Name another one or set it with "
+            f"`tacpipe label`."
+        )
+    return str(value)
+
+
+def _ordered(values: set[str]) -> list[str]:
+    """Sort text, whole numbers by value: 4, 10, bottle."""
+    return sorted(values, key=_place)
+
+
+def _place(value: str) -> tuple[int, int, str]:
+    return (0, int(value), "") if value.isdecimal() else (1, 0, value)

@@ -1,0 +1,310 @@
+"""How one key is made: arguments out of an identity, then the stage, then objects and a record."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from tacpipe.datasets import adoption
+from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.datasets.manifest import ACQUIRE, Manifest, shard_path
+from tacpipe.engine import provenance
+from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
+from tacpipe.io import memory
+from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
+from tacpipe.plugins import extras, failures, registry
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins.stage import RecordingOutput, Result, Stage
+from tacpipe.store import records
+from tacpipe.store.store import MissingError, Object, Store
+
+
+@dataclass(frozen=True)
+class Task:
+    """One key to make: all that a worker process needs."""
+
+    store: str
+    name: str  # of the stage
+    identity: Mapping[str, Any]
+    recording: str = ""
+    files: Mapping[str, str] | None = None  # of a published source: name to path
+    beside: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
+    replace: bool = False  # the old record names objects that are gone
+    dry: bool = False  # compute and compare, store nothing
+    rerun: bool = False  # compute although a result is stored
+    run: str = ""  # the lease of the run that it is part of
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a task: a record, or what was wrong with the recording."""
+
+    recording: str
+    record: Mapping[str, Any] | None
+    error: str = ""
+    exit_code: int = 0
+    made: bool = True  # False if another process was faster
+    at_fault: bool = True  # the recording is, and not the disk, a damaged input or another process
+
+
+def compute(task: Task) -> Done:
+    """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
+    store, key = Store(task.store, task.run), digest(task.identity)
+    try:
+        if task.dry:
+            result, _ = execute(task, store, _Scratch())
+            return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
+        with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
+            record = store.record(key)
+            if record is not None and not task.rerun and records.complete(store, record):
+                return Done(task.recording, record, made=False)
+            started = time.perf_counter()
+            replace = task.replace or record is not None
+            result, notes = execute(task, store, store)
+            stage = stage_of(task.name)
+            made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+            made |= {"code": provenance.code(stage), "notes": notes}
+            if stage.source:  # the record alone would tell that this is a recording, until a dataset's manifest does
+                store.put(_manifest_of(task, stage, result).content, durable=True)
+            record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
+            shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
+            return Done(task.recording, record)
+    except TacpipeError as error:
+        with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
+            (store.root / "checkpoints" / key).rmdir()
+        at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
+        return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
+
+
+class _Scratch:
+    """Takes content as a store does, and keeps only its name."""
+
+    def put(self, content: bytes, *, durable: bool = False) -> Object:
+        return Object(bytes_digest(content), len(content))
+
+
+def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str, Any], list[str]]:
+    """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
+    stage, stage_name = stage_of(task.name), task.name.removesuffix(".fit")
+    params = params_of.from_json(stage, task.identity["params"])
+    with _arguments(stage, task, store) as arguments:
+        try:
+            with memory.told(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
+                returned = stage(params, **arguments)
+        except Exception as error:
+            failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
+            raise
+    if not isinstance(returned, Result):
+        returned = (
+            Result(recordings={"": _recording(task.name, returned)}) if stage.mapped else _files(task.name, returned)
+        )
+    recordings = {
+        name: _entry(recording, sink, durable=stage.source) for name, recording in sorted(returned.recordings.items())
+    }
+    files = {name: vars(sink.put(content)) for name, content in sorted(returned.files.items())}
+    notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
+    return {"recordings": recordings, "files": files}, notes
+
+
+def _manifest_of(task: Task, stage: Stage, result: Mapping[str, Any]) -> Manifest:
+    """Return a manifest of one recording that was read from published files."""
+    (entry,), files = result["recordings"].values(), task.identity["inputs"][stage.argument("Files")]
+    return Manifest(
+        task.name,
+        stage.version,
+        task.identity["params"],
+        recordings={task.recording: entry},
+        sources={task.recording: files},
+    )
+
+
+def stage_of(name: str) -> Stage:
+    """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``."""
+    stage = registry.load(name.removesuffix(".fit"))
+    if name.endswith(".fit"):
+        assert stage.fit is not None
+        return stage.fit
+    return stage
+
+
+def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> list[str]:
+    """Return the paths of shards and files whose content is other in two results; ``name`` is that of a mapped recording."""
+
+    def contents(result: Mapping[str, Any]) -> dict[str, str]:
+        shards = {
+            shard_path(recording or name, stream): shard["digest"]
+            for recording, entry in result["recordings"].items()
+            for stream, shard in entry["shards"].items()
+        }
+        return {**shards, **{file: value["digest"] for file, value in result["files"].items()}}
+
+    before, now = contents(stored), contents(made)
+    return sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
+
+
+def reader(
+    store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] = MappingProxyType({})
+) -> Callable[[str, str], bytes]:
+    """Return a function (digest, path within its dataset) -> content that heals what it finds damaged.
+
+    It reads from the store; what is missing there is adopted from the directories ``beside``, or made again from its
+    record. ``sizes`` are those in bytes that a manifest declares, by digest: nothing much larger is read. Raises
+    `DamagedError` where neither can be done.
+    """
+
+    def read(name: str, path: str) -> bytes:
+        size = sizes.get(name)
+        try:
+            return store.read(name, size)
+        except MissingError as error:
+            content = _adopt(store, name, path, beside, size)
+            return _remake(store, name, path, str(error), size) if content is None else content
+
+    return read
+
+
+def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
+    content = adoption.beside(name, path, beside_of, size)
+    if content is not None:
+        with contextlib.suppress(TacpipeError):  # of a store that may only be read the sound copy is as good
+            store.prepare()
+            store.put(content, durable=True)
+    return content
+
+
+def _remake(store: Store, name: str, path: str, why: str, size: int | None = None) -> bytes:
+    other = ""
+    for identity, made_by in _makers(store, name):
+        acquired = identity["stage"] == ACQUIRE
+        if acquired or stage_of(identity["stage"]).source:
+            raise DamagedError(
+                f"{why} It is the recording {path}, which cannot be made again: restore it with `tacpipe store pull`"
+                f"{'' if acquired else ', or ingest it again'}."
+            )
+        stage = stage_of(identity["stage"])
+        if stage.version != identity["version"]:
+            other = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
+            continue
+        key = digest(identity)
+        if key in _remaking:  # a stage that gives what it was given: another one made that first
+            continue
+        _remaking.add(key)
+        try:
+            with store.leases.hold(key, f"{identity['stage']}, for {path}"):
+                if not store.has(name, size):  # else another process has made it again
+                    execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
+        except TacpipeError as error:
+            if error.exit_code != FAILED:
+                raise
+            other = str(error)
+            continue
+        finally:
+            _remaking.discard(key)
+        if store.has(name, size):
+            return store.read(name, size)
+        unlike = "; ".join(provenance.unlike(made_by, provenance.of(0.0)))
+        other = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
+    reason = other or f"nothing in the store says how {path} was made"
+    raise DamagedError(
+        f"{why} It cannot be made again: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
+    )
+
+
+_remaking: set[str] = set()  # keys that this process makes again, one because another one lacks its input
+_known: dict[str, dict[str, list[tuple[Any, Any]]]] = {}  # store, digest, identities of what gave it and provenance
+
+
+def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
+    """Return identity and provenance of the keys that gave an object; all records are read once for many lost objects."""
+    root = str(store.root)
+    if name not in _known.get(root, {}):
+        _known[root] = {}
+        for _, record in store.records():
+            if "stage" in record["identity"]:
+                for found in set(records.named(record["result"])):
+                    _known[root].setdefault(found, []).append((record["identity"], record["provenance"]))
+    return _known[root].get(name, [])
+
+
+@contextmanager
+def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any]]:
+    """Yield the arguments that the identity describes, by name."""
+    read = reader(store, task.beside)
+    inputs = task.identity["inputs"]
+    found: dict[str, Any] = {}
+    for name, kind in stage.arguments.items():
+        if kind == "Recording":
+            found[name] = Recording(task.recording, inputs[name], read)
+        elif kind in ("Dataset", "Model"):
+            found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
+        elif kind == "Datasets":
+            found[name] = tuple(_dataset(value, read) for value in inputs[name])
+        elif kind == "Fitted":
+            found[name] = {file: read(value, file) for file, value in inputs[name].items()}
+        elif kind == "Files":
+            found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
+        elif kind == "Trial":
+            found[name] = inputs[name]
+        elif kind == "Roles":
+            found[name] = read_roles(read(inputs[name], "split.parquet")) if inputs[name] else {}
+        else:
+            found[name] = store.root / "checkpoints" / digest(task.identity)
+            if found[name].is_symlink():
+                raise StorageError(f"{found[name]} is a symbolic link, and none is followed within a store. Remove it.")
+            found[name].mkdir(parents=True, exist_ok=True)
+    yield found
+    for file, path in (task.files or {}).items():
+        if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
+            raise StorageError(f"{path} changed while it was read. Run the same command again.")
+
+
+def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
+    lineage = value["lineage"]
+    manifest = Manifest(
+        stage=lineage["stage"],
+        version=lineage["version"],
+        params=lineage["params"],
+        chain=lineage["chain"],
+        recordings=value["recordings"],
+        files={name: {"digest": file} for name, file in value["files"].items()},
+    )
+    return Dataset(manifest, read)
+
+
+def read_roles(content: bytes) -> dict[tuple[str, int], str]:
+    """Return (recording, fold) to role from the Parquet bytes of a split."""
+    from tacpipe.io.parquet import from_parquet
+
+    rows = from_parquet(content, ["recording", "fold", "role"]).to_pydict()
+    return dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
+
+
+def _recording(name: str, returned: Any) -> RecordingOutput:
+    if isinstance(returned, RecordingOutput):
+        return returned
+    if hasattr(returned, "schema") or isinstance(returned, Mapping):
+        return RecordingOutput(returned)
+    raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a table, tables or files.")
+
+
+def _files(name: str, returned: Any) -> Result:
+    if isinstance(returned, Mapping):
+        return Result(files=returned)
+    raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a Result or files by name.")
+
+
+def _entry(recording: RecordingOutput, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
+    from tacpipe.io.parquet import to_parquet
+
+    shards = {
+        stream: {**vars(sink.put(to_parquet(table), durable=durable)), "rows": table.num_rows}
+        for stream, table in sorted(recording.streams.items())
+    }
+    return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}

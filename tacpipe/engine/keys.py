@@ -1,0 +1,98 @@
+"""Identities: what a key is the digest of, for shards, for whole datasets and for runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.engine.execution import Task
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.plugins.stage import Stage
+from tacpipe.store.store import Store
+
+
+def identity(name: str, stage: Stage, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the key of a result is the digest of."""
+    values = params if isinstance(params, Mapping) else params_of.to_json(params)
+    return {"stage": name, "version": stage.version, "params": values, "inputs": inputs}
+
+
+def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
+    """Return what a key says of a recording: digests of its streams, and the attributes in ``reads`` (None: all)."""
+    attributes = entry["attributes"]
+    if reads is not None:
+        attributes = {name: attributes[name] for name in reads if name in attributes}
+    return {
+        "attributes": attributes,
+        "shards": {stream: {"digest": shard["digest"]} for stream, shard in entry["shards"].items()},
+    }
+
+
+def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, Entry]) -> dict[str, Any]:
+    """Return what a whole-dataset key says of the ``chosen`` recordings: names, attributes, digests, chain, files."""
+    return {
+        "lineage": {
+            "stage": manifest.stage,
+            "version": manifest.version,
+            "params": manifest.params,
+            "chain": manifest.chain,
+        },
+        "recordings": {name: of_recording(entry, reads) for name, entry in sorted(chosen.items())},
+        "files": {name: file["digest"] for name, file in manifest.files.items()},
+    }
+
+
+def chain_step(name: str, stage: Stage, params: Any, fitted: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the link of a chain that a map stage adds."""
+    files = {file: value["digest"] for file, value in fitted.items()} if fitted is not None else None
+    return {"stage": name, "version": stage.version, "params": params_of.to_json(params), "fitted": files}
+
+
+def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> list[Task]:
+    """Return one task a recording of ``given`` for the map stage of a link of a chain."""
+    stage = registry.load(step["stage"])
+    fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
+    (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
+
+    def task(name: str, entry: Entry) -> Task:
+        inputs = {recording: of_recording(entry, stage.reads or ()), **fitted}
+        named = identity(step["stage"], stage, step["params"], inputs)
+        return Task(str(store.root), step["stage"], named, name, beside=beside)
+
+    return [task(name, entry) for name, entry in sorted(given.included.items())]
+
+
+def source_tasks(
+    store: Store,
+    name: str,
+    stage: Stage,
+    params: Any,
+    sources: Mapping[str, Mapping[str, Path]],
+    digests: Mapping[str, Mapping[str, str]],
+) -> list[Task]:
+    """Return one task a recording of a published source."""
+    (argument,) = (found for found, kind in stage.arguments.items() if kind == "Files")
+    return [
+        Task(
+            str(store.root),
+            name,
+            identity(name, stage, params, {argument: digests[recording]}),
+            recording,
+            files={file: str(path) for file, path in files.items()},
+        )
+        for recording, files in sources.items()
+    ]
+
+
+def trial_tasks(store: Store, name: str, stage: Stage, params: Any) -> list[Task]:
+    """Return one task a recording to simulate, named ``trial-000`` and so on."""
+    (argument,) = (found for found, kind in stage.arguments.items() if kind == "Trial")
+    count = int(params.trials)
+    width = max(3, len(str(count - 1)))
+    return [
+        Task(str(store.root), name, identity(name, stage, params, {argument: number}), f"trial-{number:0{width}d}")
+        for number in range(count)
+    ]

@@ -1,0 +1,57 @@
+"""The processor and the number of threads that numbers are computed with, on which the last digit of a sum depends.
+
+Matrix kernels are chosen by the processor's instructions, and each thread adds up its own part: either changes the order of
+additions, and so how they round.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from tacpipe.engine.executors import usable_cores
+
+_CPUINFO = Path("/proc/cpuinfo")
+# those that the kernels of OpenBLAS, oneDNN, torch and numpy are chosen by
+_INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
+# variables that choose kernels by name
+_CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def here() -> dict[str, Any]:
+    """Return the processor's ``model``, its vector ``instructions``, kernels ``chosen`` by variables, and ``threads``."""
+    chosen = {name: os.environ[name] for name in _CHOSEN if name in os.environ}
+    return {**_processor(), "chosen": chosen, "threads": threads()}
+
+
+def threads() -> int:
+    """Return with how many threads this process computes."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        return int(torch.get_num_threads())
+    given = (os.environ.get(name, "") for name in _THREADS)
+    return next((int(text) for text in given if text.isdecimal() and int(text)), usable_cores())
+
+
+@functools.cache
+def _processor() -> dict[str, Any]:
+    told: dict[str, str] = {}  # of the first core
+    try:
+        with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                name, _, value = line.partition(":")
+                if not value:
+                    break
+                told[name.strip().lower()] = value.strip()
+    except OSError:  # macOS
+        pass
+    words = set(f"{told.get('flags', '')} {told.get('features', '')}".split())
+    return {
+        "model": told.get("model name") or platform.processor() or platform.machine(),
+        "instructions": [name for name in _INSTRUCTIONS if name in words],
+    }

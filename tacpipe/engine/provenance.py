@@ -1,0 +1,86 @@
+"""Where and with what something was made: kept beside results, no part of any key or digest."""
+
+from __future__ import annotations
+
+import functools
+import platform
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tacpipe.engine import processor
+from tacpipe.io.hashing import remembered_file_digest
+from tacpipe.plugins.stage import Stage
+
+_LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
+
+
+@functools.cache
+def _here() -> dict[str, Any]:
+    import subprocess
+    from importlib.metadata import PackageNotFoundError, version
+
+    libraries = {}
+    for name in _LIBRARIES:
+        try:
+            libraries[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    git = ["git", "rev-parse", "HEAD"]
+    try:
+        commit = subprocess.run(git, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
+    except (OSError, subprocess.SubprocessError):  # no git, or none that answers in time
+        commit = ""
+    return {
+        "libraries": libraries,
+        "git_commit": commit or None,
+        "host": platform.node(),
+        "python": sys.version.split()[0],
+    }
+
+
+def of(seconds: float) -> dict[str, Any]:
+    """Return libraries, git commit, host, device and processor of this process, and the ``seconds`` that something took."""
+    torch = sys.modules.get("torch")
+    device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
+    return {**_here(), "device": device, "processor": processor.here(), "seconds": seconds}
+
+
+def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return in what two computers differ that changes how numbers round; nothing where ``stored`` does not say.
+
+    >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
+    ['threads: 1, now 2']
+    """
+    found = []
+    for name in ("device", "processor", "libraries"):
+        before, after = stored.get(name), now.get(name)
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            there = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]
+        else:
+            there = [(name, before, after)] if before and after else []
+        found += [f"{part}: {_text(one)}, now {_text(other)}" for part, one, other in there if one != other]
+    return found
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        value = [f"{name}={value[name]}" for name in sorted(value)]
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value if value is not None else "none")
+
+
+def code(stage: Stage) -> str | None:
+    """Return the digest of the file that a stage's function is written in; None where it cannot change by itself.
+
+    That is a built-in stage that was installed: it changes with the version of tacpipe alone.
+    """
+    name = stage.function.__module__
+    file = getattr(sys.modules.get(name), "__file__", None)
+    built_in = name.partition(".")[0] in ("tacpipe", "tacpipe_stages")
+    if file is None or (built_in and any(part.endswith("-packages") for part in Path(file).parts)):
+        return None
+    try:
+        return remembered_file_digest(file)
+    except OSError:  # it was removed while it ran
+        return None

@@ -1,0 +1,204 @@
+"""Files that are there whole or not at all: draft, fsync, rename; and what the file system says, as sentences."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterable, Iterator
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import StorageError
+from tacpipe.io import regular
+
+_READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
+
+
+def write_whole(
+    path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
+) -> bool:
+    """Write ``content``, whole or in blocks, to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost.
+
+    Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made. ``mode`` is less
+    what the umask takes.
+    """
+    try:
+        _write_synced(draft, content, mode)
+        try:
+            return _move(draft, path, exclusive)
+        except FileNotFoundError:
+            os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+            return _move(draft, path, exclusive)
+    finally:
+        with contextlib.suppress(OSError):  # a draft that stays is swept up later
+            os.unlink(draft)  # noqa: PTH108
+
+
+def write_all(handle: int, content: bytes) -> None:
+    """Write all of ``content``, however little of it the system takes at a time."""
+    view = memoryview(content)
+    while view:
+        view = view[os.write(handle, view) :]
+
+
+def sync_folder(path: str) -> None:
+    """Make sure that the names in a folder outlast a loss of power."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync_folders(path: str, top: str) -> None:
+    """Do as `sync_folder` for a folder and all above it up to ``top``: each may be new."""
+    while True:
+        sync_folder(path)
+        if path == top or len(path) <= len(top):
+            return
+        path = os.path.dirname(path)  # noqa: PTH120
+
+
+def listed(folder: Path, pattern: str = "*") -> list[Path]:
+    """Return what lies in a folder, sorted; nothing where there is none.
+
+    A folder that cannot be listed is an error here. `Path.glob` passes over it, and what it holds would seem to be gone.
+    """
+    try:
+        names = os.listdir(folder)  # noqa: PTH208
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [folder / name for name in sorted(names) if fnmatchcase(name, pattern)]
+
+
+def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yield ``source`` and each folder below it with the folders and files in it, sorted, from the top down.
+
+    Links are followed, circles of them are not; without ``links`` one to a folder counts as a file. Folders that are taken
+    out of the list are passed over, and so are those that are removed meanwhile. Raises `StorageError` for a folder that
+    cannot be listed: `os.walk` passes over it, and what it holds would seem to be gone.
+    """
+    seen: set[str] = set()
+    pending = [os.fspath(source)]
+    while pending:
+        place = pending.pop()
+        real = os.path.realpath(place)
+        if real in seen:
+            continue
+        seen.add(real)
+        try:
+            folders, files = _contents(place, links)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise StorageError(
+                f"{error.filename or place} cannot be listed: {error.strerror or error}. What it holds would be left out: "
+                f"make it readable, or take it away, and run the same command again."
+            ) from error
+        yield place, folders, files
+        pending += [f"{place.rstrip('/')}/{name}" for name in reversed(folders)]
+
+
+def _contents(place: str, links: bool) -> tuple[list[str], list[str]]:
+    """Return the names of the folders in a folder, and of all else, sorted."""
+    folders: list[str] = []
+    files: list[str] = []
+    with os.scandir(place) as entries:
+        for entry in entries:
+            (folders if _is_folder(entry, links) else files).append(entry.name)
+    return sorted(folders), sorted(files)
+
+
+def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
+    """Return whether an entry is a folder, or a link to one; a link in a circle is none."""
+    try:
+        return entry.is_dir(follow_symlinks=links)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        return False
+
+
+def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | None:
+    """Return the mapping that a file of a store holds; None if it is not there, holds none, or more than ``most`` bytes."""
+    try:
+        value = regular.json_value(path, most)
+    except (FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+@contextlib.contextmanager
+def readable_errors(root: Path) -> Iterator[None]:
+    """Turn what the file system says into a sentence; what is looked for and not there stays what it is."""
+    try:
+        yield
+    except (FileNotFoundError, FileExistsError):
+        raise
+    except OSError as error:
+        raise sentence(root, error) from error
+
+
+def may_not_write(error: StorageError) -> bool:
+    """Return whether a store failed because nothing may be written there, and not because its disk is full or broken."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _READ_ONLY
+
+
+def sentence(root: Path | str, error: OSError) -> StorageError:
+    """Return in words what the file system said of something under the store ``root``."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return StorageError(
+            f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
+            f"shows what the store could give back) and run the same command again."
+        )
+    if error.errno in _READ_ONLY:
+        return StorageError(
+            f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
+            f"TACPIPE_STORE."
+        )
+    return StorageError(
+        f"The store {root} cannot be used: {error.strerror or error}, says the system of {error.filename or 'it'}. "
+        f"Look after the disk, then run the same command again."
+    )
+
+
+def told(error: OSError) -> str:
+    """Return in words what the file system said of anything else."""
+    return (
+        f"{error.filename or 'A file'} cannot be used: {error.strerror or error}. Nothing was half written; mend that, then "
+        f"run the same command again."
+    )
+
+
+def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int) -> None:
+    try:
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    except FileNotFoundError:
+        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    try:
+        for block in [content] if isinstance(content, bytes) else content:
+            write_all(handle, block)
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _move(draft: str, path: str, exclusive: bool) -> bool:
+    if not exclusive:
+        os.replace(draft, path)  # noqa: PTH105
+        return True
+    try:
+        os.link(draft, path)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        if os.path.exists(path):  # noqa: PTH110
+            return False
+        os.replace(draft, path)  # noqa: PTH105  (of two that come here at once the later one stays: both are complete)
+    return True

@@ -1,0 +1,87 @@
+"""Digests: what names content, and keys, which name results before they exist."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import TacpipeError
+from tacpipe.io import regular
+from tacpipe.printable import excerpt
+
+DIGEST = re.compile(r"[0-9a-f]{64}")  # as it is written, in whole or within a text
+SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
+_remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system said of the file, its digest
+
+
+def canonical(value: Any) -> bytes:
+    """Return ``value`` as canonical JSON: the same value gives the same bytes everywhere.
+
+    Raises `TacpipeError` for what JSON cannot hold: a key must never rest on a repr or a pickle.
+
+    >>> canonical({"b": 1, "a": [1.5, None]})
+    b'{"a":[1.5,null],"b":1}'
+    """
+    try:
+        text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        if "\\ud" in text:  # beyond 16 bits, or half a character, of which two would read as a whole one
+            json.dumps(value, ensure_ascii=False).encode()
+        return text.encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise TacpipeError(
+            f"A key cannot be made of {excerpt(value)}: {error}. Use numbers, text, lists and mappings."
+        ) from error
+
+
+def digest(value: Any) -> str:
+    """Return the sha256 of the canonical JSON of ``value`` as 64 hex digits.
+
+    >>> digest({})[:8]
+    '44136fa3'
+    """
+    return hashlib.sha256(canonical(value)).hexdigest()
+
+
+def bytes_digest(content: bytes) -> str:
+    """Return the sha256 of ``content``, as ``sha256sum`` prints it.
+
+    >>> bytes_digest(b"")[:8]
+    'e3b0c442'
+    """
+    return hashlib.sha256(content).hexdigest()
+
+
+def file_digest(path: Path | str) -> str:
+    """Return the sha256 of a file's content, as ``sha256sum`` prints it.
+
+    Raises `TacpipeError` for a pipe, a device or a folder, which have no content or no end of it.
+    """
+    with regular.opened(path) as file, regular.naming(path):
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def remembered_file_digest(path: Path | str) -> str:
+    """Return `file_digest`, without reading again a file that this process has read and that did not change since.
+
+    Of a file that holds hundreds of recordings each asks for the digest. A file counts as unchanged while the system gives
+    the same inode, size and times of change; one that was written in the last `SETTLED_NS` is always read.
+    """
+    name = os.fspath(path)
+    before = _traits(name)
+    known = _remembered.get(name)
+    if known is not None and known[0] == before:
+        return known[1]
+    found = file_digest(path)
+    if before == _traits(name) and time.time_ns() - max(before[-2:]) > SETTLED_NS:
+        _remembered[name] = before, found
+    return found
+
+
+def _traits(path: str) -> tuple[int, ...]:
+    stat = os.stat(path)  # noqa: PTH116  (once a file on every hit)
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns

@@ -1,0 +1,187 @@
+"""A table and its Parquet bytes: encodings chosen by measurement, units and layout kept as field metadata."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.io import memory
+from tacpipe.io.parquet_claims import claimed
+from tacpipe.printable import plain
+
+ROW_GROUP_ROWS = 1 << 20
+HELD_SHARE = 0.25  # above this share of repeated rows zstd beats delta packing; measured, docs/format.md
+LARGE_BYTES = 1 << 25  # in memory
+ZSTD_LEVEL = 3
+ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
+_CLOCKS = ("t_ns", "t_device_ns", "seq")
+_KEY = b"tacpipe"
+BROKEN = (  # what pyarrow raises for broken files, and Python for what these say of themselves
+    *(pa.ArrowException, OSError, ValueError, RuntimeError, MemoryError, OverflowError),
+    *(LookupError, TypeError, AttributeError),
+)
+
+
+def to_parquet(table: pa.Table) -> bytes:
+    """Return ``table`` as the bytes of a Parquet file; the same table gives the same bytes.
+
+    >>> table = pa.table({"t_ns": pa.array([0, 1], pa.int64())})
+    >>> from_parquet(to_parquet(table)).equals(table)
+    True
+    """
+    held = _held_share(table) > HELD_SHARE
+    encoding, compression_level = {}, {}
+    for field in table.schema:
+        delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not held)
+        compression_level[field.name] = ZSTD_LEVEL if delta or not held else ZSTD_LEVEL_HELD
+        if pa.types.is_floating(field.type):
+            encoding[field.name] = "BYTE_STREAM_SPLIT"
+        elif delta:
+            encoding[field.name] = "DELTA_BINARY_PACKED"
+        elif not pa.types.is_boolean(field.type):
+            encoding[field.name] = "PLAIN"
+    # Arrow's own stream is faster, but doubles when it grows and copies in the end: a large table would be there thrice
+    sink = io.BytesIO() if table.nbytes > LARGE_BYTES else pa.BufferOutputStream()
+    bare = table.cast(pa.schema([pa.field(field.name, field.type) for field in table.schema]))
+    with pq.ParquetWriter(
+        sink,
+        bare.schema,
+        use_dictionary=False,
+        column_encoding=encoding,
+        compression="zstd",
+        compression_level=compression_level,
+        write_statistics=False,
+        write_page_checksum=True,
+        store_schema=False,
+    ) as writer:
+        writer.write_table(bare, row_group_size=ROW_GROUP_ROWS)
+        writer.add_key_value_metadata({_KEY: _fields_to_json(table.schema)})
+    content: bytes = sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
+    return content
+
+
+def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
+
+    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there or more than
+    the memory that is left.
+    """
+    return ParquetTable(content).read(columns)
+
+
+class ParquetTable:
+    """The table of a Parquet file's bytes, of which columns are decoded when asked for; raises as `from_parquet` does."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = owned(content)
+        try:
+            self._file = pq.ParquetFile(pa.BufferReader(self._content))
+            stored = (self._file.metadata.metadata or {}).get(_KEY)
+            self._fields = None if stored is None else json.loads(stored)
+            self.schema = self._with_fields(self._file.schema_arrow)
+        except BROKEN as error:
+            raise _unread(len(content), error) from error
+
+    @property
+    def num_rows(self) -> int:
+        """How many rows the file claims."""
+        return int(self._file.metadata.num_rows)
+
+    def read(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return the table, of ``columns`` alone where they are named, with field metadata."""
+        try:
+            needed = claimed(self._file.schema, memoryview(self._content).cast("B"), columns)
+        except BROKEN as error:
+            raise _unread(self._content.size, error) from error
+        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=DamagedError)
+        try:
+            table = self._file.read(columns=list(columns) if columns is not None else None)
+            return table if self._fields is None else table.cast(self._with_fields(table.schema))
+        except BROKEN as error:
+            raise _unread(self._content.size, error) from error
+
+    def _with_fields(self, schema: pa.Schema) -> pa.Schema:
+        return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
+
+
+def owned(content: bytes) -> pa.Buffer:
+    """Return the bytes in memory of Arrow's own.
+
+    Arrow's threads may let go of a buffer after the table is read. One of Python's they cannot release while Python ends:
+    then the process aborts, its work done.
+    """
+    sink = pa.BufferOutputStream()
+    sink.write(content)
+    return sink.getvalue()
+
+
+def _unread(size: int, error: Exception) -> TacpipeError:
+    """Return in words why bytes could not be read: they are damaged, or there is too little memory left to know."""
+    if memory.scarce() and (short := memory.shortage(error)) is not None:
+        return short
+    return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
+
+
+def _held_share(table: pa.Table) -> float:
+    """Return the share of rows whose integer channels all equal those of the row before."""
+    channels = [
+        column.to_numpy()
+        for name, column in zip(table.column_names, table.columns, strict=True)
+        if pa.types.is_integer(column.type) and name not in _CLOCKS and not column.null_count
+    ]
+    if not channels or table.num_rows < 2:
+        return 0.0
+    same = np.ones(table.num_rows - 1, dtype=bool)  # (time,)
+    for channel in channels:
+        same &= channel[1:] == channel[:-1]
+    return float(same.mean())
+
+
+def _fields_to_json(schema: pa.Schema) -> bytes:
+    """Return all field metadata as JSON: key to value to the positions of the columns that carry it."""
+    fields: dict[str, dict[str, list[int]]] = {}
+    for position, field in enumerate(schema):
+        for key, value in (field.metadata or {}).items():
+            if not key.startswith(b"PARQUET:"):
+                fields.setdefault(key.decode(), {}).setdefault(value.decode(), []).append(position)
+    return json.dumps({"fields": fields}, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _with_fields(schema: pa.Schema, names: Sequence[str], stored: dict[str, Any]) -> pa.Schema:
+    metadata: dict[str, dict[str, str]] = {}
+    for key, values in stored["fields"].items():
+        for value, positions in values.items():
+            for position in positions:
+                metadata.setdefault(names[position], {})[key] = value
+    return pa.schema([pa.field(field.name, field.type, metadata=metadata.get(field.name)) for field in schema])
+
+
+def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Table:
+    """Return ``table`` with ``metadata`` (column to key to text) added to that of its fields."""
+    fields = []
+    for field in table.schema:
+        kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        merged = {**kept, **metadata.get(field.name, {})}
+        fields.append(pa.field(field.name, field.type, metadata=merged or None))
+    return table.cast(pa.schema(fields))
+
+
+def one_after_another(tables: Mapping[str, pa.Table]) -> pa.Table:
+    """Return the tables of recordings as one, after a first column ``recording`` with their names; without metadata.
+
+    A table that has such a column keeps its own, as that of a split or of predictions. There must be a table.
+    """
+    named = []
+    for name, table in tables.items():
+        if "recording" not in table.column_names:
+            names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([name]))
+            table = table.add_column(0, "recording", names)
+        named.append(pa.Table.from_arrays(table.columns, names=table.column_names))
+    return pa.concat_tables(named, promote_options="default").unify_dictionaries()

@@ -1,0 +1,168 @@
+"""Regular files, opened as such: a pipe, a device or a folder in the place of one is refused, and never waited for.
+
+Every file of a store, of a remote store and of an untrusted dataset is opened here. A file of a store is never a symbolic
+link (``follow=False``), and none is read that is larger than what describes it declares (``most``), or than memory.
+
+What the system answers when a source file is read is no property of the recording: `failing` raises it as `StorageError`,
+which ends the command, with ``--skip-bad`` too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import json
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.io import memory
+
+KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISLNK, "a symbolic link"),
+)
+BLOCK_BYTES = 1 << 20
+JSON_BYTES = 1 << 28  # the largest JSON file that is read: a manifest of a million recordings
+JSON_IN_MEMORY = 24  # bytes that a byte of JSON becomes at most when it is parsed: "[]," is an empty list
+_FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
+_LINK = (errno.ELOOP, errno.EMLINK)  # what systems answer to O_NOFOLLOW
+
+
+class IrregularError(TacpipeError):
+    """What lies at a path is not a regular file, or is larger than it may be."""
+
+
+def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
+    """Return a file opened for reading; ``follow`` is whether ``path`` may be a symbolic link.
+
+    Raises `IrregularError` where it is not a regular file, `OSError` as `open` does.
+    """
+    handle, _ = _open(path, follow=follow)
+    return io.BufferedReader(io.FileIO(handle))
+
+
+def content(path: Path | str, most: int | None = None, *, follow: bool = True) -> bytes:
+    """Return what a regular file of at most ``most`` bytes holds, by default of as many as memory takes.
+
+    Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` where memory is short, which says
+    nothing of the file.
+    """
+    handle, size = _open(path, follow=follow)
+    try:
+        _expect_size(path, size, most)
+        with naming(path):
+            found = os.read(handle, size + 1)  # one byte more: it ends there, as it should
+            return found if len(found) == size else _rest(path, handle, found, most)
+    finally:
+        os.close(handle)
+
+
+def blocks(path: Path | str, most: int, *, follow: bool = True) -> Iterator[bytes]:
+    """Yield what a regular file of at most ``most`` bytes holds, `BLOCK_BYTES` at a time; raises as `content` does."""
+    handle, size = _open(path, follow=follow)
+    try:
+        read = 0
+        _expect_size(path, size, most, whole=False)
+        while block := os.read(handle, BLOCK_BYTES):
+            read += len(block)
+            _expect_size(path, read, most, whole=False)
+            yield block
+    finally:
+        os.close(handle)
+
+
+def json_value(path: Path | str, most: int = JSON_BYTES) -> Any:
+    """Return the JSON value that a file of a store holds.
+
+    Raises as `content` does, and `ValueError` or `RecursionError` where it is not JSON.
+    """
+    text = content(path, most, follow=False)
+    expect_parsed(path, len(text))
+    return json.loads(text)
+
+
+def expect_parsed(path: Path | str, size: int) -> None:
+    """Raise `StorageError` where this computer has too little memory left to parse ``size`` bytes of JSON."""
+    memory.require(size * JSON_IN_MEMORY, f"{path}, parsed,", error=StorageError)
+
+
+def source(path: Path | str) -> bytes:
+    """Return what a file of a recording's source holds. Raises `TacpipeError` where it is no regular one, as `failing`."""
+    with failing(path):
+        return content(path)
+
+
+@contextlib.contextmanager
+def failing(path: Path | str) -> Iterator[None]:
+    """Raise what the system answers while ``path`` is read (EIO, EMFILE, ESTALE, ENOMEM, …) as `StorageError`."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(
+            f"{path} cannot be read: {error.strerror or error}. The recording may be sound: check the disk, its permissions "
+            f"and limits, then run the same command again."
+        ) from error
+
+
+@contextlib.contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Have an `OSError` of the block carry the file's name, which one of a read lacks."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or os.fspath(path)
+        raise
+
+
+def require(path: Path | str, mode: int) -> None:
+    """Raise `IrregularError` where ``mode``, of `os.stat`, is not that of a regular file."""
+    if not stat.S_ISREG(mode):
+        kind = next((name for is_one, name in KINDS if is_one(mode)), "something else")
+        raise IrregularError(
+            f"{path} is {kind}, not a file that holds data. Put the file in its place, or leave it out."
+        )
+
+
+def _open(path: Path | str, *, follow: bool) -> tuple[int, int]:
+    """Return the handle of a regular file, and its size in bytes."""
+    try:
+        handle = os.open(path, _FLAGS if follow else _FLAGS | os.O_NOFOLLOW)
+    except OSError as error:
+        if error.errno in (*_LINK, errno.ENXIO):  # a link, or a socket
+            require(path, os.lstat(path).st_mode)
+        raise
+    try:
+        found = os.fstat(handle)
+        require(path, found.st_mode)
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle, found.st_size
+
+
+def _expect_size(path: Path | str, size: int, most: int | None, *, whole: bool = True) -> None:
+    if most is not None and size > most:
+        raise IrregularError(
+            f"{path} has {size:,} bytes, and should have {most:,} at most. It is damaged or was made up; remove it."
+        )
+    if whole:
+        memory.require(size, str(path), error=StorageError)
+
+
+def _rest(path: Path | str, handle: int, begun: bytes, most: int | None) -> bytes:
+    """Return all of a file that is longer than one read, or that grows or shrinks while it is read."""
+    found = io.BytesIO()
+    while begun:
+        found.write(begun)
+        _expect_size(path, found.tell(), most)
+        begun = os.read(handle, 16 * BLOCK_BYTES)
+    return found.getvalue()

@@ -1,0 +1,255 @@
+"""A wish to end, by Ctrl-C, SIGTERM or SIGHUP: a command ends within a second, whatever it is doing, and says one sentence.
+
+Python hears of a signal between two of its own steps, and a long call in C has none. So a thread hears of it too, and ends
+the process where `KeyboardInterrupt` has not. That is safe at any point: nothing in a store is ever half written.
+
+SIGHUP comes when a terminal or an ssh connection closes: from the kernel, and often again from the shell or from systemd. It
+never counts as a second request. What was connected to standard output and error may be gone, so writing there may fail.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any, NoReturn
+
+from tacpipe import printable
+from tacpipe.errors import INTERRUPTED
+from tacpipe.io import terminal
+
+GRACE_S = 0.7  # to end in good order
+TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a wish is the same one
+SENTENCE = "tacpipe: interrupted; what was finished is kept."
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class _Wishes:
+    """Tells wishes apart from their echoes."""
+
+    def __init__(self) -> None:
+        self._last_s = -TWICE_S
+
+    def another(self) -> bool:
+        """Return whether the signal that has just come is a wish of its own."""
+        now_s = time.monotonic()
+        if now_s - self._last_s <= TWICE_S:
+            return False
+        self._last_s = now_s
+        return True
+
+
+class _Program:
+    """What this process knows of wishes to end; there is one."""
+
+    def __init__(self) -> None:
+        self.heard = _Wishes()  # by the main thread
+        self.noticed = _Wishes()  # by the thread that listens
+        self.ending = False
+        self.heeds = False  # it is a command's own process
+        self.held = False  # `KeyboardInterrupt` waits
+        self.own_way = False  # the next wish is the command's own business
+        self.sentence = SENTENCE
+        self.told = False
+        self.code: int | None = None  # of a command that is done
+        self.restore: Callable[[], None] = lambda: None  # what was done to the terminal
+
+    def ask(self, number: int, frame: FrameType | None) -> None:
+        """Raise `KeyboardInterrupt` for the first wish, end at once for the second: the handler of all signals."""
+        hung_up = number == signal.SIGHUP
+        if hung_up:
+            drop_closed_streams()
+        if not self.heard.another() or (hung_up and self.ending):
+            return
+        if self.ending or self.code is not None:
+            self.end()
+        self.ending = True
+        if not self.held:
+            raise KeyboardInterrupt
+
+    def listen(self, wakeups: int) -> None:
+        """See to it that the process ends soon after a wish: run by a thread that hears of signals from C."""
+        expected = requested = False
+        while True:
+            (number,) = os.read(wakeups, 1)
+            if number not in _SIGNALS or not self.noticed.another() or (number == signal.SIGHUP and requested):
+                continue
+            requested = True
+            if self.own_way:
+                self.own_way = False
+            elif expected:
+                self.end()
+            else:
+                expected = True
+                threading.Thread(target=self.end_soon, daemon=True).start()
+
+    def end_soon(self) -> None:
+        time.sleep(GRACE_S)
+        self.end()
+
+    def end(self) -> NoReturn:
+        """End the process without another step of what it was doing."""
+        self.restore()
+        if self.code is None and not self.told and self.sentence:
+            self.told = True
+            with contextlib.suppress(OSError):
+                os.write(2, f"{printable.shown(self.sentence)}\n".encode(errors="backslashreplace"))
+        os._exit(INTERRUPTED if self.code is None else self.code)
+
+
+_program = _Program()
+
+
+def heed() -> None:
+    """Heed wishes to end from now on: `KeyboardInterrupt` first, the end of the process soon after.
+
+    A signal that this process was started to ignore, as by ``nohup``, is ignored further.
+    """
+    for number in _SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _program.ask)
+    wakeups, wakes = os.pipe()
+    os.set_blocking(wakes, False)
+    signal.set_wakeup_fd(wakes, warn_on_full_buffer=False)
+    threading.Thread(target=_program.listen, args=(wakeups,), daemon=True).start()
+    _program.heeds = True
+    _program.restore = _terminal()
+    unraisable = sys.unraisablehook  # where an interrupt meets code that cannot raise, the thread ends the process
+    sys.unraisablehook = lambda told: None if told.exc_type is KeyboardInterrupt else unraisable(told)
+
+
+def wished() -> bool:
+    """Return whether the process is about to end because somebody wished it: errors then say nothing of the command."""
+    return _program.heeds and _program.ending
+
+
+def tell() -> None:
+    """Tell that the command was interrupted, and what is kept."""
+    sentence, _program.sentence, _program.told = _program.sentence, SENTENCE, True
+    if sentence:
+        terminal.note(sentence)
+
+
+def done(code: int) -> int:
+    """Return the exit code of a command that is done: whoever wishes it to end from now on gets this code.
+
+    An interrupted process ends here: taking down torch and the like would need another second.
+    """
+    if code == INTERRUPTED:
+        with contextlib.suppress(OSError, ValueError):  # nobody reads what was printed
+            sys.stdout.flush()
+        _program.end()
+    _program.code = code
+    return code
+
+
+@contextlib.contextmanager
+def saying(sentence: str) -> Iterator[None]:
+    """Have an interrupt in the block told in this sentence, which knows what is kept."""
+    before, _program.sentence = _program.sentence, sentence
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise  # it is told further out
+    except BaseException:
+        _program.sentence = before
+        raise
+    _program.sentence = before
+
+
+@contextlib.contextmanager
+def held() -> Iterator[None]:
+    """Have `KeyboardInterrupt` wait for the end of the block, which is short and must not be left half done."""
+    before, _program.held = _program.ending, True
+    try:
+        yield
+    finally:
+        _program.held = False
+        if _program.ending and not before:
+            raise KeyboardInterrupt
+
+
+class Ended:
+    """Whether somebody asked to end: the first wish ends what runs in its own way and keeps it, the second interrupts.
+
+    ``number`` is the signal that asked, None before.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._asked = threading.Event()
+        self._heard = _Wishes()
+
+    def __enter__(self) -> Ended:
+        self._before: dict[signal.Signals, Any] = {}
+        for number in _SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._ask)
+        _program.own_way = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _program.own_way = False
+        if self.number == signal.SIGHUP:
+            drop_closed_streams()  # those at the other end of a pipe may have ended after this process heard of it
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        """Return whether somebody did."""
+        return self._asked.is_set()
+
+    def wait(self, timeout_s: float | None) -> None:
+        """Wait until somebody does, or for so long."""
+        self._asked.wait(timeout_s)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            drop_closed_streams()
+        if not self._heard.another() or (number == signal.SIGHUP and self._asked.is_set()):
+            return
+        if self._asked.is_set():
+            _program.ending = True
+            raise KeyboardInterrupt
+        self.number = number
+        self._asked.set()
+
+
+def drop_closed_streams() -> None:
+    """Connect standard output and error to /dev/null where their terminal or the other end of their pipe is closed.
+
+    Every write there would raise, and end what is still to be finished.
+    """
+    for handle in (1, 2):
+        with contextlib.suppress(OSError):
+            watched = select.poll()
+            watched.register(handle, select.POLLOUT)
+            if any(state & (select.POLLHUP | select.POLLERR) for _, state in watched.poll(0)):
+                nothing = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nothing, handle)
+                os.close(nothing)
+
+
+def _terminal() -> Callable[[], None]:
+    """Return what makes the terminal as it is now: a process that ends at once cannot show the cursor or echo again."""
+    settings: list[tuple[int, Any]] = []
+    with contextlib.suppress(ImportError, OSError):
+        import termios
+
+        settings = [(0, termios.tcgetattr(0))] if os.isatty(0) else []
+    shown = b"\r\x1b[2K\x1b[?25h" if os.isatty(2) and os.environ.get("TERM", "dumb") != "dumb" else b""
+
+    def restore() -> None:
+        with contextlib.suppress(Exception):
+            for handle, state in settings:
+                if os.tcgetpgrp(handle) == os.getpgrp():  # another one would be stopped for it
+                    termios.tcsetattr(handle, termios.TCSANOW, state)
+            os.write(2, shown)
+
+    return restore

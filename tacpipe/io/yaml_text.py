@@ -1,0 +1,63 @@
+"""YAML from anywhere, read without trust: plain values alone, and no more of them than a person writes.
+
+A few lines of YAML can stand for any amount of data, by aliases of aliases and merged mappings, and brackets within
+brackets end the parser's stack. So the text's events are counted first, each alias as what it stands for.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tacpipe.printable import plain
+
+DEEPEST = 50  # levels of lists and mappings within one another
+MOST = 100_000  # values, with those that aliases stand for
+LONGEST = 10_000_000  # characters
+
+
+def load(content: str | bytes) -> Any:
+    """Return the value of a YAML document. Raises `ValueError`, with a line that says why, for what is none or too much."""
+    import yaml
+
+    if len(content) > LONGEST:
+        raise ValueError(f"it has {len(content)} characters, {LONGEST} are allowed")
+    fast = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        _count(yaml.parse(content, Loader=fast))
+        return yaml.load(content, Loader=fast)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f" in line {mark.line + 1}, column {mark.column + 1}" if mark is not None else ""
+        raise ValueError(f"{plain(str(error.problem or error.context), 200)}{where}") from None
+    except (yaml.YAMLError, AttributeError, TypeError, RecursionError) as error:  # of tags that promise another value
+        raise ValueError(plain(" ".join(str(error).split()), 200)) from None
+
+
+def _count(events: Any) -> None:
+    """Raise `ValueError` where the events of a text stand for too much."""
+    import yaml
+
+    sizes: dict[str, int] = {}  # of what each anchor names, itself included
+    within: list[tuple[str | None, int]] = [(None, 0)]  # anchor and size of each list or mapping that is open
+    total = 0
+    for event in events:
+        size, anchor = 0, None
+        if isinstance(event, yaml.CollectionStartEvent):
+            within.append((event.anchor, 1))
+            if len(within) > DEEPEST:
+                raise ValueError(f"it has more than {DEEPEST} lists and mappings within one another")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, size = within.pop()
+        elif isinstance(event, yaml.ScalarEvent):
+            anchor, size = event.anchor, 1
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor in (name for name, _ in within):
+                raise ValueError(f"the alias {plain(str(event.anchor))} stands within what it names")
+            size = sizes.get(str(event.anchor), 1)
+        if size:
+            within[-1] = within[-1][0], within[-1][1] + size
+            total = max(total, sum(held for _, held in within))
+        if anchor is not None:
+            sizes[anchor] = size
+        if total > MOST:
+            raise ValueError(f"it stands for more than {MOST} values, by aliases or as written")

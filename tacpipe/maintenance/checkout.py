@@ -1,0 +1,176 @@
+"""Datasets that the store still knows, whatever their directories hold now, and bringing one back."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tacpipe import printable
+from tacpipe.datasets import directory as directory_of
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets import replacing
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.engine import execution
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import regular
+from tacpipe.io.hashing import DIGEST, bytes_digest
+from tacpipe.maintenance import pushed, transfer
+from tacpipe.printable import plain
+from tacpipe.store import projects
+from tacpipe.store.roots import PUSHED
+from tacpipe.store.store import MissingError, Store, locate
+
+SHOWN, REPLACED, GONE = "at its path", "replaced", "directory gone"
+IN_STORE, EARLIER = "pushed here", "pushed earlier"
+SHORTEST = 6  # hex digits by which a manifest may be named
+_HEX = re.compile(rf"[0-9a-f]{{{SHORTEST},64}}")
+
+
+@dataclass(frozen=True)
+class Known:
+    """A manifest that the store holds, and the path at which it was last written."""
+
+    manifest: str  # digest of the manifest
+    dataset: str  # digest of the dataset
+    stage: str
+    written_s: int  # seconds of UTC since 1970
+    recordings: int
+    labelled: int  # recordings with labels that were set by hand
+    path: str
+    state: str
+    project: str = ""  # of what was pushed: the name of the project, or digits of its id; then ":" and the path name it
+
+
+def known(store: Store) -> list[Known]:
+    """Return the manifests that roots of the store name or named before, newest first."""
+    found: dict[tuple[str, str], Known] = {}
+    roots = store.roots.all()
+    for root in roots:
+        name_of = pushed.label(root, roots)
+        for entry in [root, *root.get("history", [])]:
+            name, path = entry["manifest"], str(root["path"])
+            try:
+                manifest = manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+            except TacpipeError:
+                continue  # collected, or damaged
+            earlier = EARLIER if root["kind"] == PUSHED else REPLACED
+            state = _state(root, name) if entry is root else earlier
+            found[name, name_of] = Known(
+                name,
+                manifest.digest,
+                manifest.stage,
+                int(entry.get("written_s", 0)),
+                len(manifest.recordings),
+                len(manifest.labels),
+                path,
+                state,
+                name_of.removesuffix(f":{path}") if root["kind"] == PUSHED else "",
+            )
+    return sorted(found.values(), key=lambda one: (-one.written_s, one.path))  # of a path, as its history has them
+
+
+def _state(root: dict[str, Any], name: str) -> str:
+    """Return what became of the manifest that was written last at the path of ``root``."""
+    if root["kind"] == PUSHED:
+        return IN_STORE
+    path = Path(root["path"])
+    if path.is_file():
+        return SHOWN
+    try:
+        there = bytes_digest(regular.content(path / manifest_of.NAME, regular.JSON_BYTES))
+    except (OSError, regular.IrregularError):
+        return GONE
+    return SHOWN if there == name else REPLACED
+
+
+def to_json(listed: list[Known]) -> dict[str, Any]:
+    """Return the list as one object."""
+    return {"schema_version": 1, "manifests": [asdict(one) for one in listed]}
+
+
+def to_text(listed: list[Known]) -> str:
+    """Return one line a manifest; times are those of this computer's zone."""
+    lines = [f"{'manifest':<12}  {'written':<16}  {'stage':<20}  {'recordings':>10}  {'labelled':>8}  path"]
+    for one in listed:
+        written = time.strftime("%Y-%m-%d %H:%M", time.localtime(one.written_s))
+        state = "" if one.state == SHOWN else f"  ({one.state})"
+        lines.append(
+            f"{one.manifest[:12]}  {written}  {plain(one.stage):<20}  {one.recordings:>10}  {one.labelled:>8}  "
+            f"{plain(_place(one), 200)}{state}"
+        )
+    return printable.lines(lines)
+
+
+def _place(one: Known) -> str:
+    """Return the path of a manifest, behind its project where it was pushed."""
+    return f"{one.project}:{one.path}" if one.state in (IN_STORE, EARLIER) else one.path
+
+
+def checkout(name: str, output: Path, *, replace: bool = False, source: Store | None = None) -> Manifest:
+    """Write the dataset ``name`` to ``output``, with its labels; from the store ``source`` if it is given.
+
+    ``name`` is the digest of its manifest or of the dataset, or how it begins, or the path at which it was last written, or
+    the name under which it was pushed. What comes from another store is copied into this one.
+
+    Raises `UsageError` if none or several have it, and if ``output`` holds a dataset that would be replaced without
+    ``replace``; `DamagedError` if something of it is damaged and cannot be computed again.
+    """
+    store = locate()
+    wanted = _named(source or store, name)
+    with store.at_work([wanted]):
+        content = (source or store).read(wanted, regular.JSON_BYTES)
+        manifest = manifest_of.parse(content, wanted, verified=source is None)
+        directory_of.check_output(store, output)
+        if not replace:
+            replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
+        read = execution.reader(store, (str(output.absolute()),), dict(manifest.sizes()))
+        if source is not None:
+            transfer.bring(source, store, manifest_of.Found(output, content), transfer.Transferred())
+        for first in (True, False):
+            try:
+                directory_of.publish(store, manifest, output)
+                return manifest
+            except MissingError:
+                if not first:
+                    raise
+                for path, digest in manifest.objects():
+                    read(digest, path)  # computes what was collected or damaged, where that is possible
+    raise AssertionError
+
+
+def _is_manifest(store: Store, name: str) -> bool:
+    """Return whether ``name`` is the whole digest of a manifest in the store."""
+    if not DIGEST.fullmatch(name) or not store.has(name):
+        return False
+    try:
+        manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+    except TacpipeError:
+        return False
+    return True
+
+
+def _named(store: Store, name: str) -> str:
+    """Return the digest of the manifest that is meant: by its digest, or by the path at which it was last written."""
+    root = store.roots.get(Path(name).absolute())
+    if root is not None:
+        return str(root["manifest"])
+    if not _HEX.fullmatch(name):
+        folder, _ = projects.place(Path.cwd())
+        try:
+            return str(pushed.find(store, name, name, projects.known(locate(), folder))["manifest"])
+        except UsageError as error:
+            raise UsageError(
+                f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which "
+                f"{store.root} has seen a dataset; `tacpipe store list` names both. {error}"
+            ) from None
+    matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
+    if len(matching) > 1:
+        raise UsageError(f"{len(matching)} manifests of {store.root} begin with {name}; give more of its hex digits.")
+    if not matching and _is_manifest(store, name):  # that no root names any more
+        return name
+    if not matching:
+        raise UsageError(f"{store.root} knows no manifest {name}; `tacpipe store list` names those that it knows.")
+    return matching.pop()

@@ -1,0 +1,321 @@
+"""What in a store is still needed, and removing the rest.
+
+No clock decides what is needed: who uses an object announces it before it looks whether the object is there, and a
+collection moves objects aside before it reads the announcements. So either sees the other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets import replacing
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.io import regular
+from tacpipe.io.files import readable_errors
+from tacpipe.io.hashing import DIGEST, bytes_digest
+from tacpipe.maintenance import unnamed
+from tacpipe.store import layout
+from tacpipe.store.records import named
+from tacpipe.store.roots import PUSHED
+from tacpipe.store.store import MissingError, Store
+
+GRACE_DAYS = 14.0  # how long a root counts whose path cannot be reached, and how long quarantine is kept
+_DRAFT_S = 3600.0  # a draft older than this belongs to nobody
+_YOUNG_S = 60.0  # what was just written is left alone, whoever wrote it
+
+
+@dataclass
+class Collected:
+    """What `collect` removed, or would remove."""
+
+    objects: int = 0
+    bytes: int = 0
+    records: int = 0
+    drafts: int = 0
+    checkpoints: int = 0
+    kept_recordings: int = 0  # ingested or acquired ones that nothing names any more
+
+
+@dataclass
+class Live:
+    """What is needed: by roots, by what lies at their paths, by running processes, and by what these descend from."""
+
+    objects: set[str] = field(default_factory=set)  # digests, of manifests too
+    lasting: set[str] = field(default_factory=set)  # digests of what was replaced and cannot be computed again
+    replaced: set[str] = field(default_factory=set)  # digests of the manifests that name it
+    manifests: list[Manifest] = field(default_factory=list)  # of recordings, among all these
+    doubtful: set[Path] = field(default_factory=set)  # files in quarantine that name what may be recordings
+    runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
+
+
+def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> Live:
+    """Return what is needed, with ``lasting`` also what was replaced and cannot be computed again.
+
+    Raises `DamagedError` while a root, or a manifest that something descends from, is damaged: what it named is unknown.
+    """
+    found, wanted, replaced = Live(), [], []
+    for run in store.leases.runs():  # before the roots: a run that ends meanwhile has written its root by then
+        found.runs.add(run.path.stem)
+        found.objects |= run.objects
+        wanted += run.manifests
+    contents: dict[str, bytes] = {}
+    for root in store.roots.all():
+        path = Path(root["path"])
+        here, reached = None, root["kind"] == PUSHED
+        if not reached:
+            here, reached = _content(path)
+        if here is not None:
+            _expect_sound(here, path)
+            contents[bytes_digest(here)] = here
+            wanted.append(bytes_digest(here))
+        expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
+        if here is None and not expired:
+            wanted.append(root["manifest"])
+        if root["kind"] == PUSHED:  # each push is a snapshot, kept until it is forgotten
+            wanted += [one["manifest"] for one in root.get("history", [])]
+        elif lasting:
+            replaced += [one["manifest"] for one in root.get("history", []) if one["lasting"]]
+            replaced += [root["manifest"]] if here is None and expired and _lasting(store, root["manifest"]) else []
+    damaged = store.roots.damaged()
+    if damaged:
+        raise DamagedError(
+            f"{len(damaged)} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
+            f"removed. `tacpipe store repair` finds those beside the store, and the commands that wrote the others write "
+            f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
+        )
+    doubtful = _doubtful(store)
+    found.doubtful = set(doubtful)
+    found.objects |= _closure(store, wanted, contents, found.manifests).union(*doubtful.values())
+    found.lasting = _closure(store, list(replaced), contents, found.manifests) - found.objects
+    found.replaced = set(replaced)
+    return found
+
+
+def _lasting(store: Store, name: str) -> bool:
+    """Return whether a manifest whose directory is gone holds recordings or labels that cannot be computed again."""
+    try:
+        manifest = manifest_of.parse(store.read(name), name, verified=True)
+    except MissingError:
+        return False
+    return replacing.lasting(manifest)
+
+
+def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
+    """Remove what nothing needs, records before the objects they name; with ``dry_run`` only count.
+
+    Only what has the form of a store's own names is looked at, and no symbolic link is followed. Raises `LockedError` if
+    another collection runs, `DamagedError` as `live` does, and `UsageError` for a folder that is not a store.
+    """
+    if not store.check():
+        return Collected()
+    with store.leases.alone("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
+        if not dry_run:
+            _put_back(store)
+        return _collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
+
+
+def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
+    records = list(store.records())  # before what is needed: a damaged one goes to quarantine, and counts there
+    needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
+    collected = Collected()
+    kept = set(needed.lasting)
+    for key, record in records:
+        names = set(named(record["result"]))
+        if names <= needed.objects or names <= kept:
+            continue
+        if record["provenance"].get("irreplaceable") and not recordings:
+            kept |= names - needed.objects
+            continue
+        collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
+    objects = list(layout.entries(store.root, "objects"))
+    kept |= needed.objects
+    named_by = {} if recordings else unnamed.kept((one for one in objects if one.name not in kept), needed.manifests)
+    kept = kept.union(named_by, *named_by.values())
+    collected.kept_recordings = len(kept - needed.objects - needed.replaced - set(named_by))
+    aside = []
+    for path in objects:
+        if path.name in kept or _young(path):
+            continue
+        if dry_run:
+            _count(collected, path)
+        else:
+            with contextlib.suppress(FileNotFoundError):
+                os.rename(path, store.aside(path.name))  # noqa: PTH104
+                aside.append(path.name)
+    if aside:
+        shown = {root["manifest"] for root in store.roots.all()}
+        aside.sort(key=lambda name: name not in shown)  # no manifest is there that names what is gone
+        _remove(store, aside, live(store, grace_days).objects, collected)
+    _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
+    return collected
+
+
+def _remove(store: Store, aside: list[str], needed: set[str], collected: Collected) -> None:
+    """Remove the objects that were moved aside, but for those that somebody needed in the meantime."""
+    for name in aside:
+        if name in needed:
+            store.has(name)  # which puts it back
+            continue
+        path = Path(store.aside(name))
+        _count(collected, path)
+        path.unlink(missing_ok=True)
+
+
+def _put_back(store: Store) -> None:
+    """Put back what a collection that was killed had moved aside."""
+    for path in layout.entries(store.root, "tmp"):
+        if path.name.startswith(layout.ASIDE) and store.has(path.name.removeprefix(layout.ASIDE)):
+            path.unlink(missing_ok=True)
+
+
+def _count(collected: Collected, path: Path) -> None:
+    with contextlib.suppress(FileNotFoundError):  # put back by who needs it, or removed by another collection
+        collected.bytes += path.stat().st_size
+        collected.objects += 1
+
+
+def _young(path: Path) -> bool:
+    """Return whether a file was written just now, by a clock that may have been set since."""
+    with contextlib.suppress(FileNotFoundError):
+        return abs(time.time() - path.stat().st_mtime) < _YOUNG_S
+    return True
+
+
+def _remove_record(path: Path, *, dry_run: bool) -> bool:
+    if _young(path):
+        return False
+    if not dry_run:
+        path.unlink(missing_ok=True)
+    return True
+
+
+def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_recordings: list[Manifest]) -> set[str]:
+    """Return the digests of manifests, of those they descend from, and of all objects that these name.
+
+    Manifests of recordings are added to ``of_recordings``.
+    """
+    objects: set[str] = set()
+    manifests: set[str] = set()
+    while wanted:
+        name = wanted.pop()
+        if name in manifests:
+            continue
+        manifests.add(name)
+        try:
+            manifest = manifest_of.parse(contents.get(name) or store.read(name), name, verified=True)
+        except TacpipeError as error:
+            if store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
+                raise DamagedError(
+                    f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is not "
+                    f"known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to go on without "
+                    f"it, remove it from objects/ and quarantine/."
+                ) from error
+            continue  # it never came here: of a dataset that was copied or pulled without what it descends from
+        objects |= {found for _, found in manifest.objects()}
+        wanted += ancestors(manifest)
+        of_recordings += [manifest] if manifest.recorded else []
+    return objects | manifests
+
+
+def _doubtful(store: Store) -> dict[Path, set[str]]:
+    """Return the digests in damaged records and manifests: nobody knows any more whether they were those of recordings.
+
+    Those that were made again, or brought back, are in doubt no longer.
+    """
+    found = {}
+    for path in layout.entries(store.root, "quarantine"):
+        name, _, kind = path.name.rpartition(".")[0].partition(".")
+        if not DIGEST.fullmatch(name) or (store.record(name) if kind else store.has(name)):
+            continue
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError):  # what is larger was a shard
+            names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
+            if names:
+                found[path] = names
+    return found
+
+
+def ancestors(manifest: manifest_of.Manifest) -> list[str]:
+    """Return the digests of the manifests that this one was made from."""
+    return [given["manifest"] for several in manifest.inputs.values() for given in several]
+
+
+def _content(path: Path) -> tuple[bytes | None, bool]:
+    """Return the manifest that lies at a root's path, None if there is none; and whether the path is there.
+
+    A path of which the system tells no more than that it failed counts as there: an error is no absence.
+    """
+    try:
+        return regular.content(path / manifest_of.NAME, regular.JSON_BYTES), True
+    except (FileNotFoundError, NotADirectoryError):
+        with contextlib.suppress(OSError):
+            return None, path.is_file()  # a report: its manifest lies in the store alone
+    except (OSError, regular.IrregularError):
+        pass
+    return None, True
+
+
+def _expect_sound(content: bytes, path: Path) -> None:
+    try:
+        manifest_of.parse(content, str(path / manifest_of.NAME))
+    except TacpipeError as error:
+        raise DamagedError(
+            f"{error} It is not known what it needs, so nothing was removed; `tacpipe store repair` may bring it back."
+        ) from None
+
+
+def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
+    """Return whether a root's path has been out of reach for the whole grace.
+
+    The first look that does not reach it starts the clock, and one that reaches it stops the clock.
+    """
+    now_s = int(time.time())
+    since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # a clock may have been set back
+    if since_s != root.get("missing_since_s") and not dry_run:
+        kept = {key: value for key, value in root.items() if key != "missing_since_s"}
+        with contextlib.suppress(TacpipeError):
+            store.roots.write(kept if since_s is None else {**kept, "missing_since_s": since_s})
+    if since_s is None:
+        return False
+    return grace_days <= 0 or now_s - since_s > grace_days * 86400
+
+
+def _sweep(
+    store: Store, needed: Live, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
+) -> None:
+    """Remove drafts, leases and checkpoints of runs that are over, and what was long in quarantine.
+
+    What names objects that may be recordings stays there, unless ``doubtful`` asks for it.
+    """
+    now_s = time.time()
+    for path in layout.entries(store.root, "tmp"):
+        if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
+            continue
+        dead = path.name.startswith("run-")  # its run is over; of who told no run an old draft is swept up
+        with contextlib.suppress(FileNotFoundError):
+            old = abs(now_s - path.stat().st_mtime) >= (_YOUNG_S if dead else _DRAFT_S)
+            collected.drafts += old and _drop(path, dry_run=dry_run)
+    for path in layout.entries(store.root, "quarantine"):
+        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400  # since it was moved there
+        if old and (doubtful or path not in needed.doubtful):
+            _drop(path, dry_run=dry_run)
+    if not dry_run:
+        store.leases.sweep()
+    for folder in layout.entries(store.root, "checkpoints"):
+        if store.record(folder.name) is not None:
+            collected.checkpoints += 1
+            if not dry_run:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _drop(path: Path, *, dry_run: bool) -> bool:
+    if not dry_run:
+        path.unlink()
+    return True

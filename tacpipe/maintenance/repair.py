@@ -1,0 +1,254 @@
+"""Looking after a store: what is in it, whether it is sound, and mending it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tacpipe import printable
+from tacpipe.datasets import directory as directory_of
+from tacpipe.datasets import manifest as manifest_of
+from tacpipe.engine import execution
+from tacpipe.errors import TacpipeError
+from tacpipe.io.files import readable_errors, walk, write_whole
+from tacpipe.io.hashing import bytes_digest, file_digest
+from tacpipe.printable import plain
+from tacpipe.store import layout
+from tacpipe.store.roots import PUSHED
+from tacpipe.store.store import AbsentError, MissingError, Store, locate
+
+_SHOWN = 10  # foreign files listed before the rest is counted
+_COUNTED = ("objects", "records", "quarantine", "tmp", "checkpoints")  # folders that the status measures
+
+
+@dataclass
+class Soundness:
+    """What was looked at, what was wrong, and what could be done about it."""
+
+    there: bool = True  # False where there is no store yet
+    objects: int = 0
+    records: int = 0
+    foreign: list[str] = field(
+        default_factory=list
+    )  # paths in the store that are not of its form; they stay as they are
+    damaged: list[str] = field(default_factory=list)  # digests and keys, now in quarantine
+    missing: list[str] = field(default_factory=list)  # objects that a root's manifest names
+    repaired: list[str] = field(default_factory=list)
+    lost: dict[str, str] = field(default_factory=dict)  # digest to why it cannot be made again
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was damaged and nothing is missing."""
+        return not (self.damaged or self.missing or self.lost)
+
+    def to_text(self) -> str:
+        """Return the findings in words."""
+        if not self.there:
+            return "there is no store yet, so there is nothing to read"
+        lines = [f"{self.objects} objects and {self.records} records read"]
+        lines += [f"not part of a store, left as it is: {plain(path, 200)}" for path in self.foreign[:_SHOWN]]
+        if len(self.foreign) > _SHOWN:
+            lines.append(f"not part of a store, left as they are: {len(self.foreign) - _SHOWN} more")
+        lines += [f"damaged, now in quarantine: {name}" for name in self.damaged]
+        lines += [f"missing: {name}" for name in self.missing]
+        lines += [f"made again: {name}" for name in self.repaired]
+        lines += [f"cannot be made again: {name}: {why}" for name, why in self.lost.items()]
+        if self.clean:
+            lines.append("all sound")
+        elif not self.repaired and not self.lost:
+            lines.append("`tacpipe store repair` makes again what it can")
+        return "\n".join(lines)
+
+
+def verify(store: Store) -> Soundness:
+    """Return the soundness of every object and record; damaged ones are moved to quarantine.
+
+    What vanishes between listing and reading was removed by a collection, and is not counted. Raises `UsageError` for a
+    folder that is not a store.
+    """
+    if not store.check():
+        return Soundness(there=False)
+    found = Soundness(foreign=layout.foreign(store.root))
+    for path in layout.entries(store.root, "objects"):
+        found.objects += _read(store.read, path.name, found.damaged)
+    for path in layout.entries(store.root, "records"):
+        found.records += _read(store.read_record, path.stem, found.damaged)
+    store.roots.all()
+    found.damaged += [f"root {name}" for name in store.roots.damaged()]
+    missing = set(_wanted(store)) - set(found.damaged)
+    found.missing = sorted(missing & set(_wanted(store))) if missing else []  # a root may have changed meanwhile
+    return found
+
+
+def _read(read: Callable[[str], object], name: str, damaged: list[str]) -> bool:
+    """Return whether something was there to read; add its name to ``damaged`` where that failed."""
+    try:
+        read(name)
+    except AbsentError:
+        return False
+    except MissingError:
+        damaged.append(name)
+    return True
+
+
+def repair(store: Store) -> Soundness:
+    """Return the soundness after making again, or adopting from dataset directories, what roots name and is not there."""
+    if not store.check():
+        return Soundness(there=False)
+    with store.at_work():
+        found = verify(store)
+        found.repaired += _roots_again(store)
+        roots = store.roots.all()
+        found.repaired += [name for root in roots for name in _manifest_again(store, root)]
+        manifests = [one for one in (_find(root) for root in roots) if one is not None]
+        for one in manifests:
+            if not store.has(one.digest):
+                store.put(one.content)
+                found.repaired.append(one.digest)
+        wanted = _wanted(store)
+        read = execution.reader(store, tuple(root["path"] for root in roots))
+        for name, path in sorted(wanted.items()):
+            try:
+                read(name, path)
+                found.repaired.append(name)
+            except TacpipeError as error:
+                found.lost[name] = str(error)
+        found.missing = []
+    return found
+
+
+def _roots_again(store: Store) -> list[str]:
+    """Write damaged roots anew whose datasets lie beside the store; return their names."""
+    names, found = store.roots.damaged(), []
+    for place, folders, files in walk(store.root.parent, links=False) if names else ():
+        folders[:] = [folder for folder in folders if not folder.startswith(".")]
+        if manifest_of.NAME not in files:
+            continue
+        one = _sound(Path(place))
+        if one is None:
+            continue
+        for name in names:
+            if store.roots.is_of(name, Path(place)):
+                store.roots.set(Path(place), one.digest)
+                found.append(f"root {name}")
+    return found
+
+
+def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
+    """Write the manifest at a root's path anew where it is damaged; return its digest. What lay there goes to quarantine."""
+    path = Path(root["path"]) / manifest_of.NAME
+    if root["kind"] == PUSHED or not path.is_file() or _find(root) is not None:
+        return []
+    try:
+        content = store.read(root["manifest"])
+    except MissingError:
+        return []
+    store.write_file(store.root / "quarantine" / f"{path.name}.{time.time_ns()}", path.read_bytes())
+    with directory_of.changing(store, path.parent), directory_of.writing(path.parent):
+        write_whole(str(path), content, str(path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.draft")))
+    return [root["manifest"]]
+
+
+def link(path: Path) -> int:
+    """Link the shards of the dataset at ``path`` anew where they do not match its manifest; return how many."""
+    found = manifest_of.find(path)
+    manifest, directory = found.manifest, found.directory
+    store = locate(directory)
+    with store.at_work([found.digest]), directory_of.changing(store, directory):
+        sizes = dict(manifest.sizes())
+        read = execution.reader(store, (str(directory.absolute()),), sizes)
+        stale = []
+        for name, digest in manifest.objects():
+            there = directory / name
+            matches = there.is_file() and there.stat().st_size == sizes[digest] and file_digest(there) == digest
+            if not (matches and store.has(digest)):
+                read(digest, name)  # heals the store first
+            if not matches:
+                stale.append((name, digest))
+        directory_of.refuse_links(directory, [name for name, _ in stale])
+        with directory_of.writing(directory):
+            directory_of.sweep(directory)
+            for name, digest in stale:
+                directory_of.place(store, digest, directory / name, copy=manifest.recorded)
+        store.put(found.content)
+        store.roots.set(directory.absolute(), found.digest)
+    return len(stale)
+
+
+def status(store: Store) -> dict[str, Any]:
+    """Return where the store is, counts and bytes of what lies in it, its roots and who is at work."""
+    there = store.check()
+    folders = {name: _measured(store, name) for name in _COUNTED}
+    roots = [{**root, "reachable": _reachable(root)} for root in store.roots.all()]
+    running = [run.note for run in store.leases.runs()]
+    return {"store": str(store.root), "there": there, **folders, "roots": roots, "running": running}
+
+
+def _measured(store: Store, name: str) -> dict[str, int]:
+    """Return how many files lie beneath a folder of the store, and their bytes; what vanishes meanwhile is not counted."""
+    sizes = []
+
+    with readable_errors(store.root):
+        for place, _, files in walk(store.root / name, links=False):
+            for file in files:
+                with contextlib.suppress(FileNotFoundError):
+                    sizes.append(os.lstat(f"{place}/{file}").st_size)
+    return {"files": len(sizes), "bytes": sum(sizes)}
+
+
+def _reachable(root: dict[str, Any]) -> bool:
+    try:
+        return root["kind"] == PUSHED or Path(root["path"]).exists()
+    except OSError:  # as behind a folder that may not be entered
+        return False
+
+
+def status_text(value: dict[str, Any]) -> str:
+    """Return the status in words."""
+    lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
+    lines += [
+        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _COUNTED
+    ]
+    lines += [
+        f"  root  {root['manifest'][:12]}  {root['path']}" + ("" if root["reachable"] else "  (cannot be reached)")
+        for root in value["roots"]
+    ]
+    lines += [f"  at work: process {note.get('pid')} on {note.get('host')}" for note in value["running"]]
+    return printable.lines(lines)
+
+
+def _find(root: dict[str, Any]) -> manifest_of.Found | None:
+    """Return the manifest at a root's path, None if there is no sound one."""
+    return None if root["kind"] == PUSHED else _sound(Path(root["path"]))
+
+
+def _sound(directory: Path) -> manifest_of.Found | None:
+    try:
+        found = manifest_of.find(directory)
+        found.manifest  # noqa: B018  (is it sound?)
+    except TacpipeError:
+        return None
+    return found
+
+
+def _wanted(store: Store) -> dict[str, str]:
+    """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name."""
+    wanted = {}
+    for root in store.roots.all():
+        found = _find(root)
+        try:
+            content = store.read(root["manifest"]) if found is None else found.content
+            name = bytes_digest(content)
+            manifest = manifest_of.parse(content, name, verified=True)
+        except TacpipeError:
+            continue
+        if not store.has(name):
+            wanted[name] = manifest_of.NAME
+        wanted.update({name: path for path, name in manifest.objects() if not store.has(name)})
+    return wanted

@@ -1,0 +1,1 @@
+"""How predictions are evaluated: errors, skill over a baseline, intervals."""

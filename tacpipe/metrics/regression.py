@@ -1,0 +1,152 @@
+"""How far predicted values are from the true ones, how much nearer than a baseline's, and how sure that is.
+
+Values are (grasp, value): one of a pressure, 24 of electrodes. An error is global: over all grasps and values at once.
+Published figures are often means over batches instead, which are never larger and depend on how batches fall
+(`batch_mean_rmse`).
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import forecast
+
+Floats = NDArray[np.floating[Any]]
+
+BATCH = 10  # grasps over which the letter (RA-L 2020) takes each RMSE before it averages them
+_draws = functools.lru_cache(maxsize=8)(forecast.draws)
+
+
+class Interval(NamedTuple):
+    """A skill on all grasps and the 95 % interval of it over resampled clusters."""
+
+    mean: float
+    low: float  # NaN, like ``high``, with fewer than two clusters
+    high: float
+
+
+def squared_sums(true: Floats, predicted: Floats) -> Floats:
+    """Return the sum over values of each grasp's squared error, (grasp, value) to (grasp,).
+
+    Raises `TacpipeError` where the two are not of one such shape.
+    """
+    error = _error(true, predicted)
+    total: Floats = np.einsum("gv,gv->g", error, error)
+    return total
+
+
+def rmse(true: Floats, predicted: Floats) -> float:
+    """Return the root of the mean squared error over all grasps and values; NaN without any.
+
+    >>> rmse(np.array([[0.0], [0.0]]), np.array([[1.0], [7.0]]))
+    5.0
+    """
+    return _root_mean_square(_error(true, predicted))
+
+
+def batch_mean_rmse(true: Floats, predicted: Floats, batch: int = BATCH) -> float:
+    """Return the mean of the RMSE of successive batches of grasps, the last of which may be smaller; NaN without any.
+
+    It is no larger than `rmse` where batches are as large (Jensen), which is why both are told.
+
+    >>> batch_mean_rmse(np.array([[0.0], [0.0]]), np.array([[1.0], [7.0]]), batch=1)
+    4.0
+    """
+    if batch < 1:
+        raise TacpipeError(f"A batch of {batch} grasps holds none; give 1 or more.")
+    error = _error(true, predicted)
+    if not error.size:
+        return float("nan")
+    return float(np.mean([_root_mean_square(error[first : first + batch]) for first in range(0, len(error), batch)]))
+
+
+def mae(true: Floats, predicted: Floats) -> float:
+    """Return the mean absolute error over all grasps and values; NaN without any."""
+    error = _error(true, predicted)
+    return float(np.abs(error).mean()) if error.size else float("nan")
+
+
+def r2(true: Floats, predicted: Floats) -> float:
+    """Return the share of variance that is explained, each value's about its own mean; NaN where nothing varies.
+
+    1 is perfect; 0 is as good as the mean of these very grasps, which nobody knows beforehand: a constant that was fitted
+    elsewhere falls below it.
+    """
+    error, spread = _sums_by_value(true, predicted)
+    return _explained(error.sum(), spread.sum())
+
+
+def r2_by_value(true: Floats, predicted: Floats) -> Floats:
+    """Return `r2` of each value alone, (grasp, value) to (value,)."""
+    return np.array([_explained(*pair) for pair in zip(*_sums_by_value(true, predicted), strict=True)])
+
+
+def rmse_by_value(true: Floats, predicted: Floats) -> Floats:
+    """Return `rmse` of each value alone, (grasp, value) to (value,)."""
+    error = _error(true, predicted)
+    return np.array([_root_mean_square(column) for column in error.T])
+
+
+def skill(rmse: float, baseline: float) -> float:
+    """Return 1 - RMSE / RMSE of a baseline: 1 is perfect, 0 no better than it, below 0 worse. NaN where it never errs.
+
+    >>> skill(0.05, 0.1), skill(0.1, 0.0)
+    (0.5, nan)
+    """
+    return float(forecast.skill(np.asarray(rmse), np.asarray(baseline)))
+
+
+def skill_interval(model: Floats, baseline: Floats, clusters: NDArray[Any]) -> Interval:
+    """Return the skill of a model over a baseline and its 95 % interval, from `squared_sums` of both, each (grasp,).
+
+    ``clusters`` (grasp,) tells which grasps hang together: those of an object where the next object counts, a grasp and
+    what other runs said of it where objects are known. Each resample draws as many clusters as there are, with
+    replacement (cluster bootstrap; Davison and Hinkley, 1997, section 3.8). Raises `TacpipeError` for other shapes.
+    """
+    if not len(model) == len(baseline) == len(clusters):
+        raise TacpipeError(
+            f"There are errors of {len(model)} and {len(baseline)} grasps and clusters of {len(clusters)}; give both errors "
+            f"and the cluster of the same grasps."
+        )
+    if not len(clusters):
+        return Interval(float("nan"), float("nan"), float("nan"))
+    names, codes = np.unique(clusters, return_inverse=True)
+    sums = np.column_stack([np.bincount(codes, one, len(names)) for one in (model, baseline)])  # (cluster, predictor)
+    mean = skill(*np.sqrt(sums.sum(axis=0)))  # the number of values is the same for both, and cancels
+    if len(names) < 2:
+        return Interval(mean, float("nan"), float("nan"))
+    drawn = np.sqrt(_draws(len(names)) @ sums)  # (resample, predictor)
+    low, high = forecast.bounds(forecast.skill(drawn[:, :1], drawn[:, 1:]))
+    return Interval(mean, float(low[0]), float(high[0]))
+
+
+def _error(true: Floats, predicted: Floats) -> Floats:
+    """Return predicted less true as float64."""
+    if np.ndim(true) != 2 or np.shape(true) != np.shape(predicted):
+        raise TacpipeError(
+            f"True values of the shape {np.shape(true)} and predicted ones of {np.shape(predicted)} cannot be compared; "
+            f"both must be (grasp, value)."
+        )
+    return np.asarray(predicted, np.float64) - np.asarray(true, np.float64)
+
+
+def _root_mean_square(error: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(error)))) if error.size else float("nan")
+
+
+def _sums_by_value(true: Floats, predicted: Floats) -> tuple[Floats, Floats]:
+    """Return each value's sum of squared errors and that of its distances from its mean, two of (value,)."""
+    error = _error(true, predicted)
+    if not len(error):
+        return np.zeros(error.shape[1]), np.zeros(error.shape[1])
+    values = np.asarray(true, np.float64)
+    return np.square(error).sum(axis=0), np.square(values - values.mean(axis=0)).sum(axis=0)
+
+
+def _explained(error: float, spread: float) -> float:
+    return float(1 - error / spread) if spread > 0 else float("nan")

@@ -1,0 +1,1 @@
+"""What others extend: stages, their params, and the registry that finds plug-ins."""

@@ -1,0 +1,114 @@
+"""What a param may be beyond its type: stands in ``Annotated``, is checked where params are built and shown in help.
+
+``rate_hz: Annotated[float, Range(above=0)] = 50.0``, or ``rate_hz: PositiveFloat = 50.0``. A choice is a ``Literal``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from tacpipe.plugins import fields
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers between two ends: ``least`` and ``most`` belong to it, ``above`` and ``below`` do not."""
+
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    def allows(self, value: float) -> bool:
+        """Return whether a number lies in the range.
+
+        >>> [Range(0, below=1).allows(number) for number in (-0.1, 0, 0.9, 1)]
+        [False, True, True, False]
+        """
+        return not (
+            (self.least is not None and value < self.least)
+            or (self.most is not None and value > self.most)
+            or (self.above is not None and value <= self.above)
+            or (self.below is not None and value >= self.below)
+        )
+
+    def describe(self, kind: str) -> str:
+        """Return the kind of number with its ends.
+
+        >>> Range(1).describe("a whole number"), Range(0, 1).describe("a number"), Range(above=0).describe("a number")
+        ('a whole number of 1 or more', 'a number from 0 to 1', 'a number above 0')
+        """
+        if self.least is not None and self.most is not None:
+            return f"{kind} from {self.least} to {self.most}"
+        ends = [
+            (self.least, "of {} or more"),
+            (self.above, "above {}"),
+            (self.most, "at most {}"),
+            (self.below, "below {}"),
+        ]
+        return f"{kind} " + " and ".join(text.format(end) for end, text in ends if end is not None)
+
+
+@dataclass(frozen=True)
+class CommaList:
+    """Text that is a list with commas between; each item is read as the annotation ``of`` has it."""
+
+    of: Any = str
+    least: int = 0  # items
+
+    def items(self, text: str) -> list[Any]:
+        """Return the items of a text that is allowed; spaces around them and empty ones do not count.
+
+        >>> CommaList(int).items("1, 5,10")
+        [1, 5, 10]
+        """
+        return [fields.parsed(part.strip(), self.of) for part in text.split(",") if part.strip()]
+
+    def allows(self, value: str) -> bool:
+        """Return whether there are enough items and each is allowed."""
+        found = self.items(value)
+        return len(found) >= self.least and all(fields.fits(item, self.of) for item in found)
+
+    def describe(self, kind: str) -> str:
+        """Return what the list holds."""
+        return "a comma-separated list" + ("" if self.of is str else f", each item {fields.describe(self.of)}")
+
+
+@dataclass(frozen=True)
+class Assignments:
+    """Text that is a list of ``NAME=VALUE``; each value is read as the annotation ``of`` has it."""
+
+    of: Any
+    between: str = ","
+
+    def items(self, text: str) -> Mapping[str, Any]:
+        """Return the values of a text that is allowed, by name.
+
+        >>> Assignments(float).items("biotac=0.025, roboskin=0.05")
+        {'biotac': 0.025, 'roboskin': 0.05}
+        """
+        pairs = [part.partition("=") for part in text.split(self.between) if part.strip()]
+        return {name.strip(): fields.parsed(value.strip(), self.of) for name, _, value in pairs}
+
+    def allows(self, value: str) -> bool:
+        """Return whether all have a name, no two the same one, and each value is allowed."""
+        found = self.items(value)
+        count = sum(bool(part.strip()) for part in value.split(self.between))
+        return len(found) == count and all(name and fields.fits(item, self.of) for name, item in found.items())
+
+    def describe(self, kind: str) -> str:
+        """Return what the list holds."""
+        between = {",": "comma", ";": "semicolon"}[self.between]
+        return f"a {between}-separated list of NAME=VALUE, each value {fields.describe(self.of)}"
+
+
+PositiveInt = Annotated[int, Range(1)]
+NonNegativeInt = Annotated[int, Range(0)]
+PositiveFloat = Annotated[float, Range(above=0)]
+NonNegativeFloat = Annotated[float, Range(0)]
+Fraction = Annotated[float, Range(0, 1)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]  # what numpy, torch and scikit-learn take
+Rate = Annotated[float, Range(above=0, most=1_000_000_000)]  # Hz; stamps are whole nanoseconds
+Names = Annotated[str, CommaList()]

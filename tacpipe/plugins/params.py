@@ -1,0 +1,331 @@
+"""From defaults, ``params.yaml``, presets and options to a stage's params, checked before any data is read.
+
+A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
+same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
+one by default; a field that the chosen class does not have is refused, and is not part of a key. A method ``check`` may
+refuse values that do not go together; stored params are read back without it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import re
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args, get_origin
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import regular, yaml_text
+from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins.fields import filled as filled
+from tacpipe.plugins.stage import Stage
+from tacpipe.printable import excerpt, listed
+
+Kind = type[Any]  # a dataclass of params
+
+
+class _Given(NamedTuple):
+    """A value that was given, and where."""
+
+    where: str
+    key: str
+    value: Any
+    option: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.where if self.option else self.key
+
+    @property
+    def place(self) -> str:
+        return "" if self.option else self.where
+
+
+def build(
+    name: str,
+    stage: Stage,
+    *,
+    file: Path | None = None,
+    block: str | None = None,
+    preset: str | None = None,
+    sets: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+) -> Any:
+    """Return the params of stage ``name``: defaults, then file, preset, ``--set``, options, each over the one before.
+
+    Raises `UsageError` for an unknown name, a value that is not allowed, an option of another kind of params than the
+    chosen one, and values that do not go together.
+    """
+    early = [] if file is None else _from_file(file, block or name, required=block is not None)
+    late = [_from_set(name, text) for text in sets]
+    late += [_Given(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
+    kind = _chosen(stage, early, late, preset)
+    between = [] if preset is None else _from_preset(name, stage, kind, preset)
+    values: dict[str, Any] = {}
+    for given in (*early, *between, *late):
+        if given.key != tag(stage) or _holds(kind, tag(stage), {given.key: given.value}):  # others were overruled
+            values[given.key] = _checked(stage, kind, given, values)
+    try:
+        made = kind(**values)
+    except TypeError as error:
+        raise UsageError(f"The params of {name} are not complete: {error}.") from error
+    if hasattr(made, "check"):
+        made.check()
+    return made
+
+
+def kinds(stage: Stage) -> tuple[Kind, ...]:
+    """Return the dataclasses that a stage's params may be, the default one first."""
+    found = stage.params
+    return get_args(found) if get_origin(found) in (typing.Union, types.UnionType) else (found,)
+
+
+def tag(stage: Stage) -> str | None:
+    """Return the name of the field that chooses among several kinds of params; None where there is one kind."""
+    several = kinds(stage)
+    if len(several) == 1:
+        return None
+    name = dataclasses.fields(several[0])[0].name
+    choices = [get_args(fields_of.hints(kind).get(name)) for kind in several]
+    if not all(choices) or len({choice for some in choices for choice in some}) < sum(map(len, choices)):
+        raise TacpipeError(
+            f"The params of {stage.function.__name__} are of {len(several)} kinds, and their first field, {name}, does "
+            f"not tell them apart: it must be a Literal in each, with choices that no other has."
+        )
+    return name
+
+
+def fields(stage: Stage) -> dict[str, Any]:
+    """Return the annotation of each param of a stage, of whatever kind; choices of several kinds are joined."""
+    return dict(_fields(kinds(stage)))
+
+
+def having(stage: Stage, field: str) -> list[str]:
+    """Return the choices of the tag for which a param counts, empty if it always does."""
+    name, several = tag(stage), kinds(stage)
+    owners = [kind for kind in several if field in fields_of.hints(kind)]
+    if name is None or len(owners) == len(several):
+        return []
+    return [str(choice) for kind in owners for choice in get_args(fields_of.hints(kind)[name])]
+
+
+def defaults(stage: Stage, field: str) -> list[Any]:
+    """Return the defaults that a param has, one in each kind that has another; of the tag that of the default kind."""
+    several = kinds(stage)[:1] if field == tag(stage) else kinds(stage)
+    found = [kind.__dataclass_fields__[field] for kind in several if field in kind.__dataclass_fields__]
+    return list({repr(one.default): one.default for one in found if one.default is not dataclasses.MISSING}.values())
+
+
+def presets(stage: Stage) -> list[str]:
+    """Return the names of a stage's presets."""
+    return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
+
+
+def added(default: Any) -> Any:
+    """Return a field that was added to params later: in keys only where it is not its default.
+
+    So what was computed before keeps its key, where the default gives the same result.
+    """
+    return dataclasses.field(default=default, metadata={"added": True})
+
+
+def to_json(params: Any) -> dict[str, Any]:
+    """Return the params as they stand in keys and manifests; those `added` only where they are not the default."""
+    silent = {
+        field.name
+        for field in dataclasses.fields(params)
+        if field.metadata.get("added") and getattr(params, field.name) == field.default
+    }
+    values = {name: value for name, value in dataclasses.asdict(params).items() if name not in silent}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
+def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
+    """Return the params that `to_json` gave, now or in an older version; values are taken as they are.
+
+    A field that only other kinds have is left out, and so is any that is gone where the stage reads whole datasets.
+    Raises `TacpipeError` where a stage that works recording by recording has no such field: its result would be
+    stored under a name that is not its own.
+    """
+    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), kinds(stage)[0])
+    known = fields_of.hints(kind)
+    gone = sorted(set(values) - set(fields(stage)))
+    if gone and stage.mapped:
+        raise TacpipeError(
+            f"What is stored was made by another version of {stage.function.__name__}, with the param {gone[0]}, which "
+            f"this version does not have. Run the stage again, or use that version."
+        )
+    return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in values.items() if k in known})
+
+
+def counting(stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of stored params that the chosen kind has; older versions stored those of all kinds.
+
+    All of them are returned where the tag names no kind, as of a plug-in that is not installed.
+    """
+    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), None)
+    return {name: value for name, value in values.items() if kind is None or name in fields_of.hints(kind)}
+
+
+def comments(stage: Stage) -> dict[str, str]:
+    """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
+    found: dict[str, list[str]] = {}
+    for kind in kinds(stage):
+        own: dict[str, str] = {}
+        for owner in reversed(kind.__mro__):
+            own |= _comments(owner) if dataclasses.is_dataclass(owner) else {}
+        for name, text in own.items():
+            if text not in found.setdefault(name, []):
+                found[name].append(text)
+    return {name: "; ".join(texts) for name, texts in found.items()}
+
+
+def _comments(kind: Kind) -> dict[str, str]:
+    try:
+        lines = inspect.getsource(kind).splitlines()
+    except (OSError, TypeError):
+        return {}
+    found: dict[str, str] = {}
+    above: list[str] = []
+    for line in lines:
+        if match := re.match(r"\s+#\s*(.*)", line):
+            above.append(match[1])
+        elif match := re.match(r"\s+(\w+)\s*:[^#]*(?:#\s*(.*))?$", line):
+            found[match[1]] = match[2] or " ".join(above)
+            above = []
+        else:
+            above = []
+    return found
+
+
+# ---- kinds of params
+
+
+def _chosen(stage: Stage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
+    """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
+    kind = _named(stage, early)
+    if any(given.key == tag(stage) for given in late):
+        return _named(stage, late)
+    if preset is None or preset in _presets(kind):
+        return kind
+    return next((other for other in kinds(stage) if preset in _presets(other)), kind)
+
+
+def _named(stage: Stage, given: Sequence[_Given]) -> Kind:
+    """Return the kind that the last tag among ``given`` names, or the default one. Raises `UsageError` for none."""
+    name, found = tag(stage), kinds(stage)[0]
+    for one in given:
+        if one.key == name:
+            value = fields_of.check(one.value, fields(stage)[name], one.name, one.place)
+            found = next(kind for kind in kinds(stage) if value in get_args(fields_of.hints(kind)[name]))
+    return found
+
+
+def _holds(kind: Kind, name: str | None, values: Mapping[str, Any]) -> bool:
+    return name is None or values.get(name) in get_args(fields_of.hints(kind)[name])
+
+
+def _checked(stage: Stage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
+    """Return a value as the field of ``kind`` has it."""
+    known, name = fields_of.hints(kind), tag(stage)
+    if given.key not in fields(stage):
+        raise fields_of.unknown(given.key, fields(stage), given.where, "param")
+    subject = given.name if given.option else f"{given.place}: {given.key}"
+    current = before.get(name, kind.__dataclass_fields__[name].default) if name else None
+    if given.key in known:
+        wanted = known[given.key]
+        if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
+            told = f"with {name} {current} it must be {fields_of.describe(wanted)}"
+            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {told}.")
+        return fields_of.check(given.value, wanted, given.name, given.place)
+    owners = having(stage, given.key)
+    raise UsageError(
+        f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "
+        f"Leave it out, or set {name} to {_or(owners)}."
+    )
+
+
+def _or(names: Sequence[str]) -> str:
+    return "".join(names) if len(names) < 2 else f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+@functools.cache
+def _fields(several: tuple[Kind, ...]) -> Mapping[str, Any]:
+    found: dict[str, list[Any]] = {}
+    for kind in several:
+        for name, wanted in fields_of.hints(kind).items():
+            if wanted not in found.setdefault(name, []):
+                found[name].append(wanted)
+    return {name: _joined(wanted) for name, wanted in found.items()}
+
+
+def _joined(several: Sequence[Any]) -> Any:
+    """Return one annotation that allows what any of several does."""
+    if all(get_origin(one) is Literal for one in several):
+        return Literal[tuple(dict.fromkeys(choice for one in several for choice in get_args(one)))]
+    return several[0] if len(several) == 1 else typing.Union[tuple(several)]  # noqa: UP007
+
+
+def _presets(kind: Kind) -> Mapping[str, Mapping[str, Any]]:
+    found: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
+    return found
+
+
+# ---- where values come from
+
+
+def _from_preset(name: str, stage: Stage, kind: Kind, preset: str) -> list[_Given]:
+    there = _presets(kind)
+    if preset not in presets(stage):
+        have = f"it has {', '.join(presets(stage))}" if presets(stage) else "it has none"
+        raise UsageError(f"There is no preset {preset} for {name}; {have}.")
+    if preset not in there:
+        choices = _or(list(map(str, get_args(fields_of.hints(kind).get(tag(stage) or "")))))
+        have = f"it has {', '.join(there)}" if there else "it has none"
+        raise UsageError(f"There is no preset {preset} for the {tag(stage)} {choices} of {name}; {have}.")
+    return [_Given(f"preset {preset} of {name}", key, value) for key, value in there[preset].items()]
+
+
+def _from_set(name: str, text: str) -> _Given:
+    key, _, value = text.partition("=")
+    return _Given(f"--set {text}", key.removeprefix(f"{name}."), _parse(value))
+
+
+def _parse(text: str) -> Any:
+    try:
+        return yaml_text.load(text)
+    except ValueError:
+        return text
+
+
+def _from_file(path: Path, block: str, *, required: bool) -> list[_Given]:
+    where = f"{path}, block {block}"
+    return [_Given(where, key, value) for key, value in _block(path, block, required=required).items()]
+
+
+def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
+    try:
+        found = yaml_text.load(regular.content(path)) or {}
+    except FileNotFoundError:
+        raise UsageError(f"There is no file {path} to read params from.") from None
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except TacpipeError as error:
+        raise UsageError(str(error)) from error
+    except ValueError as error:
+        raise UsageError(f"{path} cannot be read: {error}.") from error
+    for part in block.split("."):
+        if not isinstance(found, dict):
+            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is no mapping.")
+        if part not in found:
+            if required:
+                raise UsageError(f"{path} has no block {block}; at {part} there are {listed(found)}.")
+            return {}
+        found = found[part]
+    if not isinstance(found, dict):
+        raise UsageError(f"{path}: block {block} is {excerpt(found)}; it should be a mapping of params.")
+    return found

@@ -1,0 +1,154 @@
+"""Names of stages, formats, tasks and sensors, found through entry points and loaded when asked for."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib
+import importlib.util
+import sys
+from configparser import ConfigParser
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import memory
+from tacpipe.io.files import listed
+from tacpipe.plugins import extras, failures
+from tacpipe.plugins.stage import Stage
+from tacpipe.printable import plain
+
+STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
+
+
+@functools.cache
+def entry_points() -> dict[str, dict[str, str]]:
+    """Return group, name and target of every entry point of tacpipe's groups.
+
+    Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
+    takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
+    """
+    found: dict[str, dict[str, str]] = {STAGES: {}, FORMATS: {}, TASKS: {}, SENSORS: {}}
+    for folder in dict.fromkeys(sys.path):
+        for file in _entry_point_files(folder):
+            try:
+                text = file.read_text(encoding="utf-8")
+            except (FileNotFoundError, NotADirectoryError, PermissionError):
+                continue
+            if "[tacpipe." not in text:
+                continue
+            parser = ConfigParser(delimiters=("=",), interpolation=None)
+            parser.optionxform = str  # type: ignore[assignment, method-assign]  # names keep their case
+            parser.read_string(text)
+            for group, targets in found.items():
+                if parser.has_section(group):
+                    for name, target in parser.items(group):
+                        targets.setdefault(name, target)
+    return found
+
+
+def _entry_point_files(folder: str) -> list[Path]:
+    """Return where the entry points of what is installed in a folder may be."""
+    pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
+    try:
+        return [found / "entry_points.txt" for found in listed(Path(folder or "."), pattern)]
+    except PermissionError:  # nothing can be imported from there either: Python passes over such a folder too
+        return []
+
+
+@functools.cache
+def stages() -> dict[str, str]:
+    """Return the target of every stage by name; a format ``x`` is the stage ``ingest.x``."""
+    found = entry_points()
+    formats = {f"ingest.{name}": target for name, target in found[FORMATS].items()}
+    return dict(sorted({**found[STAGES], **formats}.items()))
+
+
+def load(name: str) -> Stage:
+    """Return the stage of this name.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = stages().get(name)
+    if target is None:
+        raise UsageError(f"There is no stage {name}; there are {', '.join(stages())}.")
+    found = _import(name, target)
+    if not isinstance(found, Stage):
+        raise TacpipeError(f"{target}, registered as stage {name}, is no stage: decorate it with @stage(version=1).")
+    return found
+
+
+def load_task(name: str) -> Any:
+    """Return the module of the task of this name."""
+    target = entry_points()[TASKS].get(str(name))
+    if target is None:
+        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
+    return _import(name, target)
+
+
+def sensors() -> dict[str, str]:
+    """Return the target of every sensor by name."""
+    return dict(sorted(entry_points()[SENSORS].items()))
+
+
+def load_sensor(name: str) -> Any:
+    """Return the class of the sensor of this name, a `tacpipe.sensors.sensor.Sensor`.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = sensors().get(name)
+    if target is None:
+        raise UsageError(f"There is no sensor {plain(name)}; there are {', '.join(sensors())}.")
+    return _import(name, target)
+
+
+def _import(name: str, target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    try:
+        loaded = importlib.import_module(module)
+    except ImportError as error:
+        if (short := memory.shortage(error)) is not None:
+            raise short from error
+        sentence = f"{name} needs {error.name or target}, which cannot be imported ({error})."
+        raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
+    except TacpipeError:
+        raise
+    except Exception as error:  # a mistake in a plug-in's module
+        raise TacpipeError(f"The module {module} of {name} cannot be loaded. {failures.line(error)}") from error
+    try:
+        return getattr(loaded, attribute) if attribute else loaded
+    except AttributeError as error:
+        raise TacpipeError(f"{module} has no {attribute}, though it is registered as {name}.") from error
+
+
+def package(name: str) -> str | None:
+    """Return the name of the installed package that a stage comes from, if it is known."""
+    return _package(stages().get(name, ""))
+
+
+def _package(target: str) -> str | None:
+    """Return the name of the installed package whose entry point ``target`` is, if it is known."""
+    from importlib.metadata import entry_points as every
+
+    found = (point for group in (STAGES, FORMATS, TASKS, SENSORS) for point in every(group=group))
+    return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
+
+
+def summary(name: str) -> str:
+    """Return the first line of the docstring of a stage's function, or of its module; never imports, never raises."""
+    module, _, attribute = stages()[name].partition(":")
+    try:
+        tree = ast.parse(source(module).read_text(encoding="utf-8"))
+        functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+        text = "." in name and attribute in functions and ast.get_docstring(functions[attribute])
+        return (text or ast.get_docstring(tree) or "").split("\n")[0]
+    except (OSError, SyntaxError, ValueError, ImportError):
+        return "(its module cannot be read)"
+
+
+def source(module: str) -> Path:
+    """Return the file of a module that is not imported yet."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise ImportError(module)
+    return Path(spec.origin)

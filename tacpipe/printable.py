@@ -1,0 +1,74 @@
+"""Text from anywhere in a form that is safe to print: short, on one line, without control characters."""
+
+from __future__ import annotations
+
+import reprlib
+import unicodedata
+from collections.abc import Iterable
+from typing import Any
+
+_WIDE = ("W", "F")  # of East Asian letters, which take two cells
+_SHORT = reprlib.Repr()  # looks no deeper and no further than it tells, so that aliases of aliases cost nothing
+_SHORT.maxlevel = 2
+_SHORT.maxstring = _SHORT.maxother = 60
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxset = 4
+
+
+def excerpt(value: Any) -> str:
+    """Return the repr of a value, cut to a line's length.
+
+    >>> excerpt("x" * 1000), excerpt([[[1]], 2, 3, 4, 5])
+    ("'xxxxxxxxxxxxxxxxxxxxxxxxxxx...xxxxxxxxxxxxxxxxxxxxxxxxxxxx'", '[[[...]], 2, 3, 4, ...]')
+    """
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python tells no number of more than 4300 digits
+        return "a number of thousands of digits"
+
+
+def plain(text: str, most: int = 60) -> str:
+    r"""Return text as it is where it is short and printable, else its `excerpt`.
+
+    >>> plain("xela1"), plain("a\x1b[2J")
+    ('xela1', "'a\\x1b[2J'")
+    """
+    return text if len(text) <= most and text.isprintable() else excerpt(text)
+
+
+def listed(names: Iterable[object], most: int = 8) -> str:
+    """Return names with commas between, the first of many.
+
+    >>> listed(["a", "b", "c"], most=2), listed([])
+    ('a, b and 1 more', 'none')
+    """
+    every = [plain(str(name)) for name in names]
+    more = f" and {len(every) - most} more" if len(every) > most else ""
+    return (", ".join(every[:most]) or "none") + more
+
+
+def shown(text: str) -> str:
+    r"""Return text with each character that a terminal does not print as an escape: controls, line ends, bidi marks.
+
+    >>> shown("trial-木"), shown("a\x1b[2J\n"), shown("\u202etxt")
+    ('trial-木', 'a\\x1b[2J\\n', '\\u202etxt')
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else ascii(c)[1:-1] for c in text)
+
+
+def lines(texts: Iterable[str]) -> str:
+    """Return texts as lines, each `shown`: what a text holds adds no line."""
+    return "\n".join(shown(text) for text in texts)
+
+
+def padded(text: str, width: int) -> str:
+    """Return ``text`` with spaces behind it, to so many cells of a terminal.
+
+    >>> padded("木", 4), padded("cup", 4)
+    ('木  ', 'cup ')
+    """
+    cells = sum(
+        2 if unicodedata.east_asian_width(c) in _WIDE else not unicodedata.category(c).startswith("M") for c in text
+    )
+    return text + " " * (width - cells)

@@ -1,0 +1,166 @@
+"""The layout of a store: its folders, the form of every name in them, and whether a folder is a store at all.
+
+What has another form was put there by somebody else: it is never moved, never removed, and `tacpipe store verify` names it.
+No symbolic link within a store is followed. ``.tacpipe`` itself may be one, to another disk.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import regular
+from tacpipe.io.files import readable_errors
+from tacpipe.printable import listed, plain
+
+FORMAT = "1"
+MARK = "format"  # the file that makes a folder a store
+FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
+SPOOL = "spool"  # made by the first recording
+KEPT = "kept-spools"  # made by the first recording whose raw bytes are kept
+PROJECTS = "projects"  # made by the first push
+ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
+SHELF = re.compile(r"[0-9a-f]{2}")  # folders within objects/ and records/: how the names in them begin
+_DIGEST = r"[0-9a-f]{64}"
+_RANDOM = r"[0-9a-f]{32}"
+_FORMS = {  # of the path within each folder
+    "objects": re.compile(r"(?P<shelf>[0-9a-f]{2})/(?P=shelf)[0-9a-f]{62}"),
+    "records": re.compile(r"(?P<shelf>[0-9a-f]{2})/(?P=shelf)[0-9a-f]{62}\.json"),
+    "roots": re.compile(rf"{_DIGEST}\.json"),
+    "leases": re.compile(rf"(run-{_RANDOM}|{_DIGEST}|gc)\.lock"),
+    "checkpoints": re.compile(_DIGEST),
+    "quarantine": re.compile(rf"({_DIGEST}(\.json)?|root-{_DIGEST}\.json|manifest\.json)\.[0-9]+"),
+    "tmp": re.compile(rf"((run-{_RANDOM})?\.)?{_RANDOM}|{ASIDE}{_DIGEST}"),
+    SPOOL: re.compile(_RANDOM),
+    KEPT: re.compile(_RANDOM),
+    PROJECTS: re.compile(rf"{_DIGEST}\.json"),
+}
+_SHELVED = ("objects", "records")
+_HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # their entries are folders, those of others files
+_BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may hold something before there is a mark
+_BESIDE = frozenset({".gitignore", ".gitkeep", "lost+found"})  # no reason to refuse a folder that is to become a store
+
+
+def check(root: Path) -> bool:
+    """Return whether there is a store at ``root``; False where there is nothing yet, and a store may be begun.
+
+    Raises `UsageError` for a folder that holds something else, for a store of another format, and for one whose folders are
+    symbolic links. Nothing is changed.
+    """
+    with readable_errors(root):
+        found = _mark(root)
+        if found is None and not _may_begin(root):
+            found = _mark(root)  # another process may have begun the store between the two looks
+            if found is None:
+                raise UsageError(_not_a_store(root))
+        if found not in (None, FORMAT):
+            raise UsageError(
+                f"The store {root} has format {plain(found) or 'unknown'}; this tacpipe reads format {FORMAT}. Install "
+                f"the tacpipe that wrote it, or name another store in TACPIPE_STORE."
+            )
+        for name in _FORMS:
+            if os.path.islink(root / name):  # noqa: PTH114
+                raise UsageError(
+                    f"{root / name} is a symbolic link, and none is followed within a store. To keep a store on another "
+                    f"disk, move the whole of {root} there and make that a link, or name it in TACPIPE_STORE."
+                )
+    return found is not None
+
+
+def entries(root: Path, name: str) -> Iterator[Path]:
+    """Yield what lies in a folder of the store and has the form of its names, sorted.
+
+    What vanishes meanwhile is left out. Raises `StorageError` for a folder that cannot be listed.
+    """
+    return (path for path, ours in _found(root, name) if ours)
+
+
+def foreign(root: Path) -> list[str]:
+    """Return the paths within the store of all that is not of its form, sorted; symbolic links are among it."""
+    found = [path for name in _FORMS for path, ours in _found(root, name) if not ours]
+    known = {MARK, *_FORMS, *_BESIDE}
+    found += [Path(entry.path) for entry in _scan(root, root) if entry.name not in known]
+    return sorted(str(path.relative_to(root)) for path in found)
+
+
+def is_linked(root: str, path: str | Path) -> bool:
+    """Return whether a file of the store lies in a folder that is a symbolic link; the store itself may be one."""
+    folder = os.path.dirname(path)  # noqa: PTH120
+    return folder != root and os.path.islink(folder)  # noqa: PTH114
+
+
+def _found(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
+    """Yield what lies in a folder of the store, and whether it is of the store's form; shelves are gone into."""
+    folder = root / name
+    if folder.is_symlink():
+        yield folder, False
+        return
+    for entry in _scan(root, folder):
+        path = Path(entry.path)
+        if name not in _SHELVED:
+            is_kind = entry.is_dir if name in _HOLD_FOLDERS else entry.is_file
+            yield path, is_kind(follow_symlinks=False) and _FORMS[name].fullmatch(entry.name) is not None
+        elif SHELF.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+            for inner in _scan(root, path):
+                form = _FORMS[name].fullmatch(f"{entry.name}/{inner.name}")
+                yield Path(inner.path), inner.is_file(follow_symlinks=False) and form is not None
+        else:
+            yield path, False
+
+
+def _scan(root: Path, folder: Path) -> list[os.DirEntry[str]]:
+    with readable_errors(root):
+        try:
+            with os.scandir(folder) as found:
+                return sorted(found, key=lambda entry: entry.name)
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+
+
+def _mark(root: Path) -> str | None:
+    """Return the format that a store names, None where there is no mark. Raises `UsageError` for what cannot be a store."""
+    try:
+        with regular.opened(root / MARK) as file:
+            return file.read(64).strip().decode(errors="replace")
+    except FileNotFoundError:
+        if root.is_symlink() and not root.exists():
+            target = os.readlink(root)  # noqa: PTH115
+            raise UsageError(
+                f"The store {root} is a symbolic link to {target}, which is not there. Mount its disk, or remove the link."
+            ) from None
+        return None
+    except NotADirectoryError:
+        raise UsageError(f"{root} is not a folder, so it is not a store. Name another one in TACPIPE_STORE.") from None
+    except TacpipeError as error:
+        raise UsageError(f"{_not_a_store(root)} ({error})") from None
+
+
+def _may_begin(root: Path) -> bool:
+    """Return whether a folder without a mark is empty, but for what a process leaves there that begins a store."""
+    for entry in _scan(root, root):
+        if entry.name in _BESIDE:
+            continue
+        if entry.name not in _FORMS or not entry.is_dir(follow_symlinks=False):
+            return False
+        if any(not (ours and entry.name in _BEGUN) for _, ours in _everything(root, entry.name)):
+            return False
+    return True
+
+
+def _everything(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
+    """Do as `_found`; empty shelves count as something too."""
+    if name in _SHELVED:
+        return ((Path(entry.path), False) for entry in _scan(root, root / name))
+    return _found(root, name)
+
+
+def _not_a_store(root: Path) -> str:
+    names = [entry.name for entry in _scan(root, root)]
+    return (
+        f"{root} is not a store of tacpipe: it has no file {MARK} and is not empty ({listed(names, 4)}). Nothing in it was "
+        f"changed. Name a store, or a new folder, in TACPIPE_STORE; a store that lost this file is one again after "
+        f"`echo {FORMAT} > {root / MARK}`."
+    )

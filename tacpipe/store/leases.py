@@ -1,0 +1,302 @@
+"""Leases: who works on which key, and which runs are at work. Advisory; the kernel frees those of a process that dies."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import platform
+import shlex
+import sys
+import time
+import uuid
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import LockedError, TacpipeError
+from tacpipe.io import progress, regular
+from tacpipe.io.files import read_json, readable_errors, write_all
+from tacpipe.store import layout
+
+LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
+TELL_AFTER_S = 2.0  # a shorter wait is no news
+LEASE_BYTES = 1 << 30  # the largest lease that is read: it names 16 million objects
+_POLL_S = 0.02
+_UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts where the file system has no locks
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+
+
+@dataclass
+class Run:
+    """A process at work on a store, as it told in its lease."""
+
+    path: Path
+    note: dict[str, Any]
+    objects: set[str] = field(default_factory=set)  # digests of what it reads, puts and reuses
+
+    @property
+    def manifests(self) -> list[str]:
+        """The digests of the manifests that it reads."""
+        return list(self.note.get("manifests", ()))
+
+
+class Leases:
+    """The leases in one folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @contextlib.contextmanager
+    def hold(self, key: str, what: str = "", timeout_s: float | None = None) -> Iterator[None]:
+        """Hold the key alone while in the block, so that two processes do not make ``what`` both.
+
+        The kernel frees the lease of a process that dies. Who is waited for is told on stderr. Raises `LockedError` after
+        ``timeout_s``.
+        """
+        path = self.folder / f"{key}.lock"
+        handle = _try_lock(path)
+        if handle is None:
+            handle = _wait(path, what or f"key {key[:12]}", _timeout_s() if timeout_s is None else timeout_s)
+        try:
+            with contextlib.suppress(OSError):  # who waits likes to know for whom; no more rests on it
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, _note(what=what), 0)
+            yield
+        finally:
+            _release(path, handle)
+
+    @contextlib.contextmanager
+    def running(self, manifests: Iterable[str] = ()) -> Iterator[Announcing]:
+        """Tell ``gc`` while in the block that a run reads these manifests; yield what it announces objects with."""
+        path = self.folder / f"run-{uuid.uuid4().hex}.lock"
+        handle = None
+        while handle is None:  # gc may look at the file between its creation and the lock
+            handle = _try_lock(path)
+        try:
+            with readable_errors(self.folder):
+                write_all(handle, _note(manifests=sorted(manifests)) + b"\n")
+            announcing = Announcing(path)
+            yield announcing
+            announcing.close()
+        finally:
+            _release(path, handle)
+
+    def runs(self) -> list[Run]:
+        """Return the running processes with what they announced so far; forget dead ones.
+
+        A run that began and told nothing yet has made no use of anything yet.
+        """
+        found = []
+        for path in self._files():
+            if not path.name.startswith("run-"):
+                continue
+            try:
+                handle = _try_lock(path, create=False)
+                if handle is None:
+                    found.append(_told(path))
+                    continue
+                if not _has_locks(handle) and _seems_alive(path):
+                    found.append(_told(path))
+                else:
+                    path.unlink(missing_ok=True)
+                os.close(handle)
+            except FileNotFoundError:
+                continue
+        return found
+
+    def sweep(self) -> None:
+        """Remove the files that killed processes left; their locks went with them."""
+        for path in self._files():
+            with contextlib.suppress(FileNotFoundError, TacpipeError):
+                handle = _try_lock(path, create=False)
+                if handle is not None:
+                    if _has_locks(handle):  # else nobody knows whose it is
+                        path.unlink()
+                    os.close(handle)
+
+    def _files(self) -> Iterator[Path]:
+        return layout.entries(self.folder.parent, self.folder.name)
+
+    @contextlib.contextmanager
+    def alone(self, what: str) -> Iterator[None]:
+        """Do ``what`` in the block while nobody else does. Raises `LockedError` at once if somebody does."""
+        path = self.folder / f"{what}.lock"
+        handle = _try_lock(path)
+        if handle is None:
+            raise LockedError(f"{_holder(path)} is at work on `tacpipe store {what}` already. Wait for it.")
+        try:
+            with contextlib.suppress(OSError):
+                os.pwrite(handle, _note(what=what), 0)
+            yield
+        finally:
+            _release(path, handle)
+
+
+class Announcing:
+    """Where the processes of one run tell which objects they use, before they look whether these are there.
+
+    Whoever collects garbage moves objects away first and reads the announcements then: so of the two one sees the other.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = str(path)
+        self._handle = -1
+        self._told: set[str] = set()
+
+    def announce(self, names: Iterable[str]) -> None:
+        """Tell that objects are used. Raises `TacpipeError` if the process that began the run is gone."""
+        new = [name for name in names if name not in self._told]
+        if not new:
+            return
+        with readable_errors(Path(self.path).parent):
+            if self._handle < 0:
+                try:
+                    self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
+                except FileNotFoundError:
+                    raise TacpipeError("The process that began this run is gone; nothing more is written.") from None
+            write_all(self._handle, "".join(f"{name}\n" for name in new).encode())
+        self._told.update(new)
+
+    def close(self) -> None:
+        """Announce nothing more."""
+        if self._handle >= 0:
+            with contextlib.suppress(OSError):  # what was announced is needed no more
+                os.close(self._handle)
+            self._handle = -1
+
+
+def _release(path: Path, handle: int) -> None:
+    with contextlib.suppress(OSError):  # the kernel frees the lock in any case
+        path.unlink()
+    with contextlib.suppress(OSError):
+        os.close(handle)
+
+
+def _told(path: Path) -> Run:
+    first, _, rest = regular.content(path, LEASE_BYTES, follow=False).decode("latin-1").partition("\n")
+    try:
+        note = json.loads(first)
+    except ValueError:
+        note = {}  # it is being written
+    return Run(path, note if isinstance(note, dict) else {}, set(rest.split()))
+
+
+def _note(**more: Any) -> bytes:
+    """Return what a lease says of who holds it."""
+    command = shlex.join(["tacpipe", *sys.argv[1:]])
+    value = {"host": platform.node(), "pid": os.getpid(), "command": command[:500], "since_s": int(time.time()), **more}
+    return json.dumps(value).encode()
+
+
+def _timeout_s() -> float:
+    text = os.environ.get("TACPIPE_LOCK_TIMEOUT_S", "")
+    try:
+        return float(text) if text else LOCK_TIMEOUT_S
+    except ValueError:
+        raise TacpipeError(f"TACPIPE_LOCK_TIMEOUT_S is {text!r}; it should be a number of seconds.") from None
+
+
+def _wait(path: Path, what: str, timeout_s: float) -> int:
+    """Return the handle once the lock is free; tell on stderr who is waited for."""
+    began_s = time.monotonic()
+    told = False
+    while True:
+        waited_s = time.monotonic() - began_s
+        if waited_s >= timeout_s:
+            raise LockedError(
+                f"{_holder(path)} has held {what} for over {timeout_s:g} s. Wait for it or stop it; "
+                f"TACPIPE_LOCK_TIMEOUT_S sets how long to wait."
+            )
+        if not told and waited_s >= TELL_AFTER_S:
+            told = True
+            progress.say(f"waiting for {_holder(path, 'another process')}, which is at work on {what}.")
+        time.sleep(_POLL_S)
+        handle = _try_lock(path)
+        if handle is not None:
+            return handle
+
+
+def _holder(path: Path, unknown: str = "Another process") -> str:
+    """Return in words who holds a lease, and whether it is stopped."""
+    note = read_json(path)
+    if not note or "pid" not in note:
+        return unknown
+    stopped = ", which is stopped: `kill -CONT` lets it go on," if _stopped(note) else ""
+    prefix = "process" if unknown[0].islower() else "Process"
+    return f"{prefix} {note['pid']} on {note.get('host')} ({note.get('command')}){stopped}"
+
+
+def _stopped(note: dict[str, Any]) -> bool:
+    if note.get("host") != platform.node():
+        return False
+    try:
+        return Path(f"/proc/{note['pid']}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):  # no such process, or no such system
+        return False
+
+
+def _seems_alive(path: Path) -> bool:
+    """Return whether a run may be at work on a file system that knows no locks."""
+    note = _told(path).note
+    if note.get("host") == platform.node() and "pid" in note:
+        try:
+            os.kill(note["pid"], 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:  # of another user
+            return True
+        return True
+    return time.time() - path.stat().st_mtime < _UNKNOWN_S
+
+
+def _has_locks(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _try_lock(path: Path, *, create: bool = True) -> int | None:
+    """Return an open handle that holds the lock, or None if somebody else does.
+
+    Where the file system knows no locks everybody holds it: a lease saves double work, and no result rests on it.
+    """
+    with readable_errors(path.parent):
+        handle = _open(path, create=create)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(handle).st_ino == os.stat(path).st_ino:  # noqa: PTH116  (else it was unlinked meanwhile)
+            return handle
+    except (BlockingIOError, FileNotFoundError):
+        pass
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return handle
+        os.close(handle)
+        with readable_errors(path.parent):
+            raise
+    os.close(handle)
+    return None
+
+
+def _open(path: Path, *, create: bool) -> int:
+    flags = os.O_NOFOLLOW | (os.O_CREAT if create else 0)
+    try:
+        return os.open(path, os.O_RDWR | flags, 0o666)
+    except FileNotFoundError:
+        if not create:
+            raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return os.open(path, os.O_RDWR | flags, 0o666)
+    except PermissionError as error:
+        try:
+            return os.open(
+                path, os.O_RDONLY | os.O_NOFOLLOW
+            )  # another user's, who shares the store: it can be waited for
+        except FileNotFoundError:
+            raise error from None

@@ -1,0 +1,118 @@
+"""The identity of a project, under which other stores keep what it pushes: made once, and kept in the project's store."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import uuid
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from tacpipe.errors import DamagedError, StorageError
+from tacpipe.io import regular
+from tacpipe.io.files import may_not_write, readable_errors
+from tacpipe.io.hashing import digest
+from tacpipe.store.store import Store, marked
+
+FOLDER = "projects"  # within the store
+_FILE_BYTES = 1 << 16  # the largest identity that is read
+_NAME_LETTERS = 60
+
+
+@dataclass(frozen=True)
+class Project:
+    """What tells a project from all others, and what people call it: its folder's name."""
+
+    id: str  # hex digits
+    name: str
+
+
+def place(directory: Path) -> tuple[Path, str]:
+    """Return the folder of the project that a dataset belongs to, and the dataset's name: its path within that folder.
+
+    Where nothing marks a project, the folder is the working directory, and that above a dataset outside of it. A dataset in
+    the folder itself has the folder's name.
+    """
+    here = Path(os.path.abspath(directory))  # noqa: PTH100  (a name holds no ".." and follows no link)
+    folder = marked(here if here.exists() else Path.cwd())
+    if folder is None:
+        folder = Path.cwd() if Path.cwd() in here.parents else here.parent
+    return folder, str(here.relative_to(folder)) if folder in here.parents else here.name or "dataset"
+
+
+def known(store: Store, folder: Path) -> Project | None:
+    """Return the identity of the project in ``folder``, None where it has pushed nothing yet.
+
+    Raises `DamagedError` for one that is damaged: under a new one it would be another project.
+    """
+    file = _file(store, folder)
+    try:
+        with readable_errors(store.root):
+            value = regular.json_value(file, _FILE_BYTES)
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError, regular.IrregularError):
+        value = None
+    sound = isinstance(value, dict) and value.pop("check", None) == digest(value)
+    if not (sound and all(isinstance(value.get(key), str) for key in ("id", "name"))):
+        raise DamagedError(
+            f"{file}, the identity of the project {folder}, is damaged. Restore it, or remove it and name with "
+            f"`tacpipe store push --project NAME` the project that this one is in the other store."
+        )
+    return Project(value["id"], value["name"])
+
+
+def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
+    """Return the identity of the project in ``folder``, made now if it has none.
+
+    In a store that is not ``writable`` it is derived from the computer and the paths.
+    """
+    found = known(store, folder)
+    if found is not None:
+        return found
+    try:
+        store.prepare()
+        _write(store, folder, Project(new_id(), _name(folder)), exclusive=True)
+    except StorageError as error:
+        if writable or not may_not_write(error):
+            raise
+        derived = digest([platform.node(), str(store.root.absolute()), str(folder)])[:32]
+        return Project(derived, _name(folder))
+    made = known(store, folder)  # the first to write it wins
+    assert made is not None
+    return made
+
+
+def new_id() -> str:
+    """Return an id that no other project has."""
+    return uuid.uuid4().hex
+
+
+def join(store: Store, folder: Path, project: Project) -> None:
+    """Make ``project`` the identity of the project in ``folder``, as on a second computer."""
+    store.prepare()
+    _write(store, folder, project, exclusive=False)
+
+
+def _write(store: Store, folder: Path, project: Project, *, exclusive: bool) -> None:
+    kind, name = store.roots.named(folder)
+    value = {"kind": kind, "folder": name, **asdict(project)}
+    file = _file(store, folder)
+    text = json.dumps({**value, "check": digest(value)}, sort_keys=True)
+    store.write_file(file, text.encode(), exclusive=exclusive)
+    store.sync(file)
+
+
+def _file(store: Store, folder: Path) -> Path:
+    return store.root / FOLDER / f"{digest(['project', *store.roots.named(folder)])}.json"
+
+
+def _name(folder: Path) -> str:
+    """Return a folder's name as one that people can type and that a terminal shows.
+
+    >>> _name(Path("/lab/slip detection")), _name(Path("/lab/a:b")), _name(Path("/"))
+    ('slip detection', 'a-b', 'project')
+    """
+    shown = "".join("-" if letter == ":" or not letter.isprintable() else letter for letter in folder.name)
+    return shown[:_NAME_LETTERS] or "project"

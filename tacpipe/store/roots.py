@@ -1,0 +1,175 @@
+"""Roots: which paths hold which manifest. What they name is needed, and so is all that it descends from."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.io import regular
+from tacpipe.io.files import readable_errors
+from tacpipe.io.hashing import DIGEST, digest
+
+if TYPE_CHECKING:
+    from tacpipe.store.store import Store
+
+BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
+BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
+# {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach. "pushed" are
+# manifests of this path that went to other stores, newest first; of what was pushed here, "project" says whose it is
+Root = dict[str, Any]
+ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
+HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
+PUSHES = 100  # manifests of a path that are remembered as pushed
+_LATEST_S = 1 << 40  # a time in a root is no later: the year 36,812
+
+
+class Roots:
+    """The roots of a store."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+
+    def set(self, path: Path, manifest: str, *, durable: bool = False, lasting: bool = False) -> None:
+        """Note that ``path`` now holds ``manifest``; the one before goes into the history of the path.
+
+        That one is ``lasting`` where it held recordings or labels that are not in the new one: `gc` then keeps it.
+        """
+        kind, name = self.named(path)
+        known = self.get(path)
+        if known is None or known["manifest"] != manifest:
+            pushed = {"pushed": known["pushed"]} if known and "pushed" in known else {}
+            self.write({"path": name, "kind": kind, **_succeeding(known, manifest, lasting=lasting), **pushed})
+        if durable:
+            self.store.sync(self._file(kind, name))
+
+    def get(self, path: Path) -> Root | None:
+        """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
+        return self.at(self._file(*self.named(path)))
+
+    def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> None:
+        """Note that a project (``id`` and ``name``) pushed ``manifest`` as its dataset ``name``, after ``before``.
+
+        What was pushed before it stays in the history, for ever where that is ``lasting``.
+        """
+        root = {"path": name, "kind": PUSHED, "project": dict(project)}
+        if before is None or before["manifest"] != manifest or before.get("project") != project:
+            self.write({**root, **_succeeding(before, manifest, lasting=lasting)})
+        self.store.sync(self._file(PUSHED, name, project["id"]))
+
+    def pushed(self, name: str, project: str = "") -> Root | None:
+        """Return what the project of this id pushed as ``name``, or None; without an id, what was pushed before projects."""
+        return self.at(self._file(PUSHED, name, project))
+
+    def note_pushed(self, path: Path, manifest: str) -> None:
+        """Note that ``manifest`` of ``path`` went to another store; a path without a root has nothing to note it in."""
+        root = self.get(path)
+        if root is not None:
+            earlier = [one for one in root.get("pushed", []) if one != manifest]
+            self.write({**root, "pushed": [manifest, *earlier][:PUSHES]})
+
+    def all(self) -> list[Root]:
+        """Return all roots. Damaged ones are quarantined: the next run of their stage writes them anew."""
+        found = (self.at(path) for path in self.store.listed("roots", "*.json"))
+        return [root for root in found if root is not None]
+
+    def remove(self, root: Root) -> None:
+        """Remove a root, as `all` gave it, whatever its file is called."""
+        for file in self.store.listed("roots", "*.json"):
+            if self.at(file) == root:
+                with readable_errors(self.store.root):
+                    file.unlink(missing_ok=True)
+
+    def write(self, root: Mapping[str, Any]) -> None:
+        """Replace a root, as `all` gave it or with more to say."""
+        kind, name = root["kind"], str(root["path"])
+        if kind == BESIDE and Path(name).is_absolute():
+            name = os.path.relpath(name, self.store.root.parent)
+        content = {key: value for key, value in root.items() if key != "check"} | {"path": name, "kind": kind}
+        text = json.dumps({**content, "check": digest(content)}, sort_keys=True)
+        self.store.write_file(self._file(kind, name, project_id(root)), text.encode())
+
+    def at(self, file: Path) -> Root | None:
+        """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
+        try:
+            with readable_errors(self.store.root):
+                value = regular.json_value(file, ROOT_BYTES)
+        except FileNotFoundError:
+            return None
+        except (ValueError, RecursionError, regular.IrregularError):
+            value = None
+        root: Root = value if isinstance(value, dict) else {}
+        check = root.pop("check", None)
+        if check is None and "kind" not in root and isinstance(root.get("path"), str):  # as they were once written
+            root["kind"] = ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED
+            return root if _formed(root) else None
+        if check is None or check != digest(root) or not _formed(root):
+            if DIGEST.fullmatch(file.stem):  # another name is not one of ours
+                self.store.quarantine(file)
+            return None
+        beside = root["kind"] == BESIDE
+        return {**root, "path": str(self.store.root.parent / root["path"])} if beside else root
+
+    def damaged(self) -> list[str]:
+        """Return the names of roots that were damaged and not written anew: nobody knows which datasets they stood for."""
+        names = {path.name[len("root-") :].partition(".")[0] for path in self.store.listed("quarantine", "root-*")}
+        return sorted(name for name in names if not (self.store.root / "roots" / f"{name}.json").exists())
+
+    def is_of(self, name: str, path: Path) -> bool:
+        """Return whether the root of this name stands for the dataset at ``path``."""
+        return self._file(*self.named(path)).stem == name
+
+    def named(self, path: Path) -> tuple[str, str]:
+        """Return kind and name of a root: relative where the dataset lies beside its store, so that both can move."""
+        beside = self.store.root.parent
+        if self.store.root.name == BESIDE_NAME and path.is_relative_to(beside):
+            return BESIDE, str(path.relative_to(beside))
+        return ABSOLUTE, str(path)
+
+    def _file(self, kind: str, name: str, project: str = "") -> Path:
+        named: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
+        return self.store.root / "roots" / f"{digest(named)}.json"
+
+
+def project_id(root: Mapping[str, Any]) -> str:
+    """Return the id of the project that pushed a root; empty where none did, or before projects had one."""
+    return str(root.get("project", {}).get("id", ""))
+
+
+def _succeeding(known: Root | None, manifest: str, *, lasting: bool) -> Root:
+    """Return what a root says of ``manifest`` and of those before it, the newest of which is that of ``known``."""
+    history = [] if known is None else _history(known, manifest, lasting=lasting)
+    previous = None if known is None else known["manifest"]
+    return {"manifest": manifest, "previous": previous, "written_s": int(time.time()), "history": history}
+
+
+def _formed(root: Root) -> bool:
+    """Return whether the values of a root are of the types that one has: another program may have written it."""
+    project, history = root.get("project", {"id": "", "name": ""}), root.get("history", [])
+    if not (isinstance(project, dict) and isinstance(history, list) and all(isinstance(one, dict) for one in history)):
+        return False
+    texts = [root.get("path"), *(project.get(key) for key in ("id", "name"))]
+    texts += [one.get("manifest") for one in (root, *history)]
+    times = [one.get("written_s", 0) for one in (root, *history)] + [root.get("missing_since_s", 0)]
+    return (
+        all(isinstance(text, str) and "\0" not in text for text in texts)
+        and all(isinstance(time_s, int) and 0 <= time_s < _LATEST_S for time_s in times)
+        and all(isinstance(one.get("lasting"), bool) for one in history)
+        and isinstance(root.get("previous"), str | None)
+        and root.get("kind") in (BESIDE, ABSOLUTE, PUSHED)
+    )
+
+
+def _history(known: Root, manifest: str, *, lasting: bool) -> list[dict[str, Any]]:
+    """Return what a path held before it held ``manifest``, newest first: all that is lasting, and `HISTORY` others."""
+    newest = {"manifest": known["manifest"], "written_s": known.get("written_s", 0), "lasting": lasting}
+    older = [one for one in known.get("history", []) if one["manifest"] not in (manifest, newest["manifest"])]
+    kept, room = [], HISTORY
+    for one in [newest, *older]:
+        room -= not one["lasting"]
+        if one["lasting"] or room >= 0:
+            kept.append(one)
+    return kept

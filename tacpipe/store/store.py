@@ -1,0 +1,370 @@
+"""The store: objects by digest, records by key, roots; see docs/format.md for its invariants."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import stat
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import DamagedError, StorageError, TacpipeError
+from tacpipe.io import memory, places, regular
+from tacpipe.io.files import listed, readable_errors, sentence, sync_folders, write_whole
+from tacpipe.io.hashing import DIGEST, bytes_digest, digest
+from tacpipe.store import layout
+from tacpipe.store.leases import Announcing, Leases
+from tacpipe.store.roots import BESIDE_NAME, Roots
+
+
+class MissingError(DamagedError):
+    """An object is not in the store, or was damaged and is now in quarantine."""
+
+
+class AbsentError(MissingError):
+    """An object or a record is not in the store, which is no sign of damage: it may have been collected."""
+
+
+@dataclass(frozen=True)
+class Object:
+    """What a manifest says of stored content."""
+
+    digest: str
+    bytes: int
+
+
+class Store:
+    """Content by digest and results by key, in one folder.
+
+    ``run`` is the lease of the run that this process works for, as `at_work` gave it to the process that began it.
+    """
+
+    def __init__(self, root: Path | str, run: str = "") -> None:
+        self.root = Path(root)
+        self._root = str(root)
+        self.leases = Leases(self.root / "leases")
+        self.roots = Roots(self)
+        self._run = Announcing(run) if run else None
+
+    # ---- places
+
+    def object_path(self, name: str) -> str:
+        """Return where the object ``name`` lies, whether or not it is there.
+
+        Raises `DamagedError` for a name that is no digest: it would lead out of the store.
+        """
+        if not DIGEST.fullmatch(name):
+            raise DamagedError(f"{name[:80]!r} is no digest (64 hex digits): what names it is damaged or was made up.")
+        return f"{self._root}/objects/{name[:2]}/{name}"
+
+    def record_path(self, key: str) -> str:
+        """Return where the record of ``key`` lies, whether or not it is there."""
+        return f"{self._root}/records/{key[:2]}/{key}.json"
+
+    def check(self) -> bool:
+        """Return whether there is a store; False where one may be begun. Raises `UsageError` as `layout.check` does."""
+        return layout.check(self.root)
+
+    def prepare(self) -> None:
+        """Create the store where there is none yet; raises as `check` does."""
+        if self.check():
+            return
+        with readable_errors(self.root):
+            for name in layout.FOLDERS:
+                (self.root / name).mkdir(parents=True, exist_ok=True)
+            self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
+            sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
+
+    # ---- runs
+
+    @contextlib.contextmanager
+    def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
+        """Announce to `gc` while in the block what is read (``manifests`` and all they name), put and reused."""
+        if self._run is not None:  # within a larger piece of work, which has its lease
+            self._run.announce(manifests)
+            yield
+            return
+        self.prepare()
+        with self.leases.running(manifests) as self._run:
+            try:
+                yield
+            finally:
+                self._run = None
+
+    @property
+    def run(self) -> str:
+        """The lease of the run at work, for the processes that work for it; empty where nobody said so."""
+        return "" if self._run is None else self._run.path
+
+    def announce(self, names: Iterable[str]) -> None:
+        """Announce objects to `gc`; whoever reuses one does so before it looks whether it is there."""
+        if self._run is not None:
+            self._run.announce(names)
+
+    # ---- objects
+
+    def has(self, name: str, size: int | None = None) -> bool:
+        """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
+        try:
+            found = os.lstat(self.object_path(name))  # called once a shard: os is 5 times faster than pathlib
+        except FileNotFoundError:
+            return self._put_back(name)
+        except OSError as error:
+            raise sentence(self.root, error) from error
+        if not stat.S_ISREG(found.st_mode):
+            self.quarantine(self.object_path(name))
+            return self._put_back(name)
+        return size is None or found.st_size == size
+
+    def put(self, content: bytes, *, durable: bool = False) -> Object:
+        """Store ``content`` and return its digest and size.
+
+        An object that is there already is kept, after a look at its size: a damaged one is found on reading. What cannot
+        be made again is ``durable``: the folders above it are synced too, and a copy that is there already is read and
+        replaced if it is damaged.
+        """
+        name = bytes_digest(content)
+        path = self.object_path(name)
+        self.announce([name])
+        there = False
+        with contextlib.suppress(MissingError):
+            if durable:
+                self.read(name, len(content))
+            there = self.has(name, len(content))
+        if not there:
+            self.write_file(path, content, mode=0o444)
+        if durable:  # whoever put it there
+            self.sync(path)
+        return Object(name, len(content))
+
+    def take(self, name: str, blocks: Iterable[bytes]) -> None:
+        """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
+
+        What was there is replaced.
+        """
+        self.announce([name])
+        path = self.object_path(name)
+        self.write_file(path, blocks, mode=0o444)
+        self.sync(path)
+
+    def read(self, name: str, size: int | None = None) -> bytes:
+        """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
+
+        Raises `MissingError` if it is not there, if it is so much larger than declared that it is not read, or if its bytes
+        do not hash to its name: those are then moved to ``quarantine/``.
+        """
+        path = self.object_path(name)
+        try:
+            content = regular.content(path, None if size is None else _most(size), follow=False)
+        except FileNotFoundError:
+            if self._put_back(name):
+                return self.read(name, size)
+            raise self._missing(name) from None
+        except (OSError, regular.IrregularError, StorageError) as error:
+            raise self._unreadable(name, error) from error
+        if bytes_digest(content) != name:
+            raise self._damaged(name)
+        return content
+
+    def blocks(self, name: str, size: int) -> Iterator[bytes]:
+        """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
+        hashed = hashlib.sha256()
+        try:
+            self.has(name)  # puts back what a collection moved aside
+            for block in regular.blocks(self.object_path(name), _most(size), follow=False):
+                hashed.update(block)
+                yield block
+        except FileNotFoundError:
+            raise self._missing(name) from None
+        except (OSError, regular.IrregularError) as error:
+            raise self._unreadable(name, error) from error
+        if hashed.hexdigest() != name:
+            raise self._damaged(name)
+
+    def _missing(self, name: str) -> AbsentError:
+        return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
+
+    def _unreadable(self, name: str, error: Exception) -> MissingError:
+        """Return what to say of an object that cannot be read; what is not a regular file is moved to quarantine."""
+        with contextlib.suppress(TacpipeError):
+            self.has(name)
+        why = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {why.rstrip('.')}.")
+
+    def _damaged(self, name: str) -> MissingError:
+        moved = self.quarantine(self.object_path(name))
+        where = f"is now in {self._root}/quarantine" if moved else "cannot be moved out of the way"
+        return MissingError(f"Object {name[:12]} was damaged and {where}.")
+
+    def quarantine(self, path: str | Path) -> bool:
+        """Move a damaged file out of the way, for whoever wants to know why; return False where nothing may be moved."""
+        if layout.is_linked(self._root, path):
+            return False
+        kind = "root-" if Path(path).parent.name == "roots" else ""
+        target = self.root / "quarantine" / f"{kind}{Path(path).name}.{time.time_ns()}"
+        try:
+            target.parent.mkdir(exist_ok=True)
+            Path(path).replace(target)
+        except FileNotFoundError:  # another process did
+            return True
+        except OSError:
+            return False
+        return True
+
+    def quarantined(self, name: str) -> bool:
+        """Return whether an object of this digest was damaged, lies in quarantine, and was not made again."""
+        return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
+
+    def aside(self, name: str) -> str:
+        """Return where a collection keeps an object between its first look at what is needed and its second."""
+        return f"{self._root}/tmp/{layout.ASIDE}{name}"
+
+    def _put_back(self, name: str) -> bool:
+        """Return whether an object was aside, of a collection that runs or was killed; it is back in its place then."""
+        path = self.object_path(name)
+        if layout.is_linked(self._root, path):
+            return False
+        try:
+            os.rename(self.aside(name), path)  # noqa: PTH104
+        except OSError:
+            return False
+        return True
+
+    def sync(self, path: str | Path) -> None:
+        """Have the name of a file of the store outlast a loss of power, as its content does."""
+        with readable_errors(self.root):
+            sync_folders(os.path.dirname(path), self._root)  # noqa: PTH120
+
+    def listed(self, *patterns: str) -> list[Path]:
+        """Return the paths in the store that match a pattern a level. Raises `TacpipeError` for folders it cannot list."""
+        found = [self.root]
+        with readable_errors(self.root):
+            for pattern in patterns:
+                found = [path for folder in found for path in listed(folder, pattern)]
+        return found
+
+    def write_file(
+        self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
+    ) -> bool:
+        """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race.
+
+        Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
+        """
+        if layout.is_linked(self._root, path):
+            raise StorageError(
+                f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."
+            )
+        with readable_errors(self.root):
+            draft = f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
+            return write_whole(str(path), content, draft, mode=mode, exclusive=exclusive)
+
+    # ---- records
+
+    def record(self, key: str) -> dict[str, Any] | None:
+        """Return the record of ``key``, or None; a damaged one is quarantined and counts as none."""
+        try:
+            return self.read_record(key)
+        except MissingError:
+            return None
+
+    def read_record(self, key: str) -> dict[str, Any]:
+        """Return the record of ``key``.
+
+        Raises `AbsentError` where there is none, and `MissingError` where it is damaged: it is then in ``quarantine/``.
+        """
+        path = self.record_path(key)
+        try:
+            with readable_errors(self.root):
+                record: dict[str, Any] = regular.json_value(path)
+            if _sound(record, key):
+                return record
+        except FileNotFoundError:
+            raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
+        except StorageError:  # the disk failed, which says nothing of the record
+            raise
+        except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
+            pass
+        self.quarantine(path)
+        raise MissingError(f"Record {key[:12]} in {self._root} was damaged.")
+
+    def commit(
+        self,
+        identity: Mapping[str, Any],
+        result: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        *,
+        replace: bool = False,
+        durable: bool = False,
+    ) -> dict[str, Any]:
+        """Record that ``identity`` gave ``result`` and return the record that holds: the first to finish wins.
+
+        ``replace`` is for results whose old record names objects that are gone.
+        """
+        key = digest(identity)
+        body = {"identity": identity, "result": result}
+        record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
+        content = json.dumps(record, sort_keys=True).encode()
+        path = self.record_path(key)
+        for _ in range(2):  # a second time if the record that was there turns out to be damaged
+            if self.write_file(path, content, exclusive=not replace):
+                break
+            there = self.record(key)
+            if there is not None:
+                record = there
+                break
+        if durable:
+            self.sync(path)
+        return record
+
+    def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield every key and its record."""
+        for path in layout.entries(self.root, "records"):
+            record = self.record(path.stem)
+            if record is not None:
+                yield path.stem, record
+
+
+def _sound(record: dict[str, Any], key: str) -> bool:
+    """Return whether a record is the key's own, and all of it is as it was written (older ones have no check)."""
+    identity, provenance = record["identity"], record["provenance"]
+    body = {"identity": identity, "result": record["result"]}
+    check = record.get("check", digest(provenance))
+    whole = set(record) <= {"identity", "result", "digest", "provenance", "check"} and check == digest(provenance)
+    return whole and digest(identity) == key and digest(body) == record["digest"]
+
+
+def _most(size: int) -> int:
+    """Return how many bytes of an object of this declared size are read: a small one that has grown is quarantined."""
+    return max(size, memory.AT_HAND)
+
+
+def locate(start: Path | None = None) -> Store:
+    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` beside the project that ``start`` lies in.
+
+    Raises `UsageError` where something else lies there, as `layout.check` does.
+    """
+    named = os.environ.get("TACPIPE_STORE")
+    store = Store(places.local(named).absolute() if named else project(start) / BESIDE_NAME)
+    store.check()
+    return store
+
+
+def project(start: Path | None = None) -> Path:
+    """Return the folder of the project: the nearest one upwards with a store, a ``dvc.yaml`` or a git repository."""
+    here = (start or Path.cwd()).absolute()
+    return marked(here) or here
+
+
+def marked(here: Path) -> Path | None:
+    """Return the nearest folder upwards that has the mark of a project, None where none has."""
+    for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
+        for folder in (here, *here.parents):
+            if os.path.lexists(folder / mark):  # a link to a disk that is not mounted counts
+                return folder
+    return None

@@ -1,0 +1,118 @@
+"""How a forecaster is judged: on every window of recordings, beside all that it has to beat."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.codecs import codec as codecs
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import headline
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.forward import metrics, tracks
+from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
+from tacpipe.tasks.forward.metrics import Trial
+from tacpipe.tasks.forward.predictors import told
+from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.forward.training import HISTORY, check_codec
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+Floats = NDArray[np.floating[Any]]
+
+TOLD_STEPS = (1, 3, 5, 10)  # whose predictions are stored; 3, 5 and 10 are those of the paper's figures
+
+
+def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
+    """Return metrics, tables and predictions of a model, its files given, on ``recordings``, beside its baselines.
+
+    Every window without a gap counts, in contact or not. Errors in counts are against the tactile channels themselves,
+    whatever the codec lost. Recordings that the model was trained or stopped on are told by their digests and reported
+    apart, and so are objects that it was trained on and others. Raises `TacpipeError` where the recordings are not what
+    the model reads.
+    """
+    forecaster = Forecaster.load(model)
+    check_codec(model, recordings.files)
+    known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
+    trials, kept = [], {}
+    loads = Loads(forecaster.codec.layout, forecaster.horizon)
+    for name, shard in sorted(recordings.shards.items()):
+        track = tracks.track(shard, forecaster.codec)
+        check_rate(track, forecaster)
+        trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
+        starts = track.starts(forecaster.context, forecaster.horizon)
+        steps = [step for step in TOLD_STEPS if step <= forecaster.horizon]
+        stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
+        if not trial.seen:
+            loads.begin(track)
+        begins = 0
+        for some in told(forecaster, track, starts):
+            trial.add(some.predictions, some.truth, forecaster.feature_half)
+            ends = begins + len(some.now)
+            stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
+            begins = ends
+            if not trial.seen:
+                loads.add(some)
+        attributes = {**shard.attributes, "seen": trial.seen}
+        kept[name] = RecordingOutput(_prediction_table(forecaster, track, starts, steps, stored), attributes)
+        trials.append(trial)
+    groups = metrics.channel_groups(forecaster.codec.layout)
+    tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
+    if warned := loads.scored(forecaster.config.get("anticipation", {})):
+        tree["anticipation"] = warned
+    method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
+    files = {
+        headline.FILE: headline.write(metrics.headline(method, trials, forecaster.horizon)),
+        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
+        "horizons.csv": metrics.horizons_csv(tree, forecaster.config["rate_hz"]),
+        "trials.csv": metrics.trials_csv(trials),
+        "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
+        **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
+    }
+    return Result(kept, files)
+
+
+def _prediction_table(
+    forecaster: Forecaster, track: Track, starts: NDArray[np.int64], steps: Sequence[int], stored: NDArray[np.float32]
+) -> pa.Table:
+    """Return one row a window: the time at which its prediction is available, the features then and those predicted.
+
+    ``stored`` (step, feature, window) becomes the columns without a copy.
+    """
+    now = starts + forecaster.context - 1
+    columns = [track.t_ns[now], track.contact[now].astype(np.int32)]
+    fields = [
+        pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"}),
+        pa.field("contact", pa.int32(), metadata={"quantity": "label"}),
+    ]
+    for index, name in enumerate(forecaster.codec.latents):
+        columns += [track.latent[now, index], *stored[:, index]]
+        for step in (0, *steps):
+            about = {"quantity": "latent", "step": str(step)}
+            fields.append(pa.field(f"{name}_t{step}" if step else name, pa.float32(), metadata=about))
+    arrays = [pa.array(values, field.type) for values, field in zip(columns, fields, strict=True)]
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def check_rate(track: Track, forecaster: Forecaster) -> None:
+    """Refuse a track whose grid is not the one the model was trained on."""
+    trained, rate_hz = forecaster.config["timeline"], float(forecaster.config["rate_hz"])
+    told = f"--rate-hz {rate_hz:g}" if trained == "uniform" else f"--grid {trained}"
+    if track.timeline != trained:
+        raise TacpipeError(
+            f"{track.name} has a {track.timeline} grid and the model was trained on a {trained} one, so a step is "
+            f"another time. Synchronize it with {told}."
+        )
+    found = tracks.rate_hz([track]) if trained == "uniform" else 0.0
+    if found and rate_hz and abs(found - rate_hz) > 0.01 * rate_hz:
+        raise TacpipeError(
+            f"{track.name} has {found:g} rows a second and the model was trained at {rate_hz:g}. "
+            f"Synchronize it with {told}."
+        )

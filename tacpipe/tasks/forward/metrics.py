@@ -1,0 +1,295 @@
+"""The errors of several predictors of the same windows, as metrics and tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.io.parquet import to_parquet
+from tacpipe.metrics import forecast
+from tacpipe.metrics.headline import Headline
+from tacpipe.tasks.forward import headline as headlines
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
+
+Floats = NDArray[np.floating[Any]]
+Masks = Mapping[str, NDArray[np.bool_]]  # name of a group of channels, (channel,)
+Tree = dict[str, Any]  # names down to numbers
+
+_COLUMNS = pa.schema(
+    {
+        "recording": pa.string(),
+        "object": pa.string(),
+        "known": pa.bool_(),
+        "seen": pa.bool_(),
+        "predictor": pa.string(),
+        "group": pa.string(),
+        "step": pa.int32(),
+        "windows": pa.int64(),
+        "channels": pa.int32(),
+        "squared": pa.float64(),
+        "absolute": pa.float64(),
+    }
+)
+
+
+@dataclass
+class Errors:
+    """Sums of one predictor's errors over the windows of a recording, each (step, feature) or (step, channel)."""
+
+    latent_squared: Floats | None
+    feature_squared: Floats | None
+    count_squared: Floats
+    count_absolute: Floats
+
+    @classmethod
+    def of(cls, predicted: Prediction, truth: Prediction, feature_half: Floats) -> Errors:
+        """Return the errors of ``predicted``; ``feature_half`` (feature,) is what the paper's scaling divides by."""
+        latent = feature = None
+        if predicted.latent is not None and truth.latent is not None:
+            latent = forecast.squared_sums(predicted.latent, truth.latent)
+            feature = latent / feature_half**2
+        return cls(
+            latent,
+            feature,
+            forecast.squared_sums(predicted.count, truth.count),
+            forecast.absolute_sums(predicted.count, truth.count),
+        )
+
+    def __add__(self, other: Errors) -> Errors:
+        """Return the errors over the windows of both."""
+
+        def summed(name: str) -> Any:
+            one, another = getattr(self, name), getattr(other, name)
+            return None if one is None else one + another
+
+        return Errors(*(summed(name) for name in self.__dataclass_fields__))
+
+
+@dataclass
+class Trial:
+    """The errors on one recording by predictor; empty where it holds no window."""
+
+    name: str
+    seen: bool  # in training or validation of the model
+    object: str | None = None
+    known: bool = True  # whether the model was trained on recordings of the same object, or nobody said what is held
+    windows: int = 0
+    errors: dict[str, Errors] = field(default_factory=dict)
+
+    def add(self, predictions: Mapping[str, Prediction], truth: Prediction, feature_half: Floats) -> None:
+        """Count some more windows of the recording."""
+        self.windows += len(truth.count)
+        for name, predicted in predictions.items():
+            found = Errors.of(predicted, truth, feature_half)
+            self.errors[name] = self.errors[name] + found if name in self.errors else found
+
+
+def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, NDArray[np.bool_]]:
+    """Return masks (channel,) for both sensors together, each sensor (``sensor1``… in order of columns) and each axis."""
+    groups = {"both": np.ones(len(layout), dtype=bool)}
+    streams = list(dict.fromkeys(one["stream"] for one in layout if "stream" in one))
+    for number, stream in enumerate(streams, 1):
+        groups[f"sensor{number}"] = np.array([one.get("stream") == stream for one in layout])
+    for axis in sorted({one["axis"] for one in layout if "axis" in one}):
+        groups[axis] = np.array([one.get("axis") == axis for one in layout])
+    return groups
+
+
+def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: Floats, seed: int = 0) -> Tree:
+    """Return the metrics of ``metrics.json``; ``channel_scale`` (channel,) is each channel's spread in training.
+
+    Recordings that the model has not seen are at the top, and under ``known`` and ``unseen`` once more those of objects
+    that it was trained on and of others, where there are both; those that it has seen are under ``seen``.
+    """
+    fresh = [one for one in trials if not one.seen]
+    parts = {"known": [one for one in fresh if one.known], "unseen": [one for one in fresh if not one.known]}
+    if not all(parts.values()):
+        parts = {}
+    parts["seen"] = [one for one in trials if one.seen]
+    tree = _summary(fresh, groups, horizon, channel_scale, seed)
+    return tree | {name: _summary(part, groups, horizon, channel_scale, seed) for name, part in parts.items() if part}
+
+
+def headline(method: str, trials: Sequence[Trial], horizon: int) -> list[Headline]:
+    """Return how the model compares with its baselines on recordings that it has not seen, of known objects and unseen ones.
+
+    Where nobody named an object, all are taken together.
+    """
+    fresh = [one for one in trials if not one.seen and one.windows]
+    steps = headlines.shown(range(1, horizon + 1))
+    at = [step - 1 for step in steps]
+
+    def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], Floats]:
+        found: dict[tuple[Any, str], Floats] = {}
+        for one in chosen:
+            errors, persistence = one.errors[predictor], one.errors[BASELINE].count_squared
+            squared, absolute, still = (
+                part.sum(axis=1)[at] for part in (errors.count_squared, errors.count_absolute, persistence)
+            )
+            found[0, one.name] = headlines.sums(squared, absolute, still, one.windows * persistence.shape[1])
+        return found
+
+    named = any(one.object is not None for one in fresh)
+    found = []
+    for part in (True, False) if named else (None,):
+        chosen = [one for one in fresh if part is None or one.known == part]
+        names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
+        others = {name: sums(name, chosen) for name in names}
+        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part)
+        found += [one] if one else []
+    return found
+
+
+def horizons_csv(tree: Tree, rate_hz: float) -> bytes:
+    """Return the errors by predictor and step of ``summary``'s recordings that the model has not seen."""
+    rows = [
+        (
+            name,
+            step,
+            round(1000 * step / rate_hz, 3) if rate_hz else "",
+            *(scores[measure]["both"][f"t{step}"] for measure in ("mse_counts", "mae_counts")),
+            scores["mse_standard"][f"t{step}"],
+        )
+        for name, scores in tree.items()
+        if "mse_standard" in scores and name != "skill"
+        for step in range(1, len(scores["mse_standard"]))
+    ]
+    return _csv(("predictor", "step", "horizon_ms", "mse_counts", "mae_counts", "mse_standard"), rows)
+
+
+def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: Floats) -> bytes:
+    """Return the sums behind all errors as a Parquet table, so that results can be pooled by recording.
+
+    A row a recording, predictor, group and step: ``windows`` and ``channels`` that ``squared`` and ``absolute`` errors
+    were summed over. Groups are those of channels in counts; ``standard``, all channels in units of their spread in
+    training; ``feature`` and ``latent``, the representation's own, scaled as the paper does and not.
+    """
+    columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS.names}
+    for one in trials:
+        for predictor, errors in one.errors.items():
+            for group, squared, absolute, channels in _pooled(errors, groups, channel_scale):
+                steps = len(squared)
+                told = (one.name, one.object, one.known, one.seen, predictor, group)
+                for name, value in zip(columns, told, strict=False):
+                    columns[name] += [value] * steps
+                columns["step"] += range(1, steps + 1)
+                columns["windows"] += [one.windows] * steps
+                columns["channels"] += [channels] * steps
+                columns["squared"] += [_rounded(value) for value in squared]
+                columns["absolute"] += [None if value is None else _rounded(value) for value in absolute]
+    return to_parquet(pa.table(columns, schema=_COLUMNS))
+
+
+def _pooled(errors: Errors, groups: Masks, channel_scale: Floats) -> Iterator[tuple[str, Any, Any, int]]:
+    """Yield each group's name, its sums of squared and absolute errors (step,) and its number of channels."""
+    for group, mask in groups.items():
+        yield (
+            group,
+            errors.count_squared[:, mask].sum(axis=1),
+            errors.count_absolute[:, mask].sum(axis=1),
+            int(mask.sum()),
+        )
+    squared, absolute = errors.count_squared / channel_scale**2, errors.count_absolute / channel_scale
+    yield "standard", squared.sum(axis=1), absolute.sum(axis=1), len(channel_scale)
+    for group, sums in (("feature", errors.feature_squared), ("latent", errors.latent_squared)):
+        if sums is not None:
+            yield group, sums.sum(axis=1), [None] * len(sums), sums.shape[1]
+
+
+def trials_csv(trials: Sequence[Trial]) -> bytes:
+    """Return one line a recording: windows, mean squared error of model and persistence in counts, and skill."""
+    rows = []
+    for one in trials:
+        errors: list[float | str] = ["", "", ""]
+        if one.windows:
+            model, baseline = (float(one.errors[name].count_squared.mean()) for name in (MODEL, BASELINE))
+            gain = float(forecast.skill(np.array([model]), np.array([baseline]))[0])
+            told = (model / one.windows, baseline / one.windows, gain)
+            errors = [_rounded(value) if math.isfinite(value) else "" for value in told]
+        rows.append(
+            (one.name, one.object or "", *(str(told).lower() for told in (one.known, one.seen)), one.windows, *errors)
+        )
+    return _csv(
+        ("recording", "object", "known", "seen", "windows", "mse_counts_model", "mse_counts_persistence", "skill"), rows
+    )
+
+
+def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: Floats, seed: int) -> Tree:
+    """Return errors of each predictor, skill and counts over the recordings that hold windows."""
+    held = [one for one in trials if one.windows]
+    windows = np.array([one.windows for one in held], dtype=np.int64)
+    counts = {
+        "windows": int(windows.sum()),
+        "recordings": len(held),
+        "recordings_without_window": len(trials) - len(held),
+        "effective_windows": int(windows.sum()) // horizon,  # as many would fit without overlap of their horizons
+    }
+    tree: Tree = {"counts": counts}
+    for name in held[0].errors if held else ():
+        errors = [one.errors[name] for one in held]
+        squared = np.stack([one.count_squared for one in errors])  # (recording, step, channel)
+        tree[name] = {
+            "mse_counts": _grouped(squared, windows, groups),
+            "mae_counts": _grouped(np.stack([one.count_absolute for one in errors]), windows, groups),
+            "mse_standard": _steps(squared / channel_scale**2, windows),
+        }
+        for told, kept in (("mse_latent", "latent_squared"), ("mse_feature", "feature_squared")):
+            if getattr(errors[0], kept) is not None:
+                tree[name][told] = _steps(np.stack([getattr(one, kept) for one in errors]), windows)
+    if held:
+        kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
+        tree["skill"] = {
+            told: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), seed)
+            for told, kept in kinds.items()
+        }
+    return tree
+
+
+def _steps(sums: Floats, windows: NDArray[np.int64]) -> Tree:
+    """Return the mean error by step and over all steps; ``sums`` is (recording, step, channel)."""
+    error = forecast.mean_error(sums, windows)
+    return {f"t{step}": _rounded(value) for step, value in enumerate(error, 1)} | {"mean": _rounded(error.mean())}
+
+
+def _grouped(sums: Floats, windows: NDArray[np.int64], groups: Masks) -> Tree:
+    """Return the mean error by group of channels and step."""
+    return {name: _steps(sums[:, :, mask], windows) for name, mask in groups.items()}
+
+
+def _by_step(trials: Sequence[Trial], predictor: str, kept: str) -> Floats:
+    """Return one kind of a predictor's error sums over all channels, shape (recording, step)."""
+    return np.stack([getattr(one.errors[predictor], kept).sum(axis=1) for one in trials])
+
+
+def _intervals(model: Floats, baseline: Floats, seed: int) -> Tree:
+    """Return skill with its interval by step and over all; what is not defined is left out. Sums (recording, step)."""
+    wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
+    found = forecast.skill_interval(wide[0], wide[1], seed=seed)
+    names = [f"t{step}" for step in range(1, model.shape[1] + 1)] + ["mean"]
+    tree: Tree = {}
+    for index, name in enumerate(names):
+        told = {part: float(getattr(found, part)[index]) for part in ("mean", "low", "high")}
+        tree[name] = {part: _rounded(value) for part, value in told.items() if math.isfinite(value)}
+    return {name: one for name, one in tree.items() if one}
+
+
+def _rounded(value: float) -> float:
+    """Return ``value`` to 9 digits: more would differ between machines."""
+    return float(f"{value:.9g}")
+
+
+def _csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
+    """Return a CSV file with ``header``."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue().encode()

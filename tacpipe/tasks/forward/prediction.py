@@ -1,0 +1,87 @@
+"""What a forecaster says of recordings, without a word on whether it came true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.evaluation import check_rate
+from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
+from tacpipe.tasks.forward.predictors import forecasts
+from tacpipe.tasks.forward.training import check_codec
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+Floats = NDArray[np.floating[Any]]
+
+
+def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int]) -> Result:
+    """Return a table a recording: when each prediction was known, and each channel's counts above rest ``steps`` later.
+
+    Columns are named like ``xela1_taxel01_z_t5``. Raises `TacpipeError` for a step that the model does not reach and
+    where the recordings are not what it reads.
+    """
+    found = tables(Forecaster.load(model), recordings, steps)
+    return Result({name: RecordingOutput(table) for name, table in found.items()})
+
+
+def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) -> dict[str, pa.Table]:
+    """Return the table of each recording's predictions; steps and errors are those of `predict`."""
+    for step in steps:
+        if not 1 <= step <= forecaster.horizon:
+            raise TacpipeError(
+                f"The model tells 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
+            )
+    check_codec(forecaster.codec_files, recordings.files)
+    found = {}
+    for name, shard in sorted(recordings.shards.items()):
+        track = tracks.track(shard, forecaster.codec)
+        check_rate(track, forecaster)
+        starts = track.starts(forecaster.context, forecaster.horizon)
+        counts = np.empty((len(steps), len(forecaster.codec.channels), len(starts)), np.float32)
+        wanted, begins = [step - 1 for step in steps], 0
+        for some in forecasts(forecaster, track, starts):
+            ends = begins + len(some.count)
+            counts[..., begins:ends] = some.count[:, wanted].transpose(1, 2, 0)
+            begins = ends
+        t_ns = track.t_ns[starts + forecaster.context - 1]
+        found[name] = _table(forecaster, t_ns, counts, steps)
+    return found
+
+
+def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
+    """Return the windows of a dataset's only recording, as `Forecaster.predict` reads them."""
+    check_codec(forecaster.codec_files, recordings.files)
+    (shard,) = recordings.shards.values()
+    track = tracks.track(shard, forecaster.codec)
+    check_rate(track, forecaster)
+    starts = track.starts(forecaster.context, forecaster.horizon)
+    past, ahead = (
+        starts[:, None] + np.arange(*ends)
+        for ends in ((0, forecaster.context), (forecaster.context, forecaster.context + forecaster.horizon))
+    )
+    arm = track.arm.astype(np.float64)
+    window = np.concatenate([track.tactile[past], arm[past], track.finger[past][..., None]], axis=-1)
+    return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
+
+
+def _table(
+    forecaster: Forecaster, t_ns: NDArray[np.int64], counts: NDArray[np.float32], steps: Sequence[int]
+) -> pa.Table:
+    """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
+    fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
+    columns: list[Any] = [pa.array(t_ns)]
+    for channel, name in enumerate(forecaster.codec.channels):
+        for index, step in enumerate(steps):
+            about = {"quantity": "prediction", "unit": "count", "step": str(step), **forecaster.codec.layout[channel]}
+            fields.append(pa.field(f"{name}_t{step}", pa.float32(), metadata=about))
+            columns.append(pa.array(counts[index, channel]))
+    return pa.Table.from_arrays(columns, schema=pa.schema(fields))

@@ -1,0 +1,263 @@
+"""How a classifier of materials is judged: on every slide, beside all that it has to beat."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.datasets import origin
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import headline
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.material import headline as headlines
+from tacpipe.tasks.material import metrics
+from tacpipe.tasks.material import slides as slides_of
+from tacpipe.tasks.material.classifier import (
+    CONFIG,
+    MEAN_LEVEL,
+    Classifier,
+    Floats,
+    Materials,
+    NetworkReader,
+    SpectraReader,
+    Told,
+)
+from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
+from tacpipe.tasks.material.slides import Slides
+from tacpipe.tasks.material.training import HISTORY
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+PREDICTIONS = "predictions"
+
+
+@dataclass
+class Judged:
+    """What was said of the slides of one sensor."""
+
+    slides: Slides
+    seen: NDArray[np.bool_]  # (slide,): the model was trained on it
+    told: Told
+    predicted: dict[str, Materials]  # predictor -> the material it names (slide,)
+    held: NDArray[np.bool_]  # (slide,): of a material whose label the sensor was not told
+    zero_shot: tuple[Materials, Materials] | None = None  # another sensor's names: of all materials, of held-out ones
+    counted: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
+
+    def right(self, predictor: str, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which of the chosen slides a predictor named rightly."""
+        found: NDArray[np.bool_] = (self.predicted[predictor] == self.slides.materials)[chosen]
+        return found
+
+
+def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
+    """Return metrics, confusions and predictions of a model, its files given, on slides, beside its baselines.
+
+    Every slide counts. Slides that the model was trained or chosen on are told by their digests and reported apart, under
+    ``seen``. Raises `TacpipeError` where slides have no label or are not what the model reads.
+    """
+    classifier = Classifier.load(model)
+    known = set(classifier.config["trained_on"].values())
+    judged = {
+        sensor: _judged(classifier, slides, known)
+        for sensor, slides in classifier.read(recordings, labelled=True).items()
+    }
+    if not judged:
+        raise TacpipeError(
+            "There is no slide to judge the model on. Give a dataset that `tacpipe segment slides` made."
+        )
+    tree = _summary(judged, classifier, seen=False)
+    seen = _summary(judged, classifier, seen=True)
+    if any(seen["counts"]["slides"].values()):
+        tree["seen"] = seen
+    zero = _zero_shot(judged, classifier)
+    if zero:
+        tree["zero_shot"] = zero
+    rows = [(sensor, one, int(at)) for sensor, one in judged.items() for at in np.flatnonzero(one.counted & ~one.seen)]
+    files = {
+        headline.FILE: headline.write(_headlines(judged, classifier)),
+        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
+        "confusion.csv": metrics.confusion_csv(
+            [sensor for sensor, _, _ in rows],
+            [int(one.slides.materials[at]) for _, one, at in rows],
+            [int(one.predicted[MODEL][at]) for _, one, at in rows],
+        ),
+        **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
+    }
+    attributes = {name: shard.attributes for name, shard in recordings.shards.items()}
+    table = predictions_table(judged, classifier, {name: one.get("session") for name, one in attributes.items()})
+    return Result({PREDICTIONS: RecordingOutput(table, origin.together(attributes.values()))}, files)
+
+
+def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
+    """Return what all predictors say of the slides of one sensor."""
+    sensor = slides.layout.sensor
+    foreign = [index for index, one in enumerate(slides.materials) if int(one) not in classifier.classes]
+    if foreign:
+        raise TacpipeError(
+            f"{slides.names[foreign[0]]} is of material {slides.materials[foreign[0]]}, which the model was never taught; "
+            f"it names {len(classifier.classes)} from {classifier.classes[0]} to {classifier.classes[-1]}. Leave it out."
+        )
+    told = classifier.readers[sensor].tell(slides.frames)
+    predicted = {MODEL: classifier.named(told.scores)}
+    if sensor in classifier.last:
+        predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].tell(slides.frames).scores)
+    mapped = bool(classifier.config["params"].get("known"))  # all have the known sensor's classifier already
+    if classifier.config.get("joint") and told.latents is not None and not mapped:
+        predicted[SWAPPED] = _exchanged(classifier, sensor, told.latents)
+    for name, by_sensor in classifier.baselines.items():
+        frames = slides.frames
+        if name != MEAN_LEVEL and told.latents is not None:
+            frames = told.latents[:, None]
+        fitted = by_sensor[sensor]
+        predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
+    held_out = classifier.config.get("held_out", {}).get(sensor, [])
+    counted = np.ones(len(slides), bool)
+    if classifier.config["params"].get("drop_last"):
+        batch = classifier.config["params"]["batch"]
+        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
+    found = Judged(
+        slides,
+        np.array([digest in known for digest in slides.digests], bool),
+        told,
+        predicted,
+        np.isin(slides.materials, held_out),
+        counted=counted,
+    )
+    if held_out and told.latents is not None:
+        found.zero_shot = _by_another(classifier, sensor, told.latents, held_out)
+    return found
+
+
+def _exchanged(classifier: Classifier, sensor: str, latents: Floats) -> Materials:
+    """Return what the classifier of another sensor says of latents, in this sensor's names of materials.
+
+    Sensors that were aligned by permuted classes share a space in which one's material stands where another's does; the
+    name is then taken back through that permutation.
+    """
+    scores = _partner_scores(classifier, sensor, latents)
+    named = classifier.named(scores)
+    partners = {int(one): int(other) for one, other in classifier.config.get("partners", {}).items()}
+    first, partner = next(iter(classifier.layouts)), classifier.partner(sensor)
+    if not partners or first not in (sensor, partner):
+        return named
+    back = partners if partner == first else {other: one for one, other in partners.items()}
+    return np.array([back[int(one)] for one in named], np.int64)
+
+
+def _partner_scores(classifier: Classifier, sensor: str, latents: Floats) -> Floats:
+    own, reader = classifier.readers[sensor], classifier.readers[classifier.partner(sensor)]
+    if isinstance(own, SpectraReader):
+        return own.expected(latents)
+    assert isinstance(reader, NetworkReader)
+    return reader.scores_of(latents)
+
+
+def _by_another(
+    classifier: Classifier, sensor: str, latents: Floats, held_out: list[int]
+) -> tuple[Materials, Materials]:
+    """Return the names by what other sensors were told alone: of all materials, and of those held out alone."""
+    scores = _partner_scores(classifier, sensor, latents)
+    among = np.isin(classifier.classes, held_out)
+    return classifier.named(scores), classifier.named(np.where(among, scores, -np.inf))
+
+
+def _summary(judged: Mapping[str, Judged], classifier: Classifier, *, seen: bool) -> Tree:
+    """Return the metrics on the slides that the model has seen, or on those it has not."""
+    chosen = {sensor: (one.seen == seen) & one.counted & ~one.held for sensor, one in judged.items()}
+    predictors = sorted({name for one in judged.values() for name in one.predicted})
+    right = {
+        name: {sensor: one.right(name, chosen[sensor]) for sensor, one in judged.items() if name in one.predicted}
+        for name in predictors
+    }
+    return metrics.summary(right, len(classifier.classes))
+
+
+def _headlines(judged: Mapping[str, Judged], classifier: Classifier) -> list[headline.Headline]:
+    """Return how the model compares with its baselines on the slides of each sensor that it has not seen."""
+    found = []
+    for sensor, one in judged.items():
+        chosen = ~one.seen & one.counted & ~one.held
+        names = np.array(one.slides.names)[chosen]
+        right = {
+            predictor: {
+                (0, str(name)): (int(told), 1) for name, told in zip(names, one.right(predictor, chosen), strict=True)
+            }
+            for predictor in one.predicted
+        }
+        told = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
+        found += [told] if told else []
+    return found
+
+
+def _zero_shot(judged: Mapping[str, Judged], classifier: Classifier) -> Tree:
+    """Return how well another sensor's classifier names materials whose labels a sensor was never told."""
+    every, among, chances = {}, {}, {}
+    for sensor, one in judged.items():
+        if one.zero_shot is None:
+            continue
+        chosen = one.held & ~one.seen
+        every[sensor] = (one.zero_shot[0] == one.slides.materials)[chosen]
+        among[sensor] = (one.zero_shot[1] == one.slides.materials)[chosen]
+        chances[sensor] = 1 / len(classifier.config["held_out"][sensor])
+    if not every:
+        return {}
+    tree = metrics.accuracy(every)
+    tree["chance"] = {sensor: 1 / len(classifier.classes) for sensor in every}
+    tree["among_held_out"] = {**metrics.accuracy(among), "chance": chances}
+    return tree
+
+
+def predictions_table(
+    judged: Mapping[str, Judged], classifier: Classifier, sessions: Mapping[str, Any] | None = None
+) -> pa.Table:
+    """Return one row a slide: what it is, what each predictor named, and the model's scores and latents.
+
+    ``sessions`` maps a slide to its session, where one is recorded.
+    """
+    label, count = {"quantity": "label"}, {sensor: len(one.slides) for sensor, one in judged.items()}
+    columns: list[tuple[pa.Field, Any]] = [
+        (pa.field("recording", pa.string()), [name for one in judged.values() for name in one.slides.names]),
+        (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
+        (pa.field("material", pa.int32(), metadata=label), _joined(one.slides.materials for one in judged.values())),
+        (pa.field("seen", pa.bool_()), _joined(one.seen for one in judged.values())),
+    ]
+    told = [(sessions or {}).get(name) for one in judged.values() for name in one.slides.names]
+    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in told]))
+    for name in sorted({name for one in judged.values() for name in one.predicted}):
+        values = [one.predicted.get(name, np.full(len(one.slides), slides_of.UNKNOWN)) for one in judged.values()]
+        columns.append((pa.field(name, pa.int32(), metadata={"quantity": "prediction"}), _joined(values)))
+    columns += score_columns(classifier, _joined(one.told.scores for one in judged.values()))
+    latents = [one.told.latents for one in judged.values() if one.told.latents is not None]
+    if latents:
+        columns += latent_columns(_joined(latents))
+    arrays = [pa.array(values, field.type) for field, values in columns]
+    return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))
+
+
+def score_columns(classifier: Classifier, scores: Floats) -> list[tuple[pa.Field, Any]]:
+    """Return a column of scores a material."""
+    about = {"quantity": "score"}
+    return [
+        (pa.field(f"score_{material:02d}", pa.float32(), metadata=about), scores[:, number])
+        for number, material in enumerate(classifier.classes)
+    ]
+
+
+def latent_columns(latents: Floats) -> list[tuple[pa.Field, Any]]:
+    """Return a column a latent."""
+    about = {"quantity": "latent"}
+    return [
+        (pa.field(f"z{number + 1:02d}", pa.float32(), metadata=about), latents[:, number])
+        for number in range(latents.shape[1])
+    ]
+
+
+def _joined(parts: Any) -> Any:
+    return np.concatenate(list(parts))

@@ -1,0 +1,60 @@
+"""The headline of materials: the accuracy on a sensor's slides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.metrics import pairing
+from tacpipe.metrics.headline import Headline
+from tacpipe.metrics.pairing import Measure, Sums
+
+Floats = NDArray[np.floating[Any]]
+
+TASK = "material"
+CHANCE = "chance"
+BASELINES = {"mean_level": "mean level alone"}  # predictors that are baselines; others are controls or the model's own
+
+
+def headline(
+    method: str,
+    sensor: str,
+    right: Mapping[str, Mapping[tuple[Any, str], tuple[int, int]]],
+    classes: int,
+    *,
+    model: str = "model",
+    runs: int = 1,
+) -> Headline | None:
+    """Return how a method compares with its baselines on the slides of a sensor.
+
+    ``right`` holds, by predictor, then by seed and slide, how often the slide was classified right and how often at all.
+    Guessing among ``classes`` counts as a baseline too.
+    """
+    own = _sums(right.get(model, {}))
+    baselines = {name: _sums(right[predictor]) for predictor, name in BASELINES.items() if right.get(predictor)}
+    if classes:
+        baselines[CHANCE] = {key: np.array([one[1] / classes, one[1]]) for key, one in own.items()}
+    return pairing.headline(TASK, method, _MEASURE, own, baselines, part=sensor, runs=runs)
+
+
+def _sums(right: Mapping[tuple[Any, str], tuple[int, int]]) -> Sums:
+    return {key: np.array(one, dtype=np.float64) for key, one in right.items()}
+
+
+def _wrong(found: Floats) -> Floats:
+    return np.where(found[:, 1] > 0, 1 - found[:, 0] / np.maximum(found[:, 1], 1), np.nan)
+
+
+_MEASURE = Measure(
+    ("accuracy (%)",),
+    "percent of slides",
+    "accuracy",
+    "points",
+    "slides",
+    _wrong,
+    lambda one, other: 100 * (other - one),
+    lambda found: (100 * (1 - float(_wrong(found[None])[0])),),
+)

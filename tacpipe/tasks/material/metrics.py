@@ -1,0 +1,77 @@
+"""Counts of right names, with intervals: the numbers that a result is told in."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.metrics.proportions import mcnemar, wilson
+from tacpipe.tasks.material.classifier import MEAN_LEVEL
+
+MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
+Tree = dict[str, Any]
+
+
+def accuracy(correct: Mapping[str, NDArray[np.bool_]]) -> Tree:
+    """Return accuracy, right ones, number and 95 % Wilson interval by sensor; a sensor without slides is left out.
+
+    Accuracy is the share of right names: equation (4) of the paper, taken literally, would be a mean squared difference
+    of labels.
+
+    >>> accuracy({"biotac": np.array([True, False])})["accuracy"]
+    {'biotac': 0.5}
+    """
+    tree: Tree = {"accuracy": {}, "correct": {}, "n": {}, "low": {}, "high": {}}
+    for sensor, right in correct.items():
+        if not len(right):
+            continue
+        count = int(right.sum())
+        low, high = wilson(count, len(right))
+        tree["accuracy"][sensor] = count / len(right)
+        tree["correct"][sensor], tree["n"][sensor] = count, len(right)
+        tree["low"][sensor], tree["high"][sensor] = low, high
+    return tree
+
+
+def chance(counts: Mapping[str, int], classes: int) -> Tree:
+    """Return what guessing one of ``classes`` gets, by sensor."""
+    shares = {sensor: 1 / classes for sensor, count in counts.items() if count}
+    return {"accuracy": shares, "n": {sensor: counts[sensor] for sensor in shares}}
+
+
+def summary(right: Mapping[str, Mapping[str, NDArray[np.bool_]]], classes: int) -> Tree:
+    """Return the metrics of predictors: ``right`` tells by predictor and sensor which slides were named rightly (slide,).
+
+    ``skill`` is the share of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability
+    of so unequal disagreements if both were as good.
+    """
+    found: Tree = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
+    counts = {sensor: len(one) for sensor, one in right[MODEL].items()}
+    found["chance"] = chance(counts, classes)
+    found["counts"] = {"slides": counts}
+    if MEAN_LEVEL in right:
+        found["skill"], found["mcnemar"] = {}, {"model_vs_mean_level": {}}
+        for sensor, model in right[MODEL].items():
+            level = right[MEAN_LEVEL][sensor]
+            if len(model) and not level.all():
+                found["skill"][sensor] = float(1 - (~model).mean() / (~level).mean())
+            if len(model):
+                found["mcnemar"]["model_vs_mean_level"][sensor] = mcnemar(model, level)
+    return found
+
+
+def confusion_csv(sensors: Sequence[str], materials: Sequence[int], predicted: Sequence[int]) -> bytes:
+    """Return how often each sensor's slides of a material were given each name, as CSV."""
+    counts: dict[tuple[str, int, int], int] = {}
+    for key in zip(sensors, map(int, materials), map(int, predicted), strict=True):
+        counts[key] = counts.get(key, 0) + 1
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["sensor", "material", "predicted", "count"])
+    writer.writerows([*key, count] for key, count in sorted(counts.items()))
+    return text.getvalue().encode()

@@ -1,0 +1,48 @@
+"""What a classifier says of slides, without a word on whether it is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.material.classifier import Classifier
+from tacpipe.tasks.material.evaluation import PREDICTIONS, latent_columns, score_columns
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+
+def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
+    """Return one table, ``predictions``: a row a slide with the material named, all scores, and latents where there are.
+
+    Slides need no label; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where the
+    recordings are not what the model reads.
+    """
+    return Result({PREDICTIONS: RecordingOutput(predictions(Classifier.load(model), recordings))})
+
+
+def predictions(classifier: Classifier, recordings: Dataset) -> pa.Table:
+    """Return the table of `predict`, which raises the same errors."""
+    names: list[str] = []
+    sensors: list[str] = []
+    told = []
+    for sensor, slides in classifier.read(recordings).items():
+        names += slides.names
+        sensors += [sensor] * len(slides)
+        told.append(classifier.readers[sensor].tell(slides.frames))
+    scores = np.concatenate([one.scores for one in told])
+    columns: list[tuple[pa.Field, Any]] = [
+        (pa.field("recording", pa.string()), names),
+        (pa.field("sensor", pa.string()), sensors),
+        (pa.field("material", pa.int32(), metadata={"quantity": "prediction"}), classifier.named(scores)),
+        *score_columns(classifier, scores),
+    ]
+    latents = [one.latents for one in told if one.latents is not None]
+    if latents:
+        columns += latent_columns(np.concatenate(latents))
+    arrays = [pa.array(values, field.type) for field, values in columns]
+    return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))

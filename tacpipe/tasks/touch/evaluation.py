@@ -1,0 +1,161 @@
+"""How near a model of touch comes on grasps it has not seen, beside what can be said without looking."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tacpipe.channels import biotac_sp
+from tacpipe.datasets import origin
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import headline, regression
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch import metrics
+from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.tasks.touch.metrics import Told, Tree
+from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
+from tacpipe.tasks.touch.result_names import CONSTANT, GRASPS, MODEL, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS, TRUE
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+Mask = NDArray[np.bool_]
+
+
+def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
+    """Return ``metrics.json``, ``by_object.csv`` and what each predictor told of each grasp.
+
+    The measures are of grasps that the model was not trained on, and again of those among them whose object it knows
+    (``known``) and does not (``novel``); grasps it has seen, and those with the very reading of one of these, are told
+    apart, under ``seen``. Raises `TacpipeError` where grasps have no reading, or are not what the model reads.
+    """
+    predictor = Predictor.load(model)
+    grasps = grasps_of.read(recordings)
+    if not len(grasps):
+        raise TacpipeError(
+            "There is no grasp to judge the model on. Give a dataset with recordings of the role asked for."
+        )
+    if predictor.baselines is None:
+        raise TacpipeError("The model was trained without baselines, and cannot be judged. Train it with --baselines.")
+    told = {TRUE: grasps.felt, MODEL: predictor.foretell(grasps), **predictor.baselines.foretell(grasps)}
+    told = {name: {target: one[target] for target in predictor.targets} for name, one in told.items()}
+    streams = {name: told_table(one) for name, one in told.items()}
+    del told[TRUE]
+    trained = set(predictor.config["trained_on"].values())
+    seen = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.felt_before(grasps)
+    known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
+    tree = _measures(grasps, told, ~seen, known)
+    for name, mask in (("known", known & ~seen), ("novel", ~known & ~seen), ("seen", seen)):
+        if mask.any():
+            tree[name] = _measures(grasps, told, mask, known)
+    files = {
+        headline.FILE: headline.write(_headlines(predictor, grasps, told, seen, known)),
+        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
+        "by_object.csv": _by_object_csv(tree),
+        **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
+    }
+    streams[GRASPS] = _about(grasps, seen, known)
+    attributes = origin.together(shard.attributes for shard in recordings.shards.values())
+    return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
+
+
+def _headlines(
+    predictor: Predictor, grasps: Grasps, told: Mapping[str, Told], seen: Mask, known: Mask
+) -> list[headline.Headline]:
+    """Return how the model compares with its baselines on each target, on known objects and on novel ones."""
+    objects = {name: of or "unnamed" for name, of in zip(grasps.names, grasps.objects, strict=True)}
+    found = []
+    for part in (True, False):
+        rows = np.flatnonzero((known == part) & ~seen)
+        for target in predictor.targets:
+            true = biotac_sp.normalised(target, grasps.felt[target])
+            errors = {}
+            for name, one in told.items():
+                squared = regression.squared_sums(true, biotac_sp.normalised(target, one[target]))
+                errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
+            model = errors.pop(MODEL)
+            low, high = biotac_sp.RANGES[target]
+            made = headlines.headline(
+                predictor.config["architecture"], target, high - low, model, errors, part, objects
+            )
+            found += [made] if made else []
+    return found
+
+
+def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, known: Mask) -> Tree:
+    """Return the measures of every predictor on some grasps, over all of them and by object.
+
+    Where an object among them is not ``known``, intervals are over objects: what the next one will be like is the question.
+    """
+    if not mask.any():
+        return {"counts": {"grasps": 0}}
+    names, objects = np.array(grasps.names), np.array(grasps.objects)
+    clusters = objects if (mask & ~known).any() else names
+    tree: Tree = {"counts": {"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}}
+    for name, one in told.items():
+        tree[name] = _tree(grasps, one, told[CONSTANT], mask, clusters)
+        tree[name]["by_object"] = {
+            other or "unnamed": _tree(grasps, one, told[CONSTANT], mask & (objects == other), names)
+            for other in sorted(set(objects[mask]))
+        }
+    felt, model = (metrics.chosen(one, mask) for one in (grasps.felt, told[MODEL]))
+    tree[MODEL]["by_electrode"] = metrics.by_electrode(felt, model)
+    return tree
+
+
+def _tree(grasps: Grasps, told: Told, constant: Told, mask: Mask, clusters: NDArray[Any]) -> Tree:
+    felt, one, mean = (metrics.chosen(values, mask) for values in (grasps.felt, told, constant))
+    return metrics.tree(felt, one, mean, clusters[mask].tolist())
+
+
+def _by_object_csv(tree: Tree) -> bytes:
+    """Return a row an object, predictor and target: how many grasps, RMSE in shares and counts, R2, skill."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
+    for predictor in (MODEL, CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME):
+        for name, one in tree.get(predictor, {}).get("by_object", {}).items():
+            for target in one["rmse"]:
+                values = [one[measure][target] for measure in ("rmse", "rmse_counts", "r2", "skill")]
+                rounded = ["" if value is None else f"{value:.6g}" for value in values]
+                writer.writerow([name, predictor, target, one["n"], *rounded])
+    return text.getvalue().encode()
+
+
+def _about(grasps: Grasps, seen: Mask, known: Mask) -> pa.Table:
+    """Return a row a grasp: which recording, object and session, when, and whether the model knows it or its object."""
+    return pa.table(
+        {
+            "recording": pa.array(grasps.names, pa.string()),
+            "object": pa.array(grasps.objects, pa.string()),
+            "session": pa.array(grasps.sessions, pa.string()),
+            "t_ns": pa.array(grasps.t_ns, pa.int64()),
+            "seen": pa.array(seen, pa.bool_()),
+            "known": pa.array(known, pa.bool_()),
+        }
+    )
+
+
+def simulated(recordings: Dataset) -> dict[str, bool]:
+    """Return the attribute that marks what simulated recordings led to; none where all are real."""
+    found = any(bool(shard.attributes.get("simulated")) for shard in recordings.shards.values())
+    return {"simulated": True} if found else {}
+
+
+def told_table(told: Told) -> pa.Table:
+    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, as far as told."""
+    fields, arrays = [], []
+    for target, values in told.items():
+        for name, column in zip(biotac_sp.value_columns(target), values.T, strict=True):
+            fields.append(pa.field(name, pa.float32(), metadata={"unit": "count", "quantity": "prediction"}))
+            arrays.append(pa.array(column.astype(np.float32)))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

@@ -1,0 +1,73 @@
+"""The headline of touch: the RMSE of one target on grasps of known objects or of novel ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.metrics import pairing
+from tacpipe.metrics.headline import Headline
+from tacpipe.metrics.pairing import Measure, Sums
+
+Floats = NDArray[np.floating[Any]]
+
+TASK = "touch"
+PARTS = {True: "known objects", False: "novel objects", None: "all objects"}
+TARGETS = {
+    "pdc_th": "PDC thumb",
+    "pdc_mf": "PDC middle finger",
+    "e_th": "electrodes thumb",
+    "e_mf": "electrodes middle finger",
+}
+BASELINES = {  # what tables call the predictors that every result has
+    "constant": "constant",
+    "object_mean": "mean of the object",
+    "nearest_in_time": "mean of the nearest in time",
+}
+
+
+def headline(
+    method: str,
+    target: str,
+    range_counts: float,
+    model: Mapping[tuple[Any, str], tuple[float, int]],
+    baselines: Mapping[str, Mapping[tuple[Any, str], tuple[float, int]]],
+    known: bool | None,
+    objects: Mapping[str, str],
+    runs: int = 1,
+) -> Headline | None:
+    """Return how a method compares with its baselines on one target.
+
+    Errors are, by seed and grasp, the sum of squares in shares of the target's range, which is ``range_counts`` wide, and
+    the number of values that were summed. Grasps are drawn anew where objects are known, else ``objects`` (by grasp).
+    """
+    drawn = None if known else objects
+    told = {BASELINES.get(name, name.replace("_", " ")): _sums(one) for name, one in baselines.items() if one}
+    measure = _measure(range_counts, "grasps" if known else "objects")
+    return pairing.headline(
+        TASK, method, measure, _sums(model), told, part=PARTS[known], target=TARGETS[target], clusters=drawn, runs=runs
+    )
+
+
+def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
+    return {key: np.array([squared, float(count)]) for key, (squared, count) in errors.items()}
+
+
+def _measure(range_counts: float, cluster: str) -> Measure:
+    def rmse(found: Floats) -> Floats:
+        return np.sqrt(np.where(found[:, 1] > 0, found[:, 0] / np.maximum(found[:, 1], 1), np.nan))
+
+    def gain(one: Floats, other: Floats) -> Floats:
+        return np.where(other > 0, 1 - one / np.where(other > 0, other, 1), np.nan)
+
+    def values(found: Floats) -> tuple[float, ...]:
+        share = float(rmse(found[None])[0])
+        return share, share * range_counts
+
+    columns = ("RMSE", "RMSE (counts)")
+    return Measure(
+        columns, "shares of the target's range, and counts", "the RMSE", "skill", cluster, rmse, gain, values
+    )

@@ -1,0 +1,64 @@
+"""How near foretold touch comes to what was felt: the tree of measures of one set of grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.channels import biotac_sp
+from tacpipe.metrics import regression
+
+Floats = NDArray[np.float64]
+Told = Mapping[str, Floats]  # by target (grasp, value), device counts
+Tree = dict[str, Any]
+
+
+def tree(felt: Told, told: Told, constant: Told, clusters: Sequence[str]) -> Tree:
+    """Return the measures of what one predictor told, by measure and target.
+
+    ``rmse`` and ``mae`` are in shares of each target's range (`biotac_sp.RANGES`), over all grasps and electrodes at once;
+    ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
+    ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over resampled ``clusters``.
+    """
+    names = ("rmse", "rmse_counts", "rmse_batch_mean", "mae", "r2", "skill", "skill_low", "skill_high")
+    found: Tree = {name: {} for name in names}
+    for target, values in told.items():
+        true, share, mean = (biotac_sp.normalised(target, one[target]) for one in (felt, told, constant))
+        found["rmse"][target] = regression.rmse(true, share)
+        found["rmse_counts"][target] = regression.rmse(felt[target], values)
+        found["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, share)
+        found["mae"][target] = regression.mae(true, share)
+        found["r2"][target] = _known(regression.r2(true, share))
+        model, baseline = (regression.squared_sums(true, one) for one in (share, mean))
+        skill = regression.skill_interval(model, baseline, np.asarray(clusters))
+        for name, value in zip(("skill", "skill_low", "skill_high"), skill, strict=True):
+            found[name][target] = _known(value)
+    found["n"] = len(clusters)
+    return found
+
+
+def by_electrode(felt: Told, told: Told) -> Tree:
+    """Return RMSE (share of the range) and R2 of each electrode, by target."""
+    found: Tree = {}
+    for target, values in told.items():
+        if biotac_sp.width(target) > 1:
+            true, share = (biotac_sp.normalised(target, one) for one in (felt[target], values))
+            pairs = zip(regression.rmse_by_value(true, share), regression.r2_by_value(true, share), strict=True)
+            found[target] = {
+                f"{number:02d}": {"rmse": float(rmse), "r2": _known(float(r2))}
+                for number, (rmse, r2) in enumerate(pairs, 1)
+            }
+    return found
+
+
+def chosen(told: Told, mask: NDArray[np.bool_]) -> dict[str, Floats]:
+    """Return the values of the grasps that a mask (grasp,) chooses."""
+    return {target: values[mask] for target, values in told.items()}
+
+
+def _known(value: float) -> float | None:
+    """Return a measure, or None where it is not defined, as JSON tells it."""
+    return value if np.isfinite(value) else None

@@ -1,0 +1,36 @@
+"""What a model says that grasps would feel like, without a word on whether it is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch.evaluation import simulated, told_table
+from tacpipe.tasks.touch.predictor import Predictor
+from tacpipe.tasks.touch.result_names import PREDICTIONS
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+
+def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
+    """Return one table, ``predictions``: a row a grasp with the recording's name and all values foretold, device counts.
+
+    Grasps need no reading; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where
+    there are no recordings or they are not what the model reads.
+    """
+    return Result({PREDICTIONS: RecordingOutput(predictions(Predictor.load(model), recordings), simulated(recordings))})
+
+
+def predictions(predictor: Predictor, recordings: Dataset) -> pa.Table:
+    """Return the table of `predict`, which raises the same errors."""
+    grasps = grasps_of.read(recordings, felt=False)
+    if not len(grasps):
+        raise TacpipeError("There is no grasp to foretell. Give a dataset with recordings of the role asked for.")
+    table = told_table(predictor.foretell(grasps))
+    return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))
