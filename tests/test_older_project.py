@@ -1,0 +1,63 @@
+"""A project as an older version wrote it: its store, datasets, model and labels are read, and its keys still hit."""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tacpipe
+from tests.conftest import Ran
+
+ARCHIVE = Path(__file__).parent / "older" / "project.tar.xz"
+HITS = {  # commands whose results are in the store, under the keys that they had then
+    "data/recordings": "simulate forward --trials 3 --duration-s 4 --tactile-rate-hz 25 --robot-rate-hz 50",
+    "data/synced": "synchronize data/recordings --rate-hz 25",
+    "data/segments": "segment contacts data/synced",
+    "data/split": "split data/segments --scheme random --val 0.34 --test 0.34",
+    "data/latents": "compress pca data/segments --split data/split --components 2",
+    "results/forward": "evaluate models/forward data/latents --split data/split",
+    "data/predicted": "predict models/forward data/latents --steps 1",
+}
+
+
+@pytest.fixture
+def older(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_object_of_an_older_store_is_sound(older: Path, call: Callable[[str], Ran]) -> None:
+    done = call("store verify --json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["damaged"] == []
+
+
+@pytest.mark.parametrize("output", HITS)
+def test_a_command_finds_its_older_result_under_the_same_key(
+    older: Path, call: Callable[[str], Ran], output: str
+) -> None:
+    before = (older / output / "manifest.json").read_bytes()
+    done = call(f"{HITS[output]} -o {output} --json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["ran"] == 0
+    assert (older / output / "manifest.json").read_bytes() == before
+
+
+def test_an_older_dataset_is_opened_with_the_label_that_was_set_by_hand(older: Path) -> None:
+    found = tacpipe.open("data/recordings")
+    assert found.shards["trial-001"].attributes["object"] == "cup"
+
+
+def test_an_older_model_predicts_what_it_predicted_then(older: Path) -> None:
+    found = tacpipe.load("models/forward").predict(tacpipe.open("data/latents"), steps=[1])
+    then = tacpipe.open("data/predicted").table()
+    assert found.column_names == then.column_names
+    for name in found.column_names[2:]:
+        assert np.allclose(found.column(name).to_numpy(), then.column(name).to_numpy(), rtol=1e-4, atol=1e-3), name
