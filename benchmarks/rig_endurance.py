@@ -100,7 +100,7 @@ def main() -> None:
             looks, sealed = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")
         os.environ["TACPIPE_STORE"] = str(folder / "store")
         recordings = tacpipe.open(folder / "rec")
-        (shard,) = recordings.shards.values()
+        (shard,) = recordings.recordings.values()
         first, last = looks[0], looks[-1]
         share = (last.processor_s - first.processor_s) / (last.at_s - first.at_s)
         settled = [one.resident_mb for one in looks if one.at_s - first.at_s > SETTLED_S]

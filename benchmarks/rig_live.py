@@ -61,7 +61,7 @@ def main() -> None:
             words = ["acquire", str(folder / "rig.toml"), "-o", str(folder / "rec"), "--quiet"]
             os.environ["TACPIPE_STORE"] = str(folder / "store")
             done = subprocess.run([str(BIN / "tacpipe"), *words, "--duration", str(60 * chosen.minutes)], check=False)
-        (shard,) = tacpipe.open(folder / "rec").shards.values()
+        (shard,) = tacpipe.open(folder / "rec").recordings.values()
         print(f"acquire ended with {done.returncode}")
         print("| stream | frames sent whole | samples recorded | not among them | harm that cannot be told | beyond |")
         print("| --- | --- | --- | --- | --- | --- |")

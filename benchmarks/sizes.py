@@ -60,7 +60,7 @@ def _line(what: str, dataset: Path) -> timing.Line:
 
 def _tactile(dataset: Path) -> Iterator[tuple[Path, pa.Table]]:
     """Yield the file and the table of each stream whose channels are all tactile and integer."""
-    for name, shard in open_dataset(dataset).shards.items():
+    for name, shard in open_dataset(dataset).recordings.items():
         for stream in shard.streams:
             table = shard.table(stream)
             channels = [field for field in table.schema if field.name != "t_ns"]

@@ -58,7 +58,7 @@ def scale(params: Factor, recording: Recording) -> pa.Table:
 def total(params: Nothing, recordings: Dataset) -> Result:
     """Sum tables."""
     trust_steps.begun("total", "all")
-    sums = {name: int(shard.table()["x"].to_numpy().sum()) for name, shard in recordings.shards.items()}
+    sums = {name: int(shard.table()["x"].to_numpy().sum()) for name, shard in recordings.recordings.items()}
     return Result(files={"total.json": json.dumps(sums).encode()})
 
 
@@ -66,7 +66,7 @@ def values(directory: str) -> dict[str, list[int]]:
     """Return what tacpipe serves of a dataset, by recording."""
     import tacpipe
 
-    return {name: shard.table()["x"].to_pylist() for name, shard in tacpipe.open(directory).shards.items()}
+    return {name: shard.table()["x"].to_pylist() for name, shard in tacpipe.open(directory).recordings.items()}
 
 
 if __name__ == "__main__":

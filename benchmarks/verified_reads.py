@@ -56,7 +56,7 @@ def measure(
 def _of_kind(dataset: Path, kind: str, rounds: int) -> list[timing.Line]:
     found = tacpipe.open(dataset)
     store = locate(dataset)
-    objects = [Path(store.object_path(shard.digest)) for shard in found.shards.values()]
+    objects = [Path(store.object_path(shard.digest)) for shard in found.recordings.values()]
     files = sorted(dataset.glob("*.parquet"))
     size = sum(path.stat().st_size for path in objects)
     columns = [name for name in pq.read_schema(files[0]).names if name != "t_ns"]
@@ -70,8 +70,8 @@ def _of_kind(dataset: Path, kind: str, rounds: int) -> list[timing.Line]:
         return call
 
     tables: Ways = {
-        "verified": lambda: [len(shard.table()) for shard in tacpipe.open(dataset).shards.values()],
-        "unverified": lambda: [len(shard.table()) for shard in plain.shards.values()],
+        "verified": lambda: [len(shard.table()) for shard in tacpipe.open(dataset).recordings.values()],
+        "unverified": lambda: [len(shard.table()) for shard in plain.recordings.values()],
         "pyarrow.parquet.read_table": lambda: [len(pq.read_table(path)) for path in files],
     }
     arrays: Ways = {

@@ -66,7 +66,7 @@ def fit(params: Params, train: Dataset) -> Result:
     from tacpipe.codecs import pca, training_rows
     from tacpipe.plugins.stage import Result
 
-    rows = training_rows.read(train.shards, params.of)
+    rows = training_rows.read(train.recordings, params.of)
     codec = pca.fit_and_measure(rows, components=params.components, variance=params.variance, of=params.of)
     return Result(files=codec.to_files())
 
@@ -89,7 +89,7 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
         gradient_clip=autoencoder_fit.GRADIENT_CLIP,
         seed=params.seed,
     )
-    rows = training_rows.read(train.shards, params.of, params.frames)
+    rows = training_rows.read(train.recordings, params.of, params.frames)
     codec = autoencoder_fit.fit(rows, tried, schedule, workspace, components=params.components, of=params.of)
     return Result(files=codec.to_files())
 

@@ -118,7 +118,7 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
 
     values = asdict(params)
     scheme = Scheme(name=values.pop("scheme"), **values)
-    attributes = {name: shard.attributes for name, shard in recordings.shards.items()}
+    attributes = {name: shard.attributes for name, shard in recordings.recordings.items()}
     roles = assign(attributes, scheme, extend or {})
     bare = without_val(roles) if params.val else []
     enough = sufficient_val(attributes, scheme, extend or {}) if bare else None

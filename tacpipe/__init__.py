@@ -22,7 +22,7 @@ def open(path: Any) -> Dataset:
 def load(path: Any) -> Any:
     """Return the model at ``path``: what its task makes of the files that `tacpipe train` wrote.
 
-    ``model.predict(tacpipe.open(PATH))``, or ``predict`` of one recording among the dataset's ``shards``, returns the arrow
+    ``model.predict(tacpipe.open(PATH))``, or ``predict`` of one recording of it, returns the arrow
     table that ``tacpipe predict`` writes. It is a `tacpipe.tasks.forward.forecaster.Forecaster`, a
     `tacpipe.tasks.material.classifier.Classifier` or a `tacpipe.tasks.touch.predictor.Predictor`, whose ``predict`` also
     reads arrays. Raises `UsageError` if ``path`` holds no model.

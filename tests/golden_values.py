@@ -34,7 +34,7 @@ def values_digest(path: Path) -> str:
     from tacpipe.io.hashing import bytes_digest, digest
 
     found: dict[str, Any] = {}
-    for name, shard in tacpipe.open(path).shards.items():
+    for name, shard in tacpipe.open(path).recordings.items():
         for stream in shard.streams:
             table = shard.table(stream)
             for field, column in zip(table.schema, table.columns, strict=True):

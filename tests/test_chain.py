@@ -47,7 +47,7 @@ def test_persistence_is_what_numpy_computes_from_the_segments(lab: Lab) -> None:
     split = tacpipe.open(lab.folder / "data/split").to_pandas(columns=["recording", "role"])
     test = set(split["recording"][split["role"] == "test"])
     errors = []
-    for name, shard in tacpipe.open(lab.folder / "data/segments").shards.items():
+    for name, shard in tacpipe.open(lab.folder / "data/segments").recordings.items():
         if name not in test:
             continue
         table = shard.table()
@@ -143,14 +143,14 @@ def test_a_model_predicts_from_python_what_the_command_writes_to_the_last_bit(la
     assert model.predict(given).equals(tacpipe.open(lab.folder / "data/predicted").table())
     wanted = tacpipe.open(lab.folder / "data/predicted2").table()
     assert model.predict(given, steps=[7, 2]).equals(wanted)
-    one = model.predict(given.shards["trial-003"], steps=[2, 7])
+    one = model.predict(given.recordings["trial-003"], steps=[2, 7])
     of_it = [row for row in wanted.to_pylist() if row["recording"] == "trial-003"]
     assert one.num_rows and one.to_pylist() == of_it
 
 
 def test_windows_of_a_recording_give_its_predictions_and_hold_its_columns_less_rest(lab: Lab) -> None:
     model = tacpipe.load(lab.folder / "models/forward")
-    shard = tacpipe.open(lab.folder / "data/latents").shards["trial-003"]
+    shard = tacpipe.open(lab.folder / "data/latents").recordings["trial-003"]
     window, plan, t_ns = model.windows(shard)
     found, predicted = shard.table(), model.predict(shard, steps=[4])
     assert t_ns.tolist() == predicted["t_ns"].to_pylist()
@@ -175,7 +175,7 @@ def test_recordings_that_lack_a_stage_of_the_model_are_refused_with_the_stages_t
     with pytest.raises(tacpipe_errors.UsageError, match=missing):
         model.predict(tacpipe.open(lab.folder / "data/recordings"))
     with pytest.raises(tacpipe_errors.UsageError, match="`tacpipe compress pca --components 6` is missing"):
-        model.windows(tacpipe.open(lab.folder / "data/segments").shards["trial-000"])
+        model.windows(tacpipe.open(lab.folder / "data/segments").recordings["trial-000"])
     lab.run("synchronize data/recordings -o data/synced25 --rate-hz 25")
     with pytest.raises(tacpipe_errors.UsageError, match=r"synchronize has rate_hz 25\.0 instead of 50\.0"):
         model.predict(tacpipe.open(lab.folder / "data/synced25"))

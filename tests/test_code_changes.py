@@ -45,7 +45,7 @@ def times(params: Params, recording: Recording) -> RecordingOutput:
 @stage(version=1)
 def sums(params: Params, recordings: Dataset) -> dict:
     """Return the sum of all numbers."""
-    total = sum(sum(shard.table()["x"].to_pylist()) for shard in recordings.shards.values())
+    total = sum(sum(shard.table()["x"].to_pylist()) for shard in recordings.recordings.values())
     return {"sum.txt": str(total).encode()}
 
 

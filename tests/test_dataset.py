@@ -62,11 +62,11 @@ def test_every_table_comes_out_of_a_dataset_as_it_went_in_to_the_bit(
 ) -> None:
     with published(recordings) as path:
         dataset = tacpipe.open(path)
-        assert set(dataset.shards) == set(recordings)
+        assert set(dataset.recordings) == set(recordings)
         for name, several in recordings.items():
-            assert dataset.shards[name].streams == tuple(sorted(several))
+            assert dataset.recordings[name].streams == tuple(sorted(several))
             for stream, table in several.items():
-                assert bits(dataset.shards[name].table(stream)) == bits(table)
+                assert bits(dataset.recordings[name].table(stream)) == bits(table)
 
 
 @given(tables(columns=4))
@@ -217,8 +217,8 @@ def test_more_rows_than_a_group_holds_come_back(rows: int) -> None:
     table = pa.table({"t_ns": np.arange(rows), "x": pa.array(np.arange(rows) % 251, pa.uint8())})
     cut = pa.concat_tables([table.slice(0, 700_001), table.slice(700_001)])
     with published({"trial-000": {"": table}}) as path:
-        assert tacpipe.open(path).shards["trial-000"].table().equals(table)
+        assert tacpipe.open(path).recordings["trial-000"].table().equals(table)
         groups = pq.ParquetFile(path / "trial-000.parquet").metadata.num_row_groups
         assert groups == math.ceil(rows / (1 << 20))
-        (name,) = tacpipe.open(path).shards["trial-000"].digests.values()
+        (name,) = tacpipe.open(path).recordings["trial-000"].digests.values()
     assert bytes_digest(to_parquet(cut)) == name

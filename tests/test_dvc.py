@@ -81,7 +81,7 @@ class Project:
 
     def values(self, dataset: str) -> dict[str, list[int]]:
         """Return the values of each recording as tacpipe reads them."""
-        shards = tacpipe.open(self.folder / dataset).shards
+        shards = tacpipe.open(self.folder / dataset).recordings
         return {name: shard.table()["x"].to_pylist() for name, shard in shards.items()}
 
     def beside(self, dataset: str) -> dict[str, list[int]]:
@@ -311,7 +311,7 @@ def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:
 
     assert "Running stage 'scaled'" in told
     assert "0 ran, 4 reused" in told  # no shard reads the label
-    assert tacpipe.open(toy.folder / "data/scaled").shards["trial-002"].attributes["material"] == "foam"
+    assert tacpipe.open(toy.folder / "data/scaled").recordings["trial-002"].attributes["material"] == "foam"
     assert "Running stage" not in toy.run("dvc repro")
 
 

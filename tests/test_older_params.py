@@ -144,4 +144,4 @@ def test_a_model_of_touch_of_before_is_evaluated_and_predicts(architecture: str,
     before = older(files, "train.touch", **({} if architecture == "pointnet" else {"inputs": "rgbcont"}))
     assert metrics(touch, before, recordings) == metrics(touch, files, recordings)
     (predicted,) = touch.predict(before, recordings, [1]).recordings.values()
-    assert predicted.streams[""].column("recording").to_pylist() == sorted(recordings.shards)
+    assert predicted.streams[""].column("recording").to_pylist() == sorted(recordings.recordings)

@@ -329,12 +329,12 @@ def test_a_lost_shard_that_a_stage_gave_as_it_got_it_is_made_again_by_the_stage_
     monkeypatch.setenv("TACPIPE_LOCK_TIMEOUT_S", "0")  # who waits for itself waits for ever
     lab.run(f"simulate toy --trials 1 --rows {rows} -o data/r")
     lab.run("named data/r -o data/n")
-    wanted = tacpipe.open("data/r").shards["trial-000"].table("left")
+    wanted = tacpipe.open("data/r").recordings["trial-000"].table("left")
     shard = lab.manifest("data/n").recordings["trial-000"]["shards"][""]["digest"]
     assert shard == lab.manifest("data/r").recordings["trial-000"]["shards"]["left"]["digest"]
     for path in (lab.store.object_path(shard), "data/n/trial-000.parquet", "data/r/trial-000/left.parquet"):
         Path(path).unlink()
-    assert tacpipe.open("data/n").shards["trial-000"].table().equals(wanted)
+    assert tacpipe.open("data/n").recordings["trial-000"].table().equals(wanted)
 
 
 def test_shards_are_linked_and_recordings_copied(lab: Lab) -> None:

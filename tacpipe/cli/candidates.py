@@ -96,7 +96,7 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
         if recording is not None:
             raise UsageError(f"{path} is one cloud; --recording {recording} picks one of a dataset. Leave it out.")
         return files.read(path)
-    shards = pipeline.open_dataset(path).shards
+    shards = pipeline.open_dataset(path).recordings
     if recording is None and len(shards) != 1:
         raise UsageError(f"{path} has {len(shards)} recordings; pick one with --recording: {_some(list(shards))}.")
     name = next(iter(shards)) if recording is None else recording

@@ -47,8 +47,8 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     return {
         "kind": "recordings",
         **about,
-        "recordings": {name: _recording(opened.shards[name]) for name in sorted(opened.shards)[:most]},
-        "attributes": {name: dict(shard.attributes) for name, shard in opened.shards.items()},
+        "recordings": {name: _recording(opened.recordings[name]) for name in sorted(opened.recordings)[:most]},
+        "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()},
         "excluded": _excluded(opened),
     }
 
@@ -68,7 +68,7 @@ def _about(opened: Dataset) -> dict[str, Any]:
 
 def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
     """Return how many recordings have each role, by fold, where the dataset is a split; else nothing."""
-    shards = list(opened.shards.values())
+    shards = list(opened.recordings.values())
     if len(shards) != 1 or shards[0].streams != ("",):
         return {}
     table = shards[0].table()

@@ -57,7 +57,7 @@ class Recording:
         """
         if self._manifest is None:
             raise UsageError(
-                f"Recording {self.name} is not of an opened dataset. Take it from tacpipe.open(PATH).shards."
+                f"Recording {self.name} is not of an opened dataset; take it from one: tacpipe.open(PATH)[{self.name!r}]."
             )
         return Dataset(self._manifest, self._read, [self.name])
 
@@ -108,7 +108,9 @@ class Dataset:
         included = manifest.included
         chosen = sorted(included if names is None else names)
         self.source = manifest
-        self.shards: dict[str, Recording] = {name: Recording(name, included[name], read, manifest) for name in chosen}
+        self.recordings: dict[str, Recording] = {
+            name: Recording(name, included[name], read, manifest) for name in chosen
+        }
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
 
     @property
@@ -130,9 +132,9 @@ class Dataset:
         from tacpipe.io.parquet import one_after_another
 
         name = self._only_stream() if stream is None else stream
-        if not self.shards:
+        if not self.recordings:
             raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
-        return one_after_another({shard.name: shard.table(name, columns) for shard in self.shards.values()})
+        return one_after_another({shard.name: shard.table(name, columns) for shard in self.recordings.values()})
 
     def to_pandas(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return all recordings in one frame, after a categorical column ``recording``.
@@ -163,7 +165,7 @@ class Dataset:
         order = columns and [*dict.fromkeys(columns)]
         return {
             shard.name: arrays.of_table(table if order is None else table.select(order))
-            for shard in self.shards.values()
+            for shard in self.recordings.values()
             for table in [shard.table(name, order)]
         }
 
@@ -178,7 +180,7 @@ class Dataset:
             return {name: arrays.to_tensors(found) for name, found in self.to_numpy(stream, columns).items()}
 
     def _only_stream(self) -> str:
-        streams = {stream for shard in self.shards.values() for stream in shard.streams}
+        streams = {stream for shard in self.recordings.values() for stream in shard.streams}
         if len(streams) > 1:
             raise UsageError(f"Name the stream to read: the recordings have {', '.join(sorted(streams))}.")
         return next(iter(streams), "")

@@ -18,7 +18,7 @@ Tree = Mapping[str, Any]
 
 def simulated(result: Dataset) -> bool:
     """Say whether any recording of a result was simulated."""
-    return any(bool(shard.attributes.get("simulated")) for shard in result.shards.values())
+    return any(bool(shard.attributes.get("simulated")) for shard in result.recordings.values())
 
 
 def published(result: Dataset, sets: Collection[str]) -> bool:
@@ -26,7 +26,7 @@ def published(result: Dataset, sets: Collection[str]) -> bool:
 
     The attribute ``published``, which `tacpipe ingest` sets, names the set of a recording.
     """
-    named = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.shards.values()]
+    named = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.recordings.values()]
     return bool(named) and all(one and set(one.split(",")) <= set(sets) for one in named)
 
 

@@ -108,7 +108,7 @@ def test_files_are_written_whole_and_a_picture_is_drawn(lab: Lab, bottle: Cloud,
 def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
     held = SimpleNamespace(streams=("cloud", "grasp"), table=lambda stream: bottle.table())
     bare = SimpleNamespace(streams=("grasp",))
-    opened = SimpleNamespace(shards={"bleach-1": held, "bleach-2": bare})
+    opened = SimpleNamespace(recordings={"bleach-1": held, "bleach-2": bare})
     monkeypatch.setattr("tacpipe.engine.pipeline.open_dataset", lambda path: opened)
     told = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
     assert told == rows(lab.run("candidates bottle.ply --count 3").out)

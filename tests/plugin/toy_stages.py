@@ -96,7 +96,7 @@ def fit(params: Read, train: Dataset) -> Result:
     """Return the mean of the training recordings."""
     import numpy as np
 
-    values = np.concatenate([shard.table()["x"].to_numpy() for shard in train.shards.values()])
+    values = np.concatenate([shard.table()["x"].to_numpy() for shard in train.recordings.values()])
     return Result(files={"codec.json": f"{values.mean():.6f}".encode()})
 
 
@@ -115,7 +115,7 @@ def total(params: Read, recordings: Dataset) -> Result:
     """Return the sum of each recording."""
     import json
 
-    sums = {name: sum(shard.table()["x"].to_pylist()) for name, shard in recordings.shards.items()}
+    sums = {name: sum(shard.table()["x"].to_pylist()) for name, shard in recordings.recordings.items()}
     return Result(files={"metrics.json": json.dumps(sums).encode()})
 
 
@@ -124,7 +124,7 @@ def halves(params: Read, recordings: Dataset) -> Result:
     """Return a split: the first half trains, the second tests."""
     import pyarrow as pa
 
-    names = sorted(recordings.shards)
+    names = sorted(recordings.recordings)
     roles = ["train" if position < len(names) / 2 else "test" for position in range(len(names))]
     fold = pa.array([0] * len(names), pa.int32())
     table = pa.table({"recording": names, "fold": fold, "role": roles})

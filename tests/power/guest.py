@@ -188,7 +188,7 @@ def survived(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, 
     for path in ("data/recordings", "data/scaled"):
         with contextlib.suppress(TacpipeError):
             dataset = api.open(path)
-            for name, shard in dataset.shards.items():
+            for name, shard in dataset.recordings.items():
                 with contextlib.suppress(TacpipeError):
                     factor = 2 if path == "data/scaled" else 1
                     found = shard.table("left" if factor == 1 else "").column("x").to_pylist()
@@ -228,11 +228,11 @@ def recovered(passed: list[str]) -> None:
 
 def held(dataset: Any, names: set[str], *, labelled: bool) -> None:
     """Expect recordings with all their values, and the label that was set by hand."""
-    assert names <= set(dataset.shards), f"{sorted(dataset.shards)} of {sorted(names)}"
-    for name, shard in dataset.shards.items():
+    assert names <= set(dataset.recordings), f"{sorted(dataset.recordings)} of {sorted(names)}"
+    for name, shard in dataset.recordings.items():
         assert shard.table("left").column("x").to_pylist() == values(name), name
     if labelled:
-        assert dataset.shards["a"].attributes.get("material") == "foam", dict(dataset.shards["a"].attributes)
+        assert dataset.recordings["a"].attributes.get("material") == "foam", dict(dataset.recordings["a"].attributes)
 
 
 def main() -> None:

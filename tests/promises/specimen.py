@@ -123,7 +123,7 @@ def held(path: Path) -> Contents:
     """Return all that a dataset gives to whoever opens it."""
     dataset = tacpipe.open(path)
     found: Contents = {}
-    for name, shard in dataset.shards.items():
+    for name, shard in dataset.recordings.items():
         for stream in shard.streams:
             found[f"{name}/{stream}.parquet" if stream else f"{name}.parquet"] = bits(shard.table(stream))
     return {**found, **dict(dataset.files)}

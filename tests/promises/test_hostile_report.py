@@ -88,7 +88,7 @@ def shard(one: Any, words: Words) -> Any:
 
 def poisoned(result: Any, words: Words) -> Any:
     """Return a result in which these words are others; its recordings get labels of the same."""
-    shards = [shard(one, words) for one in result.shards.values()]
+    shards = [shard(one, words) for one in result.recordings.values()]
     files = {name: file(name, content, words) for name, content in result.files.items()}
     return FakeDataset({one.name: one for one in shards}, files, renamed(result.manifest, words))
 

@@ -84,14 +84,14 @@ def kill(
     if not new or not told["recordings"]:
         return None
     os.environ["TACPIPE_STORE"] = str(folder / "store")
-    shard = tacpipe.open(output).shards[new[0]]
+    shard = tacpipe.open(output).recordings[new[0]]
     whole = float(told["recordings"][0]["seconds"]) > duration_s - 0.2  # it was being sealed
     return [_cost(emulator, shard, name, killed_ns, whole=whole) for name in shard.streams if name != "events"]
 
 
 def names(output: Path) -> list[str]:
     """Return the recordings of a dataset, none where there is none yet."""
-    return list(tacpipe.open(output).shards) if (output / "manifest.json").exists() else []
+    return list(tacpipe.open(output).recordings) if (output / "manifest.json").exists() else []
 
 
 def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, whole: bool) -> Cost:

@@ -67,7 +67,7 @@ def spools(folder: Path) -> list[Path]:
 
 def shards(folder: Path, output: str = "rec") -> dict[str, Any]:
     """Return the recordings of a dataset by name."""
-    return dict(tacpipe.open(folder / output).shards)
+    return dict(tacpipe.open(folder / output).recordings)
 
 
 def only(folder: Path, output: str = "rec") -> Any:

@@ -142,5 +142,5 @@ def test_later_stages_read_it(acquired: Lab) -> None:
     acquired.run("synchronize rec -o grid --rate-hz 50")
     grid = tacpipe.open(acquired.folder / "grid")
 
-    assert list(grid.shards) == ["one", "two"]
+    assert list(grid.recordings) == ["one", "two"]
     assert Path(acquired.folder / "grid/manifest.json").exists()

@@ -42,13 +42,13 @@ def forward_single() -> list[Any]:
         f'{{"epoch": {epoch}, "train_loss": {0.4 / epoch**0.5}, "val_loss": {0.42 / epoch**0.5}}}'
         for epoch in range(1, 9)
     ]
-    return [FakeDataset(one.shards, {**one.files, "history.jsonl": "\n".join(lines).encode()}, one.manifest)]
+    return [FakeDataset(one.recordings, {**one.files, "history.jsonl": "\n".join(lines).encode()}, one.manifest)]
 
 
 def forward_of_long_names() -> list[Any]:
     one = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5})
     trials = one.files["trials.csv"].decode().replace("\nr", f"\n{LONG}-r").encode()
-    shards = {f"{LONG}-{name}": FakeShard(f"{LONG}-{name}", shard.content) for name, shard in one.shards.items()}
+    shards = {f"{LONG}-{name}": FakeShard(f"{LONG}-{name}", shard.content) for name, shard in one.recordings.items()}
     return [FakeDataset(shards, {**one.files, "trials.csv": trials}, one.manifest)]
 
 

@@ -39,5 +39,5 @@ def grasps(rig: Rig, indices: Iterable[int], *, seed: int = SEED) -> Any:
 def readings(made: Any, target: str, stream: str = "reading", prefix: str = "") -> NDArray[np.float64]:
     """What was read of a target (grasp, value), counts; with ``truth`` and ``gt_expected_`` what was to be expected."""
     columns = [prefix + column for column in biotac_sp.columns(target)]
-    rows = [[shard.table(stream).column(column)[0].as_py() for column in columns] for shard in made.shards.values()]
+    rows = [[shard.table(stream).column(column)[0].as_py() for column in columns] for shard in made.recordings.values()]
     return np.array(rows, np.float64)

@@ -49,7 +49,7 @@ def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_ar
     made = grasps(Rig(), range(60))
     strong = touch.load(trained(made, tmp_path, trees=20, leaf=2))
     rng = np.random.default_rng(0)
-    for shard in list(made.shards.values())[:12]:
+    for shard in list(made.recordings.values())[:12]:
         cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
         turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)
         moved = Cloud((cloud.points_m @ turn.T + shift_m).astype(np.float32), cloud.colours)
@@ -102,10 +102,12 @@ def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("remembered")
 def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
     made = grasps(Rig(drift_count_day=0.0), range(240))
-    names = list(made.shards)
+    names = list(made.recordings)
     gains: dict[str, list[float]] = {target: [] for target in biotac_sp.TARGETS}
     for fold in range(4):
-        training, tested = (type(made)({name: made.shards[name] for name in part}, {}) for part in _parted(names, fold))
+        training, tested = (
+            type(made)({name: made.recordings[name] for name in part}, {}) for part in _parted(names, fold)
+        )
         errors = [
             judged(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
             for inputs in ("xyz", "rgb")

@@ -126,14 +126,14 @@ def test_of_materials_that_are_all_the_same_sessions_are_told_and_nothing_is_lef
     def of(session: int, numbers: range) -> Any:
         chosen = [
             shard
-            for shard in every.shards.values()
+            for shard in every.recordings.values()
             if str(shard.attributes["session"]).endswith(f"s{session}") and shard.attributes["trial"] in numbers
         ]
         assert chosen
         return dataset(*chosen)
 
     def both(numbers: range) -> Any:
-        return dataset(*of(1, numbers).shards.values(), *of(2, numbers).shards.values())
+        return dataset(*of(1, numbers).recordings.values(), *of(2, numbers).recordings.values())
 
     model = {"features": 2_000}
     blocked, _ = judged(trained(tmp_path, both(range(12)), dataset(), **model), both(range(12, 16)))
@@ -146,7 +146,7 @@ def test_of_materials_that_are_all_the_same_sessions_are_told_and_nothing_is_lef
 
 
 def test_the_rig_gives_the_same_slides_again() -> None:
-    one, other = (slides(RIG, [4, 5]).shards for _ in range(2))
+    one, other = (slides(RIG, [4, 5]).recordings for _ in range(2))
     for name, shard in one.items():
         assert shard.table("slide").equals(other[name].table("slide"))
     assert np.isfinite([shard.attributes["slide_frames"] for shard in one.values()]).all()

@@ -31,7 +31,7 @@ class FakeShard:
 
 @dataclass
 class FakeDataset:
-    shards: Mapping[str, FakeShard] = field(default_factory=dict)
+    recordings: Mapping[str, FakeShard] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     manifest: dict[str, Any] = field(default_factory=dict)
 

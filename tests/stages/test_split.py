@@ -19,7 +19,7 @@ Recording = Callable[..., Any]
 
 @dataclass(frozen=True)
 class FakeDataset:
-    shards: dict[str, Any]
+    recordings: dict[str, Any]
 
 
 def dataset(shard: Recording, count: int) -> FakeDataset:

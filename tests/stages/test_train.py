@@ -67,7 +67,7 @@ def test_what_is_not_named_is_what_the_model_of_init_is(tmp_path: Path) -> None:
 
 def test_an_architecture_that_cannot_read_latents_is_refused_before_training(tmp_path: Path) -> None:
     given = compressed(motion(0))
-    given.shards["absent"] = None  # whoever reads on past the first recording trips over this one
+    given.recordings["absent"] = None  # whoever reads on past the first recording trips over this one
     with pytest.raises(TacpipeError, match=r"reads raw channels .* the recordings hold latents"):
         STAGE(asked("train.forward", architecture="taxelwise"), given, given, tmp_path)
     assert not any(tmp_path.iterdir())

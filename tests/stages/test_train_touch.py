@@ -64,10 +64,10 @@ def test_a_model_from_the_store_tells_the_touch_of_a_grasp_and_refuses_what_is_n
     lab.run("evaluate model grasps --split split -o results")
     metrics = json.loads(tacpipe.open("results").files["metrics.json"])
     assert metrics["model"]["n"] == metrics["counts"]["grasps"] > 0
-    model, found = tacpipe.load("model"), tacpipe.open("results").shards["predictions"]
+    model, found = tacpipe.load("model"), tacpipe.open("results").recordings["predictions"]
     assert found.attributes["simulated"] is True
     name = found.table("grasps").to_pydict()["recording"][0]
-    shard = tacpipe.open("grasps").shards[name]
+    shard = tacpipe.open("grasps").recordings[name]
     cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
     told = model.predict(cloud, grasp)
     row = found.table("model").to_pylist()[0]

@@ -290,7 +290,7 @@ def _paper_traces(overview: Overview) -> str:
             continue
         run = overview.median(found[0])
         name = _median_recording(run.dataset)
-        svg = traces.draw(run.dataset.shards[name], latents, FIGURE_STEPS) if name else ""
+        svg = traces.draw(run.dataset.recordings[name], latents, FIGURE_STEPS) if name else ""
         if svg:
             caption = f"{title}, on {name}, the recording of median skill of {found[0].name}. {traces.UNSHIFTED}"
             drawn.append(markup.figure(svg, caption))
@@ -303,6 +303,6 @@ def _median_recording(result: Dataset) -> str | None:
     judged = sorted(
         (float(one["skill"]), one["recording"])
         for one in trials
-        if one["seen"] == "false" and one["skill"] and one["recording"] in result.shards
+        if one["seen"] == "false" and one["skill"] and one["recording"] in result.recordings
     )
     return judged[len(judged) // 2][1] if judged else None

@@ -268,7 +268,7 @@ def _trials(trials: Sequence[Mapping[str, str]]) -> str:
 def _traces(result: Dataset, trials: Sequence[Mapping[str, str]], count: int) -> str:
     """Return example predictions of the recordings of median, lowest and highest skill."""
     judged = sorted(
-        (one for one in trials if one["seen"] == "false" and one["skill"] and one["recording"] in result.shards),
+        (one for one in trials if one["seen"] == "false" and one["skill"] and one["recording"] in result.recordings),
         key=lambda one: float(one["skill"]),
     )
     if not judged or not count:
@@ -279,7 +279,7 @@ def _traces(result: Dataset, trials: Sequence[Mapping[str, str]], count: int) ->
         name = one["recording"]
         if name not in drawn:
             caption = f"{name}, the recording of {rank} skill ({markup.skill(float(one['skill']))}). {traces.UNSHIFTED}"
-            drawn[name] = markup.figure(traces.draw(result.shards[name], (0, 1), TRACE_STEPS), caption)
+            drawn[name] = markup.figure(traces.draw(result.recordings[name], (0, 1), TRACE_STEPS), caption)
     return "<h3>Predictions</h3>" + "".join(drawn.values())
 
 

@@ -26,7 +26,7 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
     A result without predictions of unseen slides has nothing to compare and is told as its metrics name it. Nothing is
     drawn by recording, so ``traces`` is of no effect.
     """
-    runs = [Run.read(one) for one in results if "predictions" in one.shards]
+    runs = [Run.read(one) for one in results if "predictions" in one.recordings]
     runs = [run for run in runs if run.sensors]
     compared = {id(run.dataset) for run in runs}
     bare = [one for one in results if id(one) not in compared]

@@ -45,7 +45,7 @@ class Run:
     def read(cls, dataset: Dataset) -> Run:
         """Return the run that a result holds."""
         config, metrics = (contents.tree(dataset, name) for name in ("config.json", "metrics.json"))
-        found = predictions.read(dataset.shards["predictions"].table(), config)
+        found = predictions.read(dataset.recordings["predictions"].table(), config)
         return cls(dataset, config, metrics, contents.history(dataset), found)
 
     @property

@@ -21,12 +21,12 @@ SLIDE, PROFILE = "slide", "profile"
 
 def reads(dataset: Dataset) -> bool:
     """Say whether a dataset holds slides."""
-    return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.shards.values())
+    return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.recordings.values())
 
 
 def section(datasets: Sequence[Dataset]) -> str:
     """Return what slides were like; empty without any."""
-    shards = [shard for one in datasets for shard in one.shards.values() if reads(one)]
+    shards = [shard for one in datasets for shard in one.recordings.values() if reads(one)]
     if not shards:
         return ""
     published = all(provenance.published(one, PAPERS_SETS) for one in datasets)

@@ -27,7 +27,7 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
     A result without predictions of unseen grasps has nothing to compare and is told as its metrics name it. Nothing is
     drawn over time, so ``traces`` is of no effect.
     """
-    runs = [Run.read(one) for one in results if PREDICTIONS in one.shards]
+    runs = [Run.read(one) for one in results if PREDICTIONS in one.recordings]
     runs = [run for run in runs if len(run.predictions.recordings)]
     compared = {id(run.dataset) for run in runs}
     bare = [one for one in results if id(one) not in compared]

@@ -21,7 +21,7 @@ SHOWN = 3
 
 def reads(dataset: Dataset) -> bool:
     """Say whether a dataset holds clouds with grasps."""
-    return any(_whole(shard) for shard in dataset.shards.values())
+    return any(_whole(shard) for shard in dataset.recordings.values())
 
 
 def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
@@ -29,7 +29,7 @@ def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
 
     Where none of them is there, the first grasps are drawn.
     """
-    shards = {name: shard for one in datasets for name, shard in one.shards.items() if _whole(shard)}
+    shards = {name: shard for one in datasets for name, shard in one.recordings.items() if _whole(shard)}
     if not shards:
         return ""
     told = {name: words for name, words in chosen.items() if name in shards} or dict.fromkeys(

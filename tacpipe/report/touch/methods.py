@@ -40,7 +40,7 @@ class Run:
     @classmethod
     def read(cls, dataset: Dataset) -> Run:
         """Return the run that a result holds."""
-        found = predictions.read(dataset.shards[PREDICTIONS])
+        found = predictions.read(dataset.recordings[PREDICTIONS])
         return cls(dataset, contents.tree(dataset, "config.json"), contents.history(dataset), found)
 
     @property

@@ -43,7 +43,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
-    for name, shard in sorted(recordings.shards.items()):
+    for name, shard in sorted(recordings.recordings.items()):
         track = tracks.track(shard, forecaster.codec)
         check_rate(track, forecaster)
         trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)

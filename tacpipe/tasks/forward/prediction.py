@@ -42,7 +42,7 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
             )
     check_codec(forecaster.codec_files, recordings.files)
     found = {}
-    for name, shard in sorted(recordings.shards.items()):
+    for name, shard in sorted(recordings.recordings.items()):
         track = tracks.track(shard, forecaster.codec)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
@@ -60,7 +60,7 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
 def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     """Return the windows of a dataset's only recording, as `Forecaster.predict` reads them."""
     check_codec(forecaster.codec_files, recordings.files)
-    (shard,) = recordings.shards.values()
+    (shard,) = recordings.recordings.values()
     track = tracks.track(shard, forecaster.codec)
     check_rate(track, forecaster)
     starts = track.starts(forecaster.context, forecaster.horizon)

@@ -64,15 +64,15 @@ def train(
     Raises `TacpipeError` where recordings lack columns or windows or hold what the architecture cannot read, and where
     ``init`` has another shape or codec.
     """
-    if not training.shards:
+    if not training.recordings:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
-    codec = tracks.codec_of(next(iter(training.shards.values())).table(), training.files)
+    codec = tracks.codec_of(next(iter(training.recordings.values())).table(), training.files)
     start = Forecaster.load(init) if init else None
     params = _resolved(params, codec, start)
     if init and start:
         _check_start(start, init, params, codec, training.files)
     parts = [
-        [tracks.track(shard, codec) for _, shard in sorted(dataset.shards.items())]
+        [tracks.track(shard, codec) for _, shard in sorted(dataset.recordings.items())]
         for dataset in (training, validation)
     ]
     rate_hz = tracks.rate_hz([one for part in parts for one in part])
@@ -206,7 +206,7 @@ def _reference(quaternions: Sequence[Floats]) -> Floats:
 
 def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str, str]:
     """Return the digests of all recordings that the model has seen by name, those of the one it began with included."""
-    digests = {shard.name: shard.digest for part in parts for shard in part.shards.values()}
+    digests = {shard.name: shard.digest for part in parts for shard in part.recordings.values()}
     return seen(digests, start.config["trained_on"] if start else {})
 
 

@@ -247,7 +247,7 @@ class Classifier:
         for all that there were. Raises `TacpipeError` for what `tacpipe.tasks.material.slides.read` refuses.
         """
         only = tuple(self.layouts) if self.config["params"]["sensors"] else ()
-        there = {shard.attributes.get("sensor") for shard in recordings.shards.values()}
+        there = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
         only = tuple(name for name in only if name in there) or only
         found = slides_of.read(recordings, only=only, quantities=self.quantities, labelled=labelled)
         for one in found.values():

@@ -90,7 +90,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         ),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    attributes = {name: shard.attributes for name, shard in recordings.shards.items()}
+    attributes = {name: shard.attributes for name, shard in recordings.recordings.items()}
     table = predictions_table(judged, classifier, {name: one.get("session") for name, one in attributes.items()})
     return Result({PREDICTIONS: RecordingOutput(table, origin.together(attributes.values()))}, files)
 

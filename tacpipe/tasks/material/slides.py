@@ -85,7 +85,7 @@ def read(
     """
     found: dict[str, list[tuple[Recording, Layout, NDArray[np.float32]]]] = {}
     there: set[str] = set()
-    for name, shard in sorted(recordings.shards.items()):
+    for name, shard in sorted(recordings.recordings.items()):
         sensor = shard.attributes.get("sensor")
         if not isinstance(sensor, str):
             raise TacpipeError(

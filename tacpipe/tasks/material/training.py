@@ -72,7 +72,7 @@ def train(
     kinds = slides_of.quantities(params["quantities"]) or QUANTITIES.get(params["architecture"], (slides_of.TACTILE,))
     known = slides_of.read(training, only=only, quantities=kinds, labelled=True)
     watched: dict[str, Slides] = {}
-    if validation is not None and validation.shards:
+    if validation is not None and validation.recordings:
         watched = slides_of.read(validation, only=only, quantities=kinds, labelled=True)
     if not known:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")

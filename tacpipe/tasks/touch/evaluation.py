@@ -64,7 +64,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     streams[GRASPS] = _about(grasps, seen, known)
-    attributes = origin.together(shard.attributes for shard in recordings.shards.values())
+    attributes = origin.together(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
 
@@ -147,7 +147,7 @@ def _about(grasps: Grasps, seen: Mask, known: Mask) -> pa.Table:
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
     """Return the attribute that marks what simulated recordings led to; none where all are real."""
-    found = any(bool(shard.attributes.get("simulated")) for shard in recordings.shards.values())
+    found = any(bool(shard.attributes.get("simulated")) for shard in recordings.recordings.values())
     return {"simulated": True} if found else {}
 
 

@@ -62,8 +62,8 @@ def read(recordings: Dataset, *, felt: bool = True) -> Grasps:
     Raises `TacpipeError` where a recording lacks a stream or a column, where a value is not finite, where a cloud has
     next to no points, and where a grasp lies far from it.
     """
-    names = sorted(recordings.shards)
-    shards = [recordings.shards[name] for name in names]
+    names = sorted(recordings.recordings)
+    shards = [recordings.recordings[name] for name in names]
     clouds, grasps, t_ns = [], [], []
     readings: dict[str, list[Floats]] = {target: [] for target in biotac_sp.TARGETS}
     for shard in shards:

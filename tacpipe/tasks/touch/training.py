@@ -58,7 +58,7 @@ def train(
     known = grasps_of.read(training)
     if not len(known):
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
-    watched = grasps_of.read(validation) if validation is not None and validation.shards else None
+    watched = grasps_of.read(validation) if validation is not None and validation.recordings else None
     if watched is not None and params["use_validation"] and not _chooses(params):
         known, watched = known.joined(watched), None
     config = _config(params, targets, known, watched)

@@ -77,7 +77,7 @@ def test_the_errors_of_a_recording_in_several_runs_stay_together() -> None:
 def test_a_recording_that_is_known_in_one_fold_and_unseen_in_another_counts_once_in_each() -> None:
     one, other = result(seed=0, ratio=RATIO), result(seed=1, ratio=RATIO)
     swapped = errors({"model": RATIO}, known=("r1", "r3"))
-    folds = runs(one, FakeDataset(other.shards, {**other.files, "errors.parquet": swapped}, other.manifest))
+    folds = runs(one, FakeDataset(other.recordings, {**other.files, "errors.parquet": swapped}, other.manifest))
     known = pooled(folds)
     assert dict(zip(known.recordings, known.windows.tolist(), strict=True)) == {"r1": 20, "r2": 30, "r3": 20}
     unseen = pooled(folds, known=False)
@@ -87,7 +87,7 @@ def test_a_recording_that_is_known_in_one_fold_and_unseen_in_another_counts_once
 def test_one_recording_has_no_interval() -> None:
     one = result(ratio=RATIO)
     files = {**one.files, "errors.parquet": errors({"model": RATIO}, windows={"r1": 10})}
-    found = comparison.skill(pooled(runs(FakeDataset(one.shards, files, one.manifest))), STEPS)
+    found = comparison.skill(pooled(runs(FakeDataset(one.recordings, files, one.manifest))), STEPS)
     assert np.allclose(found.mean, 0.5)
     assert np.isnan(found.low).all()
 
@@ -136,7 +136,7 @@ def test_rows_are_all_methods_and_baselines_with_the_best_first() -> None:
 def test_what_else_was_made_of_a_models_forecast_is_a_row_of_its_method_and_no_baseline() -> None:
     one = result("PCA-20", ratio=2.0)
     ratios = {"model": dict.fromkeys(WINDOWS, 2.0), "model_anchored": dict.fromkeys(WINDOWS, 0.5)}
-    anchored = FakeDataset(one.shards, {**one.files, "errors.parquet": errors(ratios)}, one.manifest)
+    anchored = FakeDataset(one.recordings, {**one.files, "errors.parquet": errors(ratios)}, one.manifest)
     found = comparison.rows(methods.grouped(runs(anchored, result("raw"))), STEPS, known=True)
     assert {row.name: row.score for row in found if "anchored" in row.name} == {"recurrent · PCA-20 · anchored": 0.5}
     method, other = methods.grouped(runs(anchored, result("raw")))
@@ -210,7 +210,7 @@ def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_c
 def test_only_steps_that_all_runs_predict_are_shown() -> None:
     one, other = result(), result(seed=1)
     files = {**other.files, "errors.parquet": errors({"model": dict.fromkeys(WINDOWS, 0.5)}, steps=range(1, 11))}
-    long = FakeDataset(other.shards, files, other.manifest)
+    long = FakeDataset(other.recordings, files, other.manifest)
     assert comparison.shown_steps(runs(long)) == (1, 3, 5, 10)
     assert comparison.shown_steps(runs(one, long)) == (1, 3)
     assert pooled(runs(one, long)).steps == (1, 2, 3)

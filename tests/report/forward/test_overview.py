@@ -37,7 +37,7 @@ def many(ratio: float | dict[str, float], recordings: int = 8, **how: Any) -> An
     by_name = dict.fromkeys(names, ratio) if isinstance(ratio, float) else ratio
     ratios = {"model": by_name, "ridge": dict.fromkeys(names, 0.75), "last_value_linear": dict.fromkeys(names, 0.9)}
     return FakeDataset(
-        one.shards, {**one.files, "errors.parquet": errors(ratios, names, known=tuple(names))}, one.manifest
+        one.recordings, {**one.files, "errors.parquet": errors(ratios, names, known=tuple(names))}, one.manifest
     )
 
 
@@ -109,7 +109,7 @@ def test_recordings_whose_objects_nobody_named_are_neither_known_nor_unseen() ->
     none = pa.array([None] * table.num_rows, pa.string())
     content = io.BytesIO()
     pq.write_table(table.set_column(table.column_names.index("object"), "object", none), content)
-    unnamed = FakeDataset(one.shards, {**one.files, "errors.parquet": content.getvalue()}, one.manifest)
+    unnamed = FakeDataset(one.recordings, {**one.files, "errors.parquet": content.getvalue()}, one.manifest)
     found = over(unnamed, unnamed)
     assert found.parts == [None]
     html = overview.render(found, [], simulated=False)

@@ -57,7 +57,7 @@ def test_results_of_before_groups_were_renamed_are_still_read(judged: Any) -> No
             old[name][measure]["all"] = old[name][measure].pop("both")
     del old["known"], old["unseen"]
     files = {**judged.files, "metrics.json": json.dumps(old).encode()}
-    text = page.render([FakeDataset(judged.shards, files, judged.manifest)], title="t").decode()  # type: ignore[list-item]
+    text = page.render([FakeDataset(judged.recordings, files, judged.manifest)], title="t").decode()  # type: ignore[list-item]
     assert "model, sensor1" in text
     assert "model, all" not in text
 
@@ -67,7 +67,7 @@ def test_simulated_results_say_so_and_others_do_not(judged: Any) -> None:
     badge = '<span class="badge">simulated</span>'
     assert badge in page.render([judged], title="t").decode()
     measured: Any = FakeDataset(
-        {name: FakeShard(name, one.content) for name, one in judged.shards.items()}, judged.files
+        {name: FakeShard(name, one.content) for name, one in judged.recordings.items()}, judged.files
     )
     assert badge not in page.render([measured], title="t").decode()
 
@@ -139,7 +139,7 @@ def test_results_on_recordings_that_were_all_trained_on_are_not_compared() -> No
         one = result_fakes.result(seed=seed)
         ratios = {"model": dict.fromkeys(result_fakes.WINDOWS, 0.5)}
         files = {**one.files, "errors.parquet": result_fakes.errors(ratios, seen=tuple(result_fakes.WINDOWS))}
-        seen.append(FakeDataset(one.shards, files, one.manifest))
+        seen.append(FakeDataset(one.recordings, files, one.manifest))
     assert "methods in" not in page.render(seen, title="t").decode()  # type: ignore[arg-type]
 
 

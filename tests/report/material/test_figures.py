@@ -148,7 +148,7 @@ def test_slides_are_counted_and_the_one_of_median_force_is_drawn() -> None:
 @pytest.mark.parametrize("lacking", ["force_n", "speed_m_s"])
 def test_what_was_not_measured_is_not_drawn(lacking: str) -> None:
     given = material_fakes.recorded(1, outside=0)
-    shard = given.shards["biotac-m01-t000"]
+    shard = given.recordings["biotac-m01-t000"]
     short = shard.tables["profile"].drop_columns([lacking] if lacking == "force_n" else [lacking, "speed_raw_m_s"])
     shard.tables = {**shard.tables, "profile": short}
     assert profiles.section([given]).count("<svg") == 1

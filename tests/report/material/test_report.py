@@ -91,7 +91,7 @@ def test_a_labs_own_slides_get_nothing_that_the_paper_says_of_its_own(simulated:
         result(wrong=BOTH, also=level, joint=True, reduce="biotac", ratio=25, epochs=3, **how),
     ]
     slides = material_fakes.recorded()
-    for shard in slides.shards.values():
+    for shard in slides.recordings.values():
         del shard.attributes["published"]
     text = unescape(page.render([*given, slides], title="").decode()).partition("</style>")[2]
     for told in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure 5", "Materials are"):

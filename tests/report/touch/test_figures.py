@@ -61,7 +61,7 @@ def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
         ("worst decile", "object01-000"),
     ]
     assert [one.error for one in chosen] == pytest.approx([0.06, 0.02, 0.10], abs=1e-5)
-    shard = given.shards["predictions"]
+    shard = given.recordings["predictions"]
     back = list(range(len(names)))[::-1]
     shard.tables = {name: table.take(back) for name, table in shard.tables.items()}
     assert [one.recording for one in electrodes.chosen([Run.read(given)])] == [one.recording for one in chosen]
@@ -95,7 +95,7 @@ def test_a_cloud_is_drawn_with_its_grasp_and_the_chosen_ones_first() -> None:
 def test_a_dataset_without_clouds_or_grasps_is_not_read() -> None:
     given = recorded(["a"])
     assert clouds.reads(given)
-    shard = given.shards["a"]
+    shard = given.recordings["a"]
     shard.tables = {name: table for name, table in shard.tables.items() if name != "grasp"}
     assert not clouds.reads(given)
 

@@ -38,10 +38,10 @@ def test_a_baseline_that_is_better_takes_the_green_and_is_named() -> None:
 
 def test_targets_with_unlike_verdicts_are_not_green_together() -> None:
     given = result(baselines={"object_mean": 0.04})
-    del given.shards["predictions"].tables["object_mean"]
+    del given.recordings["predictions"].tables["object_mean"]
     other = result(targets=("pdc_th",), baselines={"object_mean": 0.04})
-    rows = given.shards["predictions"].tables
-    rows["object_mean"] = other.shards["predictions"].tables["object_mean"]  # of one target alone
+    rows = given.recordings["predictions"].tables
+    rows["object_mean"] = other.recordings["predictions"].tables["object_mean"]  # of one target alone
     ((known, verdict),) = said(given)
     assert "is better than the best baseline on PDC middle finger" in known
     assert "is worse than the best baseline on PDC thumb" in known

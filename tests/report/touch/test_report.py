@@ -83,7 +83,7 @@ def test_that_an_objects_grasps_follow_one_another_is_said_where_they_do() -> No
     told = "of 23 evaluated grasps follow one of the same object in time"
     assert f"21 {told}" in page.render([result(published=False)], title="t").decode()
     turns = result(published=False)
-    tables = turns.shards["predictions"].tables
+    tables = turns.recordings["predictions"].tables
     t_ns = pa.array([index % 8 * 3 + index // 8 for index in range(24)] + [99], pa.int64())
     place = tables["grasps"].column_names.index("t_ns")
     tables["grasps"] = tables["grasps"].set_column(place, "t_ns", t_ns)
@@ -109,7 +109,7 @@ def test_one_result_of_one_target_is_told_without_what_it_lacks() -> None:
 
 def test_a_result_without_a_constant_is_told_without_skill() -> None:
     given = result()
-    del given.shards["predictions"].tables["constant"]
+    del given.recordings["predictions"].tables["constant"]
     elements.check(page.render([given], title="t").decode())
 
 

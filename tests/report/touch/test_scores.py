@@ -77,7 +77,7 @@ def test_where_nothing_is_said_there_is_no_score() -> None:
 
 def test_without_a_constant_there_is_no_skill() -> None:
     given = result()
-    del given.shards["predictions"].tables["constant"]
+    del given.recordings["predictions"].tables["constant"]
     found = scores.score(runs(given), "pdc_th", True)
     assert found is not None and math.isnan(found.skill.mean)
     assert found.rmse == pytest.approx(0.05, abs=1e-6)

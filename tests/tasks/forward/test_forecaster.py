@@ -77,7 +77,7 @@ def test_predict_says_what_is_judged(
     name: str, models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
     made = load(models[name])
-    shard = TEST if "raw" in name else compressed(TEST, files=latents["levels"].files).shards[TEST.name]
+    shard = TEST if "raw" in name else compressed(TEST, files=latents["levels"].files).recordings[TEST.name]
     found, starts, some = foretold(made, shard)
     predicted = made.predict(*asked(found, starts))
     assert predicted.shape == (72, HORIZON, len(CHANNELS))
@@ -90,7 +90,7 @@ def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_wi
     models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
     made = load(models["gru increments"])
-    shard = compressed(TEST, files=latents["increments"].files, of="increments").shards[TEST.name]
+    shard = compressed(TEST, files=latents["increments"].files, of="increments").recordings[TEST.name]
     found, starts, some = foretold(made, shard)
     predicted, wanted = made.predict(*asked(found, starts)), some.predictions["model"].count
     # the first window begins where the recording does, so that nothing is lost
@@ -144,7 +144,7 @@ def test_touch_after_now_does_not_change_what_is_predicted_now(
     later = FakeShard(TEST.name, table(felt, poses(TEST)))
     shards: list[Any] = [TEST, later]
     if "levels" in name:
-        shards = [compressed(one, files=latents["levels"].files).shards[TEST.name] for one in shards]
+        shards = [compressed(one, files=latents["levels"].files).recordings[TEST.name] for one in shards]
     (_, _, before), (_, _, after) = (foretold(made, one) for one in shards)
     known = now - CONTEXT + 2  # windows whose last frame of the past is not after ``now``
     for predictor, said in before.predictions.items():

@@ -243,7 +243,7 @@ def test_what_the_codec_alone_loses_stands_beside_the_model(
 ) -> None:
     of = name.split()[1]
     codec, test = latents[of], compressed(*TEST, files=latents[of].files, of=of)
-    metrics, result = judged(latent_models[name], *test.shards.values(), files=codec.files)
+    metrics, result = judged(latent_models[name], *test.recordings.values(), files=codec.files)
     assert set(metrics) - LINEAR - {"known", "unseen", "counts", "skill", "anticipation", "context_mean"} == {
         *("model", "persistence"),
         *rows,
@@ -264,7 +264,7 @@ def test_what_the_codec_loses_is_what_numpy_computes(
 ) -> None:
     codec = Forecaster.load(latent_models["gru levels"]).codec
     test = compressed(*TEST, files=latents["levels"].files)
-    metrics, _ = judged(latent_models["gru levels"], *test.shards.values(), files=latents["levels"].files)
+    metrics, _ = judged(latent_models["gru levels"], *test.recordings.values(), files=latents["levels"].files)
     lost = {one.name: codec.decode(codec.encode(counts(one), CHANNELS)) - counts(one) for one in TEST}
     windows = np.concatenate([sliding(one) for one in lost.values()])
     for predictor, wanted in (
@@ -281,7 +281,7 @@ def test_latents_of_another_codec_are_refused(
 ) -> None:
     other = compressed(*TEST)
     with pytest.raises(TacpipeError, match="another codec than the model's"):
-        judged(latent_models["gru levels"], *other.shards.values(), files=other.files)
+        judged(latent_models["gru levels"], *other.recordings.values(), files=other.files)
     with pytest.raises(TacpipeError, match="trial-20: There is no column z00"):
         judged(latent_models["gru levels"], *TEST)
 
@@ -290,7 +290,7 @@ def test_a_model_of_raw_channels_reads_recordings_that_have_latents_too(
     model: dict[str, bytes], latents: Mapping[str, Any]
 ) -> None:
     test = compressed(*TEST, files=latents["levels"].files)
-    metrics, _ = judged(model, *test.shards.values(), files=latents["levels"].files)
+    metrics, _ = judged(model, *test.recordings.values(), files=latents["levels"].files)
     assert metrics == judged(model, *TEST)[0]
 
 

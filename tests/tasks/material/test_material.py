@@ -230,7 +230,7 @@ def test_networks_are_trained_by_the_loop_that_all_tasks_share(tmp_path: Path, m
 
 
 def same_but(**attributes: Any) -> Any:
-    return dataset(*slides(0, 2).shards.values(), slide("roboskin", 1, 9, **attributes))
+    return dataset(*slides(0, 2).recordings.values(), slide("roboskin", 1, 9, **attributes))
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def test_the_labels_of_held_out_materials_reach_nothing_that_is_fitted(tmp_path:
 def test_a_material_that_a_sensor_never_felt_is_as_one_held_out(tmp_path: Path) -> None:
     some = [
         one
-        for one in slides(0, 5).shards.values()
+        for one in slides(0, 5).recordings.values()
         if (one.attributes["sensor"], one.attributes["material"]) != ("roboskin", 4)
     ]
     files = trained(tmp_path, dataset(*some))
@@ -102,7 +102,7 @@ def test_a_material_that_a_sensor_never_felt_is_as_one_held_out(tmp_path: Path) 
 def test_the_speed_is_that_which_recordings_tell_and_else_that_of_params(tmp_path: Path) -> None:
     told = json.loads(trained(tmp_path)[CONFIG])["spectra"]["speed_m_s"]
     assert told == {"biotac": 0.025, "roboskin": 0.05}
-    some = [*slides(0, 4).shards.values(), *(slide("biotac", kind, 9, speed_m_s=0.03) for kind in WAVES)]
+    some = [*slides(0, 4).recordings.values(), *(slide("biotac", kind, 9, speed_m_s=0.03) for kind in WAVES)]
     told = json.loads(trained(tmp_path, dataset(*some), speeds="roboskin=0.04")[CONFIG])["spectra"]["speed_m_s"]
     assert told == {"biotac": 0.03, "roboskin": 0.04}
 
@@ -116,7 +116,7 @@ def test_the_wrong_speed_takes_what_sensors_share(tmp_path: Path) -> None:
 def test_one_sensor_alone_learns_its_own_materials(tmp_path: Path) -> None:
     metrics, _ = judged(
         trained(tmp_path, sensors="roboskin"),
-        dataset(*(one for one in slides(5, 3).shards.values() if one.attributes["sensor"] == "roboskin")),
+        dataset(*(one for one in slides(5, 3).recordings.values() if one.attributes["sensor"] == "roboskin")),
     )
     assert metrics["model"]["accuracy"]["roboskin"] > 0.9
     assert metrics["permuted_labels"]["accuracy"]["roboskin"] < 0.5

@@ -182,13 +182,13 @@ def test_the_streams_have_the_columns_and_types_that_are_promised(result: Result
     for stream in ("true", *PREDICTORS):
         assert found.streams[stream].column_names == names
         assert {str(field.type) for field in found.streams[stream].schema} == {"float"}  # of 32 bits
-        assert found.streams[stream].num_rows == len(asked.shards)
+        assert found.streams[stream].num_rows == len(asked.recordings)
     about = found.streams["grasps"]
     assert [(field.name, str(field.type)) for field in about.schema] == [
         *(("recording", "string"), ("object", "string"), ("session", "string")),
         *(("t_ns", "int64"), ("seen", "bool"), ("known", "bool")),
     ]
-    felt = asked.shards["egg-030"].tables["reading"].column("th_pdc")[0].as_py()
+    felt = asked.recordings["egg-030"].tables["reading"].column("th_pdc")[0].as_py()
     assert rows(found.streams["true"], "pdc_th")[about.to_pydict()["recording"].index("egg-030")] == felt
     assert dict(found.attributes) == {}
 

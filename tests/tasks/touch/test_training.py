@@ -47,7 +47,7 @@ def test_a_model_holds_what_it_was_trained_on_and_how(tmp_path: Path) -> None:
     assert told["targets"] == ["pdc_th", "pdc_mf", "e_th", "e_mf"]
     assert told["objects"] == ["ball", "melon"]
     assert told["counts"] == {"train": 12, "val": 0}
-    assert told["trained_on"] == {name: shard.digest for name, shard in recordings().shards.items()}
+    assert told["trained_on"] == {name: shard.digest for name, shard in recordings().recordings.items()}
     assert [one["kind"] for one in told["members"]] == ["forest"]
 
 
