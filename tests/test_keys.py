@@ -19,7 +19,7 @@ from tacpipe.engine import keys
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import canonical, digest
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import Stage, stage
+from tacpipe.plugins.stage import AnyStage, stage
 from tests.conftest import Lab
 
 numbers = st.integers(-(2**80), 2**80) | st.floats(allow_nan=False, allow_infinity=False)
@@ -67,7 +67,7 @@ given_params = st.builds(
 def cut(params: Params) -> None: ...
 
 
-STAGE: Stage = stage(version=3)(cut)
+STAGE: AnyStage = stage(version=3)(cut)
 
 
 def built(**options: Any) -> Params:
@@ -76,7 +76,7 @@ def built(**options: Any) -> Params:
     return params
 
 
-def key(params: Any = None, inputs: Mapping[str, Any] | None = None, name: str = "cut", given: Stage = STAGE) -> str:
+def key(params: Any = None, inputs: Mapping[str, Any] | None = None, name: str = "cut", given: AnyStage = STAGE) -> str:
     return digest(keys.identity(name, given, params or Params(), inputs or {}))
 
 

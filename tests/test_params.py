@@ -7,7 +7,7 @@ import pytest
 from tacpipe.errors import UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import Range
-from tacpipe.plugins.stage import Stage, stage
+from tacpipe.plugins.stage import AnyStage, stage
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Params:
 def cut(params: Params) -> None: ...
 
 
-STAGE: Stage = stage(version=1)(cut)
+STAGE: AnyStage = stage(version=1)(cut)
 
 
 def built(**given: object) -> Params:
@@ -165,7 +165,7 @@ Sized = Small | Large
 def grow(params: Sized) -> None: ...
 
 
-GROW: Stage = stage(version=1)(grow)
+GROW: AnyStage = stage(version=1)(grow)
 
 
 def grown(**given: object) -> Any:

@@ -20,7 +20,7 @@ from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeInt
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage
 
 _PLACES = {  # what examples call the datasets
     "ingest": "data/recordings",
@@ -64,7 +64,7 @@ def add(program: typer.Typer, name: str, command: str) -> None:
     program.command(command, help=_help(name, stage))(call)
 
 
-def _call(name: str, stage: Stage, given: dict[str, Any], named: Sequence[str]) -> None:
+def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str]) -> None:
     progress.set_quiet(given["quiet"])
     for flag, kind in _CHECKED.items():
         fields_of.check(given.get(flag), kind, f"--{flag}")
@@ -133,7 +133,7 @@ def _params_file(given: dict[str, Any]) -> Path | None:
     return default if given["block"] is not None or default.exists() else None
 
 
-def _arguments(stage: Stage) -> list[inspect.Parameter]:
+def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
     found = []
     if "Files" in kinds:
@@ -147,7 +147,7 @@ def _arguments(stage: Stage) -> list[inspect.Parameter]:
     return found
 
 
-def _shared(stage: Stage) -> list[inspect.Parameter]:
+def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
     found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
     if stage.needs_split or stage.reads_model:
@@ -173,7 +173,7 @@ def _shared(stage: Stage) -> list[inspect.Parameter]:
     return found
 
 
-def _options(stage: Stage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
     found = []
     for name, wanted in fields.items():
@@ -231,7 +231,7 @@ def _parsed(given: Any, wanted: Any) -> Any:
     return fields_of.parsed(given, wanted) if isinstance(given, str) else given
 
 
-def _about(stage: Stage, name: str, comment: str) -> str:
+def _about(stage: AnyStage, name: str, comment: str) -> str:
     """Return the help of an option: its comment, what it may be, which choices have it, and its default."""
     wanted = params_of.fields(stage)[name]
     told = [comment] if comment else []
@@ -256,12 +256,12 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _help(name: str, stage: Stage) -> str:
+def _help(name: str, stage: AnyStage) -> str:
     text = inspect.cleandoc(stage.function.__doc__ or sys.modules[stage.function.__module__].__doc__ or "")
     return f"{text}\n\nExample: {example(name, stage)}"
 
 
-def example(name: str, stage: Stage) -> str:
+def example(name: str, stage: AnyStage) -> str:
     """Return a command line that shows the stage at work."""
     group = name.partition(".")[0]
     words = ["tacpipe", *name.split(".")]

@@ -21,7 +21,7 @@ from tacpipe.io import memory
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import RecordingOutput, Result, Stage
+from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Object, Store
 
@@ -113,7 +113,7 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
     return {"recordings": recordings, "files": files}, notes
 
 
-def _manifest_of(task: Task, stage: Stage, result: Mapping[str, Any]) -> Manifest:
+def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
     """Return a manifest of one recording that was read from published files."""
     (entry,), files = result["recordings"].values(), task.identity["inputs"][stage.argument("Files")]
     return Manifest(
@@ -125,7 +125,7 @@ def _manifest_of(task: Task, stage: Stage, result: Mapping[str, Any]) -> Manifes
     )
 
 
-def stage_of(name: str) -> Stage:
+def stage_of(name: str) -> AnyStage:
     """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``."""
     stage = registry.load(name.removesuffix(".fit"))
     if name.endswith(".fit"):
@@ -234,7 +234,7 @@ def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
 
 
 @contextmanager
-def _arguments(stage: Stage, task: Task, store: Store) -> Iterator[dict[str, Any]]:
+def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, Any]]:
     """Yield the arguments that the identity describes, by name."""
     read = reader(store, task.beside)
     inputs = task.identity["inputs"]

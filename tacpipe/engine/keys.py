@@ -10,11 +10,11 @@ from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine.execution import Task
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage
 from tacpipe.store.store import Store
 
 
-def identity(name: str, stage: Stage, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
+def identity(name: str, stage: AnyStage, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the key of a result is the digest of."""
     values = params if isinstance(params, Mapping) else params_of.to_json(params)
     return {"stage": name, "version": stage.version, "params": values, "inputs": inputs}
@@ -45,7 +45,7 @@ def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mappin
     }
 
 
-def chain_step(name: str, stage: Stage, params: Any, fitted: Mapping[str, Any] | None) -> dict[str, Any]:
+def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the link of a chain that a map stage adds."""
     files = {file: value["digest"] for file, value in fitted.items()} if fitted is not None else None
     return {"stage": name, "version": stage.version, "params": params_of.to_json(params), "fitted": files}
@@ -68,7 +68,7 @@ def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: 
 def source_tasks(
     store: Store,
     name: str,
-    stage: Stage,
+    stage: AnyStage,
     params: Any,
     sources: Mapping[str, Mapping[str, Path]],
     digests: Mapping[str, Mapping[str, str]],
@@ -87,7 +87,7 @@ def source_tasks(
     ]
 
 
-def trial_tasks(store: Store, name: str, stage: Stage, params: Any) -> list[Task]:
+def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[Task]:
     """Return one task a recording to simulate, named ``trial-000`` and so on."""
     (argument,) = (found for found, kind in stage.arguments.items() if kind == "Trial")
     count = int(params.trials)

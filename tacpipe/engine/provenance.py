@@ -11,7 +11,7 @@ from typing import Any
 
 from tacpipe.engine import processor
 from tacpipe.io.hashing import remembered_file_digest
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage
 
 _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
@@ -70,7 +70,7 @@ def _text(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value if value is not None else "none")
 
 
-def code(stage: Stage) -> str | None:
+def code(stage: AnyStage) -> str | None:
     """Return the digest of the file that a stage's function is written in; None where it cannot change by itself.
 
     That is a built-in stage that was installed: it changes with the version of tacpipe alone.

@@ -16,7 +16,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io.hashing import remembered_file_digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage
 from tacpipe.store.store import Store
 
 
@@ -158,7 +158,7 @@ def split_digest(split: Found) -> str:
     return found
 
 
-def _discover(stage: Stage, request: Request) -> dict[str, dict[str, Path]]:
+def _discover(stage: AnyStage, request: Request) -> dict[str, dict[str, Path]]:
     if not stage.source:
         return {}
     if request.source is None or stage.discover is None:

@@ -22,7 +22,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular, yaml_text
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins.fields import filled as filled
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage
 from tacpipe.printable import excerpt, listed
 
 Kind = type[Any]  # a dataclass of params
@@ -47,7 +47,7 @@ class _Given(NamedTuple):
 
 def build(
     name: str,
-    stage: Stage,
+    stage: AnyStage,
     *,
     file: Path | None = None,
     block: str | None = None,
@@ -78,13 +78,13 @@ def build(
     return made
 
 
-def kinds(stage: Stage) -> tuple[Kind, ...]:
+def kinds(stage: AnyStage) -> tuple[Kind, ...]:
     """Return the dataclasses that a stage's params may be, the default one first."""
     found = stage.params
     return get_args(found) if get_origin(found) in (typing.Union, types.UnionType) else (found,)
 
 
-def tag(stage: Stage) -> str | None:
+def tag(stage: AnyStage) -> str | None:
     """Return the name of the field that chooses among several kinds of params; None where there is one kind."""
     several = kinds(stage)
     if len(several) == 1:
@@ -99,12 +99,12 @@ def tag(stage: Stage) -> str | None:
     return name
 
 
-def fields(stage: Stage) -> dict[str, Any]:
+def fields(stage: AnyStage) -> dict[str, Any]:
     """Return the annotation of each param of a stage, of whatever kind; choices of several kinds are joined."""
     return dict(_fields(kinds(stage)))
 
 
-def having(stage: Stage, field: str) -> list[str]:
+def having(stage: AnyStage, field: str) -> list[str]:
     """Return the choices of the tag for which a param counts, empty if it always does."""
     name, several = tag(stage), kinds(stage)
     owners = [kind for kind in several if field in fields_of.hints(kind)]
@@ -113,14 +113,14 @@ def having(stage: Stage, field: str) -> list[str]:
     return [str(choice) for kind in owners for choice in get_args(fields_of.hints(kind)[name])]
 
 
-def defaults(stage: Stage, field: str) -> list[Any]:
+def defaults(stage: AnyStage, field: str) -> list[Any]:
     """Return the defaults that a param has, one in each kind that has another; of the tag that of the default kind."""
     several = kinds(stage)[:1] if field == tag(stage) else kinds(stage)
     found = [kind.__dataclass_fields__[field] for kind in several if field in kind.__dataclass_fields__]
     return list({repr(one.default): one.default for one in found if one.default is not dataclasses.MISSING}.values())
 
 
-def presets(stage: Stage) -> list[str]:
+def presets(stage: AnyStage) -> list[str]:
     """Return the names of a stage's presets."""
     return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
 
@@ -144,7 +144,7 @@ def to_json(params: Any) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
-def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
+def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
     """Return the params that `to_json` gave, now or in an older version; values are taken as they are.
 
     A field that only other kinds have is left out, and so is any that is gone where the stage reads whole datasets.
@@ -162,7 +162,7 @@ def from_json(stage: Stage, values: Mapping[str, Any]) -> Any:
     return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in values.items() if k in known})
 
 
-def counting(stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
+def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of stored params that the chosen kind has; older versions stored those of all kinds.
 
     All of them are returned where the tag names no kind, as of a plug-in that is not installed.
@@ -171,7 +171,7 @@ def counting(stage: Stage, values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if kind is None or name in fields_of.hints(kind)}
 
 
-def comments(stage: Stage) -> dict[str, str]:
+def comments(stage: AnyStage) -> dict[str, str]:
     """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
     found: dict[str, list[str]] = {}
     for kind in kinds(stage):
@@ -205,7 +205,7 @@ def _comments(kind: Kind) -> dict[str, str]:
 # ---- kinds of params
 
 
-def _chosen(stage: Stage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
+def _chosen(stage: AnyStage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
     """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
     kind = _named(stage, early)
     if any(given.key == tag(stage) for given in late):
@@ -215,7 +215,7 @@ def _chosen(stage: Stage, early: Sequence[_Given], late: Sequence[_Given], prese
     return next((other for other in kinds(stage) if preset in _presets(other)), kind)
 
 
-def _named(stage: Stage, given: Sequence[_Given]) -> Kind:
+def _named(stage: AnyStage, given: Sequence[_Given]) -> Kind:
     """Return the kind that the last tag among ``given`` names, or the default one. Raises `UsageError` for none."""
     name, found = tag(stage), kinds(stage)[0]
     for one in given:
@@ -229,7 +229,7 @@ def _holds(kind: Kind, name: str | None, values: Mapping[str, Any]) -> bool:
     return name is None or values.get(name) in get_args(fields_of.hints(kind)[name])
 
 
-def _checked(stage: Stage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
+def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
     """Return a value as the field of ``kind`` has it."""
     known, name = fields_of.hints(kind), tag(stage)
     if given.key not in fields(stage):
@@ -278,7 +278,7 @@ def _presets(kind: Kind) -> Mapping[str, Mapping[str, Any]]:
 # ---- where values come from
 
 
-def _from_preset(name: str, stage: Stage, kind: Kind, preset: str) -> list[_Given]:
+def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_Given]:
     there = _presets(kind)
     if preset not in presets(stage):
         have = f"it has {', '.join(presets(stage))}" if presets(stage) else "it has none"

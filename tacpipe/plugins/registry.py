@@ -15,7 +15,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
 from tacpipe.io.files import listed
 from tacpipe.plugins import extras, failures
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
@@ -64,7 +64,7 @@ def stages() -> dict[str, str]:
     return dict(sorted({**found[STAGES], **formats}.items()))
 
 
-def load(name: str) -> Stage:
+def load(name: str) -> AnyStage:
     """Return the stage of this name.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.

@@ -26,7 +26,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeAlias, TypeVar
 
 from tacpipe.errors import TacpipeError
 
@@ -40,6 +40,8 @@ Fitted = Mapping[str, bytes]  # file name, content
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
+P = ParamSpec("P")
+R = TypeVar("R", covariant=True)
 _KINDS = ("Recording", "Dataset", "Datasets", "Model", "Fitted", "Files", "Trial", "Roles", "Workspace")
 
 
@@ -71,19 +73,19 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A function with a version; calling it calls the function."""
+class Stage(Generic[P, R]):
+    """A function with a version; calling it calls the function, with the function's own signature and result type."""
 
-    function: Callable[..., Any]
+    function: Callable[P, R]
     version: int
     reads: tuple[str, ...] | None = (
         None  # attributes that the function looks at; None: none of a Recording, all of a Dataset
     )
-    fit: Stage | None = None  # makes what a ``Fitted`` argument holds
+    fit: AnyStage | None = None  # makes what a ``Fitted`` argument holds
     discover: Callable[[Any, Path], Mapping[str, Mapping[str, Path]]] | None = None
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Return what the function returns: no store is involved."""
         return self.function(*args, **kwargs)
 
@@ -92,7 +94,7 @@ class Stage:
         """The stage's arguments after ``params``, and the kind of each."""
         found = {}
         for name, parameter in list(inspect.signature(self.function).parameters.items())[1:]:
-            kind = str(parameter.annotation).strip("'\"").removesuffix(" | None")
+            kind = _text(parameter.annotation).removesuffix(" | None").rpartition(".")[2]
             if kind not in _KINDS:
                 raise TacpipeError(
                     f"Stage {self.function.__name__} annotates {name} as {kind}; known are {', '.join(_KINDS)}."
@@ -106,13 +108,14 @@ class Stage:
 
     def optional(self, name: str) -> bool:
         """Return whether the argument ``name`` may be left out."""
-        return str(inspect.signature(self.function).parameters[name].annotation).strip("'\"").endswith(" | None")
+        return _text(inspect.signature(self.function).parameters[name].annotation).endswith(" | None")
 
     @property
     def params(self) -> Any:
         """The dataclass of the first argument, or a union of dataclasses; `params.kinds` gives each."""
-        name = next(iter(inspect.signature(self.function).parameters.values())).annotation
-        return self.function.__globals__[name] if isinstance(name, str) else name
+        function: Any = self.function
+        found: Any = next(iter(inspect.signature(function).parameters.values())).annotation
+        return function.__globals__[found] if isinstance(found, str) else found
 
     @property
     def reads_model(self) -> bool:
@@ -135,15 +138,27 @@ class Stage:
         return self.fit is not None or any(name in ROLES for name in self.arguments)
 
 
+AnyStage: TypeAlias = Stage[..., Any]
+
+
+def _text(annotation: Any) -> str:
+    """Return an annotation as it is written, ``Dataset | None``, whether or not Python has evaluated it.
+
+    >>> _text("tacpipe.Dataset | None"), _text(Path)
+    ('tacpipe.Dataset | None', 'Path')
+    """
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation).strip("'\"")
+
+
 def stage(
     *,
     version: int,
     reads: tuple[str, ...] | None = None,
-    fit: Stage | None = None,
+    fit: AnyStage | None = None,
     discover: Callable[[Any, Path], Mapping[str, Mapping[str, Path]]] | None = None,
     headline: str | None = None,
-) -> Callable[[Callable[..., Any]], Stage]:
-    """Declare the decorated function a stage. Raise ``version`` whenever its result changes.
+) -> Callable[[Callable[P, R]], Stage[P, R]]:
+    """Declare the decorated function a stage, whose signature it keeps. Raise ``version`` whenever its result changes.
 
     ``headline`` names the file of its result (`tacpipe.metrics.headline`) that the command prints as a table.
     """

@@ -8,7 +8,7 @@ from typing import Any
 
 from tacpipe.engine import execution
 from tacpipe.io.hashing import digest
-from tacpipe.plugins.stage import Stage
+from tacpipe.plugins.stage import AnyStage, Stage
 
 
 class Replay:
@@ -56,7 +56,7 @@ class Replay:
             self._events.append(("resume",))
             return self._resume(folder)
 
-        def calling(found: Stage, params: Any, **arguments: Any) -> Any:
+        def calling(found: AnyStage, params: Any, **arguments: Any) -> Any:
             return self._call(found, arguments, lambda: stage(found, params, **arguments))
 
         def packing(table: Any) -> bytes:
@@ -67,7 +67,7 @@ class Replay:
         execution.execute, execution.reader, Stage.__call__ = executing, reading, calling  # type: ignore
         checkpoint.write, checkpoint.read, parquet.to_parquet = saving, resuming, packing
 
-    def _call(self, stage: Stage, arguments: dict[str, Any], run: Callable[[], Any]) -> Any:
+    def _call(self, stage: AnyStage, arguments: dict[str, Any], run: Callable[[], Any]) -> Any:
         workspace = next((arguments[name] for name, kind in stage.arguments.items() if kind == "Workspace"), None)
         known = self._known.get(self._identity)
         if known is None or self.listening or (workspace is not None and any(workspace.iterdir())):
