@@ -63,3 +63,7 @@ class DeviceError(TacpipeError):
     """A device is missing, busy, silent, lost, or speaks another protocol."""
 
     exit_code = DEVICE
+
+
+class ResultWarning(UserWarning):
+    """A result is valid but probably not what was wanted, or lacks recordings that could not be read."""

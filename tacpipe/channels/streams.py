@@ -36,6 +36,22 @@ def streams_of(recording: Recording) -> dict[str, pa.Table]:
     }
 
 
+def rate_hz(table: pa.Table) -> float | None:
+    """Return the rate of a stream's rows: by the device's own counter where there is one, else by the median step.
+
+    None where there are no times, or too few rows.
+    """
+    import numpy as np
+
+    if "t_ns" not in table.column_names or table.num_rows < 2:
+        return None
+    step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
+    if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
+        return round(float(np.diff(table["seq"].to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
+    median_ns = float(np.median(step_ns))
+    return round(1e9 / median_ns, 3) if median_ns else None
+
+
 def of_quantity(table: pa.Table, quantity: str) -> list[str]:
     """Return the columns of a stream that hold ``quantity``."""
     return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]

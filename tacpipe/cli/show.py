@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import printable
+from tacpipe.channels import streams
 from tacpipe.cli import model_overview
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.dataset import Dataset, Recording
@@ -100,12 +101,10 @@ def _stream(shard: Recording, stream: str) -> dict[str, Any]:
         step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
         median_ns = float(np.median(step_ns))
         found["duration_s"] = round(float(step_ns.sum()) / 1e9, 3)
-        found["rate_hz"] = round(1e9 / median_ns, 3) if median_ns else None
+        found["rate_hz"] = streams.rate_hz(table)
         found["gaps"] = int((step_ns > _GAP_FACTOR * median_ns).sum())
         if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
-            steps = np.diff(table["seq"].to_numpy())
-            found["rate_hz"] = round(float(steps.sum() / step_ns.sum()) * 1e9, 3)
-            found["gaps"] = int((steps > 1).sum())
+            found["gaps"] = int((np.diff(table["seq"].to_numpy()) > 1).sum())
     integers = [
         table[field.name].to_numpy()
         for field in table.schema

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe.channels.masks import gaps as gaps
+from tacpipe.channels.masks import times as times
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -61,19 +63,3 @@ def matrix(table: pa.Table, names: Sequence[str]) -> Floats:
 def above_rest(table: pa.Table, channels: Sequence[str]) -> Floats:
     """Return the channels' counts above their rest level as float64, shape (time, channel)."""
     return matrix(table, channels) - rest_counts(table.schema, channels)
-
-
-def gaps(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` says so."""
-    gap = np.zeros(table.num_rows, dtype=bool)
-    for name in table.column_names:
-        if name.endswith("_gap"):
-            gap |= table.column(name).to_numpy().astype(bool)
-    return gap
-
-
-def times(table: pa.Table) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
-    if "t_ns" not in table.column_names:
-        raise TacpipeError("There is no column t_ns, so it cannot be told which rows follow one another.")
-    return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)

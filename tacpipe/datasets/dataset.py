@@ -1,37 +1,55 @@
-"""A dataset opened for reading: shards and files by name, their bytes verified when asked for."""
+"""A dataset opened for reading: recordings and files by name, their bytes verified when they are read."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import operator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe.datasets.manifest import Manifest, shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import listed
 
 if TYPE_CHECKING:
+    import duckdb
     import pandas as pd
+    import polars as pl
     import pyarrow as pa
 
     from tacpipe.datasets.arrays import Arrays, Tensors
+    from tacpipe.datasets.windows import Windows
     from tacpipe.io.columns import Columns
 
 Reader = Callable[[str, str], bytes]  # digest, path within the dataset directory -> verified content
+Wanted = Attribute | Collection[Attribute] | Callable[[Any], bool]  # value of a label, values, or a test of one
+_NAMED = 5  # recordings that an error names
 
 
 class Recording:
     """One recording of a dataset: its attributes, and its tables when asked for."""
 
-    def __init__(self, name: str, entry: Mapping[str, Any], read: Reader, manifest: Manifest | None = None) -> None:
+    def __init__(self, name: str, entry: Mapping[str, Any], read: Reader, dataset: Dataset | None = None) -> None:
         self.name = name
         self.attributes: Mapping[str, Attribute] = MappingProxyType(dict(entry["attributes"]))
+        self._entry = entry
         self._shards = entry["shards"]
         self._read = read
-        self._manifest = manifest
+        self._dataset = dataset
+
+    def __repr__(self) -> str:
+        streams = ", ".join(filter(None, self.streams))
+        return f"Recording({self.name!r}{', streams ' * bool(streams)}{streams})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._dataset is None:
+            return Recording, (self.name, self._entry, self._read)
+        return operator.getitem, (self._dataset, self.name)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -55,17 +73,29 @@ class Recording:
 
         Raises `UsageError` for one that a stage was given: what it is part of is unknown there.
         """
-        if self._manifest is None:
+        if self._dataset is None:
             raise UsageError(
                 f"Recording {self.name} is not of an opened dataset; take it from one: tacpipe.open(PATH)[{self.name!r}]."
             )
-        return Dataset(self._manifest, self._read, [self.name])
+        return self._dataset.only([self.name])
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        """Return a stream as an arrow table with field metadata; its bytes are verified first."""
+        """Return a stream as an arrow table with field metadata; its bytes are verified first.
+
+        Of a synchronized recording, whose streams lie side by side in one table, ``stream`` names those columns: ``t_ns``
+        and the columns of that stream, under the names with which they were recorded; masks and ground truth are left
+        out. Without ``stream`` the table is as stored. Raises `UsageError` for a stream that is not there.
+        """
         from tacpipe.io.parquet import from_parquet
 
-        return from_parquet(self._content(stream), columns)
+        if stream in self._shards:
+            return from_parquet(self._content(stream), columns)
+        from tacpipe.channels.streams import streams_of
+
+        within = streams_of(self) if self.streams == ("",) else {}
+        if stream not in within:
+            raise self._without(stream, [name for name in within if name])
+        return within[stream] if columns is None else within[stream].select(list(columns))
 
     def columns(self, stream: str = "") -> Columns:
         """Return a stream whose columns are decoded when asked for, some at a time; its bytes are verified first.
@@ -79,10 +109,12 @@ class Recording:
 
     def _content(self, stream: str) -> bytes:
         if stream not in self._shards:
-            raise UsageError(
-                f"Recording {self.name} has no stream {stream!r}; it has {', '.join(map(repr, self.streams))}."
-            )
+            raise self._without(stream, [])
         return self._read(self._shards[stream]["digest"], shard_path(self.name, stream))
+
+    def _without(self, stream: str, within: Sequence[str]) -> UsageError:
+        there = ", ".join(map(repr, within or self.streams))
+        return UsageError(f"Recording {self.name} has no stream {stream!r}; it has {there}.")
 
 
 class LazyFiles(Mapping[str, bytes]):
@@ -102,16 +134,113 @@ class LazyFiles(Mapping[str, bytes]):
 
 
 class Dataset:
-    """A dataset opened for reading: recordings by name, files by name."""
+    """A dataset opened for reading: recordings by name, files by name.
 
-    def __init__(self, manifest: Manifest, read: Reader, names: Iterable[str] | None = None) -> None:
+    ``len(dataset)`` counts its recordings, iteration yields them in the order of their names, ``dataset["trial-003"]`` is
+    one of them and ``"trial-003" in dataset`` tests for its name. A dataset without recordings, as a model, counts as true.
+    It can be pickled; what is read then comes from the same place.
+    """
+
+    def __init__(
+        self,
+        manifest: Manifest,
+        read: Reader,
+        names: Iterable[str] | None = None,
+        *,
+        directory: Path | None = None,
+        opener: Callable[[Path | str], Dataset] | None = None,
+    ) -> None:
         included = manifest.included
         chosen = sorted(included if names is None else names)
         self.source = manifest
-        self.recordings: dict[str, Recording] = {
-            name: Recording(name, included[name], read, manifest) for name in chosen
+        self.path = directory  # where it was opened; None for one that a stage was given
+        self.recordings: Mapping[str, Recording] = {
+            name: Recording(name, included[name], read, self) for name in chosen
         }
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
+        self._read, self._opener = read, opener
+
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+    def __iter__(self) -> Iterator[Recording]:
+        return iter(self.recordings.values())
+
+    def __getitem__(self, name: str) -> Recording:
+        """Return the recording of this name. Raises `UsageError` where there is none."""
+        if name not in self.recordings:
+            raise UsageError(
+                f"There is no recording {name!r} in {self._where}; it has {listed(self.recordings, _NAMED)}."
+            )
+        return self.recordings[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.recordings
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopened, (self.source, self._read, tuple(self.recordings), self.path, self._opener)
+
+    def __repr__(self) -> str:
+        from tacpipe.datasets import overview
+
+        return overview.text(self)
+
+    def _repr_html_(self) -> str:
+        from tacpipe.datasets import overview
+
+        return overview.html(self)
+
+    @property
+    def _where(self) -> str:
+        return "this dataset" if self.path is None else str(self.path)
+
+    @property
+    def labels(self) -> pd.DataFrame:
+        """The attributes of the recordings, one row a recording by its name, one column an attribute.
+
+        Attributes are what the recordings carry: labels set on them, sensor, sizes of gaps and whatever their stages add.
+        """
+        from tacpipe.datasets import frames
+
+        return frames.labels(self)
+
+    def only(self, names: Iterable[str]) -> Dataset:
+        """Return the dataset with the recordings of these names alone."""
+        return Dataset(self.source, self._read, names, directory=self.path, opener=self._opener)
+
+    def select(
+        self,
+        *names: str,
+        split: Path | str | Dataset | None = None,
+        role: Literal["train", "val", "test"] | str | None = None,
+        fold: int = 0,
+        labels: Mapping[str, Wanted] | None = None,
+        **more: Wanted,
+    ) -> Dataset:
+        """Return the dataset with those recordings alone that meet every condition; nothing is read but the split.
+
+        ``names`` are names or patterns (``"trial-00?"``), of which one must match. ``split`` and ``role`` choose by the
+        role in ``fold`` of a split, or, without ``role``, all recordings that have one. Each further keyword is a label: its
+        value, a collection of values, or a function of the value, as in ``select(object="cup", speed_m_s=lambda v: v < 1)``;
+        ``labels`` holds those that share a name with a parameter. A recording without the label does not match.
+
+        Raises `UsageError` for a label that no recording has, and where no recording meets the conditions.
+        """
+        from tacpipe.datasets import selection
+
+        opened = self._open(split) if isinstance(split, str | Path) else split
+        roles = selection.roles_of(opened, role, fold)
+        return self.only(selection.chosen(self, names, roles, role, {**(labels or {}), **more}))
+
+    def _open(self, path: Path | str) -> Dataset:
+        if self._opener is None:
+            raise UsageError(
+                f"Open {path} with tacpipe.open first, and give that: this dataset is one that a stage reads."
+            )
+        return self._opener(path)
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -124,34 +253,94 @@ class Dataset:
         """The dataset's digest."""
         return self.source.digest
 
-    def table(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+    def table(
+        self,
+        stream: str | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        labels: bool | Sequence[str] = False,
+    ) -> pa.Table:
         """Return all recordings in one arrow table, after a first column ``recording`` (but where it has one already).
 
-        ``stream`` may be left out where the recordings have one table each.
+        ``stream`` may be left out where the recordings have one table each. ``labels`` adds attributes of the recordings
+        as last columns: all of them, or those named.
         """
         from tacpipe.io.parquet import one_after_another
 
         name = self._only_stream() if stream is None else stream
         if not self.recordings:
             raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
-        return one_after_another({shard.name: shard.table(name, columns) for shard in self.recordings.values()})
+        tables = {one.name: one.table(name, columns) for one in self}
+        if labels is not False:
+            from tacpipe.datasets import frames
 
-    def to_pandas(self, stream: str | None = None, columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """Return all recordings in one frame, after a categorical column ``recording``.
+            tables = frames.labelled(self, tables, None if labels is True else labels)
+        return one_after_another(tables)
+
+    to_arrow = table
+
+    def to_pandas(
+        self,
+        stream: str | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        labels: bool | Sequence[str] = False,
+    ) -> pd.DataFrame:
+        """Return all recordings in one frame, after a categorical column ``recording``; arguments are those of `table`.
 
         Integers with nulls, as where only some recordings have the column, are pandas' nullable integers: a column of
         floats would round those beyond 2^53.
         """
-        import pandas as pd
-        import pyarrow as pa
+        from tacpipe.datasets import frames
 
-        table = self.table(stream, columns)
-        frame: pd.DataFrame = table.to_pandas()
-        for field, column in zip(table.schema, table.columns, strict=True):
-            if pa.types.is_integer(field.type) and column.null_count:
-                nullable = pd.api.types.pandas_dtype(str(field.type).replace("u", "U").replace("i", "I"))
-                frame[field.name] = column.to_pandas(types_mapper={field.type: nullable}.get)
-        return frame
+        return frames.to_pandas(self.table(stream, columns, labels=labels))
+
+    def to_polars(
+        self,
+        stream: str | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        labels: bool | Sequence[str] = False,
+    ) -> pl.DataFrame:
+        """Return all recordings in one polars frame; arguments are those of `table`."""
+        with extras.named("to_polars"):
+            import polars as pl
+
+            found = pl.from_arrow(self.table(stream, columns, labels=labels))
+        assert isinstance(found, pl.DataFrame)
+        return found
+
+    def duckdb(self) -> duckdb.DuckDBPyConnection:
+        """Return a DuckDB connection, in memory, that has a view a stream, named as it, and a view ``labels``.
+
+        Of recordings with one table each that view is named ``data``. Each view begins with a column ``recording``, by which
+        it joins ``labels``. All streams are read and verified at once.
+        """
+        from tacpipe.datasets import frames
+
+        with extras.named("duckdb"):
+            return frames.connected(self)
+
+    def windows(
+        self,
+        context: int,
+        horizon: int,
+        *,
+        stream: str | None = None,
+        columns: Sequence[str] | None = None,
+        stride: int = 1,
+        dtype: Literal["float32", "float64"] = "float32",
+    ) -> Windows:
+        """Return the windows of all recordings as a map-style torch dataset; see `tacpipe.datasets.windows.Windows`.
+
+        Each is ``context`` past rows and ``horizon`` future ones of the channels, or of ``columns``; the next one begins
+        ``stride`` rows later. None crosses a gap or the end of a recording.
+        """
+        with extras.named("windows"):
+            from tacpipe.datasets.windows import Windows
+
+        name = self._only_stream() if stream is None else stream
+        return Windows(self, context, horizon, stream=name, columns=columns, stride=stride, dtype=dtype)
 
     def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Arrays]:
         """Return the arrays of each recording by its name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).
@@ -164,9 +353,9 @@ class Dataset:
         name = self._only_stream() if stream is None else stream
         order = columns and [*dict.fromkeys(columns)]
         return {
-            shard.name: arrays.of_table(table if order is None else table.select(order))
-            for shard in self.recordings.values()
-            for table in [shard.table(name, order)]
+            one.name: arrays.of_table(table if order is None else table.select(order))
+            for one in self
+            for table in [one.table(name, order)]
         }
 
     def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Tensors]:
@@ -180,10 +369,20 @@ class Dataset:
             return {name: arrays.to_tensors(found) for name, found in self.to_numpy(stream, columns).items()}
 
     def _only_stream(self) -> str:
-        streams = {stream for shard in self.recordings.values() for stream in shard.streams}
+        streams = {stream for one in self for stream in one.streams}
         if len(streams) > 1:
             raise UsageError(f"Name the stream to read: the recordings have {', '.join(sorted(streams))}.")
         return next(iter(streams), "")
+
+
+def _reopened(
+    manifest: Manifest,
+    read: Reader,
+    names: Iterable[str],
+    directory: Path | None,
+    opener: Callable[[Path | str], Dataset] | None,
+) -> Dataset:
+    return Dataset(manifest, read, names, directory=directory, opener=opener)
 
 
 Model = Dataset  # whose files hold weights and configuration

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from tacpipe.datasets import adoption
+from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.manifest import ACQUIRE, Manifest, shard_path
 from tacpipe.engine import provenance
@@ -149,25 +149,38 @@ def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -
     return sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
 
 
+class _Reader:
+    """What `reader` returns; in another process it reads from the same store."""
+
+    def __init__(self, store: Store, beside: tuple[str, ...], sizes: Mapping[str, int]) -> None:
+        self._store, self._beside, self._sizes = store, beside, sizes
+
+    def __call__(self, name: str, path: str) -> bytes:
+        size = self._sizes.get(name)
+        try:
+            return self._store.read(name, size)
+        except MissingError as error:
+            content = _adopt(self._store, name, path, self._beside, size)
+            return _remake(self._store, name, path, str(error), size) if content is None else content
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reader_at, (str(self._store.root), self._beside, dict(self._sizes))
+
+
+def _reader_at(root: str, beside: tuple[str, ...], sizes: Mapping[str, int]) -> _Reader:
+    return _Reader(Store(root), beside, sizes)
+
+
 def reader(
     store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] = MappingProxyType({})
 ) -> Callable[[str, str], bytes]:
     """Return a function (digest, path within its dataset) -> content that heals what it finds damaged.
 
-    It reads from the store; what is missing there is adopted from the directories ``beside``, or made again from its
+    It reads from the store; what is missing there is adopted from the directories ``beside``, or recomputed from its
     record. ``sizes`` are those in bytes that a manifest declares, by digest: nothing much larger is read. Raises
-    `DamagedError` where neither can be done.
+    `DamagedError` where neither can be done. It can be pickled.
     """
-
-    def read(name: str, path: str) -> bytes:
-        size = sizes.get(name)
-        try:
-            return store.read(name, size)
-        except MissingError as error:
-            content = _adopt(store, name, path, beside, size)
-            return _remake(store, name, path, str(error), size) if content is None else content
-
-    return read
+    return _Reader(store, beside, sizes)
 
 
 def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
@@ -253,7 +266,7 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
         elif kind == "Trial":
             found[name] = inputs[name]
         elif kind == "Roles":
-            found[name] = read_roles(read(inputs[name], "split.parquet")) if inputs[name] else {}
+            found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}
         else:
             found[name] = store.root / "checkpoints" / digest(task.identity)
             if found[name].is_symlink():
@@ -276,14 +289,6 @@ def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dat
         files={name: {"digest": file} for name, file in value["files"].items()},
     )
     return Dataset(manifest, read)
-
-
-def read_roles(content: bytes) -> dict[tuple[str, int], str]:
-    """Return (recording, fold) to role from the Parquet bytes of a split."""
-    from tacpipe.io.parquet import from_parquet
-
-    rows = from_parquet(content, ["recording", "fold", "role"]).to_pydict()
-    return dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
 
 
 def _recording(name: str, returned: Any) -> RecordingOutput:

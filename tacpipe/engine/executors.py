@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tacpipe.errors import TacpipeError
@@ -76,10 +78,24 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
         ours, theirs = context.Pipe()
         alive, life = context.Pipe(duplex=False)
         workers[ours] = life
-        with termination.held(), _death_told():  # a worker that heard half of what it is to do would say so
+        with termination.held(), _death_told(), _without_main():  # who hears half of what it is to do would say so
             context.Process(target=_work, args=(theirs, alive)).start()
         theirs.close()
         alive.close()
+
+
+@contextlib.contextmanager
+def _without_main() -> Iterator[None]:
+    """Have a process that starts in the block not import the program's main module, of which workers need nothing.
+
+    A script that calls `tacpipe.run` at its top level would otherwise run once more in each worker.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _start_server() -> None:

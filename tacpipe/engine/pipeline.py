@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import manifest, replacing
+from tacpipe.datasets import manifest, replacing, roles
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution, executors, keys, output, provenance
-from tacpipe.engine import request as request_of
 from tacpipe.engine.execution import Done, Task
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Inputs, Request
@@ -30,7 +29,9 @@ def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
     found = manifest.find(path)
     sizes = dict(found.manifest.sizes())
-    return Dataset(found.manifest, execution.reader(locate(found.directory), (str(found.directory.absolute()),), sizes))
+    directory = found.directory.absolute()
+    read = execution.reader(locate(directory), (str(directory),), sizes)
+    return Dataset(found.manifest, read, directory=directory, opener=open_dataset)
 
 
 def run(request: Request) -> Outcome:
@@ -177,7 +178,7 @@ class _Run:
             return [keys.of_dataset(found.manifest, reads, found.manifest.included) for found in inputs.datasets]
         if kind == "Roles":
             old = inputs.named.get("extend")
-            return request_of.split_digest(old) if old else None
+            return roles.digest(old.manifest, str(old.directory)) if old else None
         if name in ROLES:
             chosen = inputs.in_role(inputs.merged, name, may_lack=self.stage.optional(name))
             return keys.of_dataset(inputs.merged, reads, chosen)

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import manifest, recording_names
+from tacpipe.datasets import manifest, recording_names, roles
 from tacpipe.datasets.manifest import Entry, Found, Manifest
 from tacpipe.datasets.replacing import Plan
 from tacpipe.engine import execution
@@ -126,13 +126,9 @@ class Inputs:
             raise UsageError(
                 f"{self.request.name} must know which recordings to train on: give --split, as made by `tacpipe split`."
             )
-        read_content = execution.reader(self.store, (str(split.directory),))
-        table = execution.read_roles(read_content(split_digest(split), "split.parquet"))
-        folds = sorted({fold for _, fold in table})
-        fold = self.request.fold
-        if fold not in folds:
-            raise UsageError(f"The split {split.directory} has the folds {folds}; --fold {fold} is none.")
-        return {recording: role for (recording, number), role in table.items() if number == fold}
+        where = str(split.directory)
+        content = execution.reader(self.store, (where,))(roles.digest(split.manifest, where), roles.FILE)
+        return roles.in_fold(roles.read(content), self.request.fold, where)
 
     def in_role(self, given: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
         """Return the recordings of ``given`` that have this role. Raises `UsageError` without any, unless ``may_lack``."""
@@ -147,15 +143,6 @@ class Inputs:
                 f"Split this dataset, or give the split that was made for it."
             )
         return chosen
-
-
-def split_digest(split: Found) -> str:
-    """Return the digest of the table of a split."""
-    recordings = split.manifest.recordings
-    if set(recordings) != {"split"}:
-        raise UsageError(f"{split.directory} is no split; make one with `tacpipe split`.")
-    found: str = recordings["split"]["shards"][""]["digest"]
-    return found
 
 
 def _discover(stage: AnyStage, request: Request) -> dict[str, dict[str, Path]]:

@@ -18,6 +18,17 @@ def set_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
+@contextmanager
+def shown(wanted: bool) -> Iterator[None]:
+    """Show bars and sentences within the block, or neither, whatever was set before."""
+    before = _quiet
+    set_quiet(not wanted)
+    try:
+        yield
+    finally:
+        set_quiet(before)
+
+
 def wanted() -> bool:
     """Return whether somebody is looking: stderr is a terminal and nobody asked for quiet."""
     return sys.stderr.isatty() and not _quiet

@@ -9,6 +9,22 @@ from numpy.typing import NDArray
 
 from tacpipe.errors import TacpipeError
 
+GAP = 1.5  # times the median step of time, above which rows do not follow one another
+
+
+def breaks(t_ns: NDArray[np.int64], gap: float = GAP) -> NDArray[np.bool_]:
+    """Return for each row (time,) whether an unbroken run begins there: after more than ``gap`` times the median step.
+
+    >>> breaks(np.array([0, 20, 40, 100, 120])).tolist()
+    [True, False, False, True, False]
+    """
+    begins = np.zeros(len(t_ns), dtype=bool)
+    begins[:1] = True
+    if len(t_ns) > 1:
+        apart = np.diff(t_ns)
+        begins[1:] = apart > gap * np.median(apart)
+    return begins
+
 
 def window_starts(
     groups: NDArray[Any], usable: NDArray[np.bool_], context: int, horizon: int, stride: int = 1

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.channels import masks
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored, tactile
 from tacpipe.codecs.frame_stacking import breaks
@@ -33,7 +34,6 @@ ARM = POSE + VELOCITY + TURNING
 FINGER = "robot_finger_m"
 JOINTS = 7
 TRUTH = "gt_"  # how the simulator's ground truth begins, which no model may see
-APART = {"uniform": 1.5, "logged": 3.0, "fresh": 3.0}  # times the usual step: further apart, rows are missing between
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def track(shard: Recording, codec: codecs.Codec) -> Track:
         shard.name,
         t_ns,
         contact,
-        np.cumsum(breaks(t_ns, APART.get(timeline, APART["uniform"]))),
+        np.cumsum(breaks(t_ns, masks.apart(shard.attributes))),
         finite & np.isfinite(finger) & ~tactile.gaps(table),
         latent.astype(np.float32),
         arm,

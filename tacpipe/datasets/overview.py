@@ -1,0 +1,95 @@
+"""What an opened dataset holds, in a few lines: its stage, recordings, streams with rates, labels and files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from html import escape
+from typing import TYPE_CHECKING
+
+from tacpipe import printable
+from tacpipe.channels import streams
+from tacpipe.errors import TacpipeError
+from tacpipe.printable import listed
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+_NAMED, _PARAMS, _LABELS = 4, 6, 8  # recordings or files, params and labels that are listed before the rest is counted
+_VALUES = 5  # values of a label, above which it is counted alone
+
+
+def lines(dataset: Dataset) -> list[tuple[str, str]]:
+    """Return (what, text) of each line; streams and rates are those of the first recording, which alone is read."""
+    made = dataset.source
+    params = listed([f"{name}={value}" for name, value in made.params.items()], _PARAMS)
+    found = [("made by", f"{made.stage} version {made.version}{f' ({params})' if params else ''}")]
+    names = list(dataset.recordings)
+    count = f"{len(names)} of {len(made.included)}" if len(names) < len(made.included) else str(len(names))
+    found.append(("recordings", f"{count}: {listed(names, _NAMED)}" if names else "none"))
+    if names:
+        found.append(("streams", _streams(dataset[names[0]])))
+        labels = _labels(dataset)
+        found += [("labels", labels)] if labels else []
+    if made.files:
+        found.append(("files", listed(sorted(made.files), _NAMED)))
+    return [(what, printable.lines([text])) for what, text in found]
+
+
+def text(dataset: Dataset) -> str:
+    """Return the overview as plain text, a line each."""
+    body = [f"  {what:<11}{line}" for what, line in lines(dataset)]
+    return "\n".join([f"<tacpipe.Dataset {_title(dataset)}>", *body])
+
+
+def html(dataset: Dataset) -> str:
+    """Return the overview as a small table for a notebook; every text is escaped."""
+    rows = "".join(
+        f'<tr><th style="text-align:left">{escape(what)}</th><td style="text-align:left">{escape(line)}</td></tr>'
+        for what, line in lines(dataset)
+    )
+    return f"<table><caption>tacpipe.Dataset {escape(_title(dataset))}</caption>{rows}</table>"
+
+
+def _title(dataset: Dataset) -> str:
+    where = "" if dataset.path is None else f"{printable.shown(str(dataset.path))} "
+    return f"{where}[{dataset.digest[:12]}]"
+
+
+def _streams(recording: Recording) -> str:
+    try:
+        if recording.streams == ("",):
+            table = recording.table()
+            within = [name for name in streams.streams_of(recording) if name]
+            return f"one table ({_size(table)}){' of ' if within else ''}{', '.join(within)}"
+        return ", ".join(f"{name} ({_size(recording.table(name))})" for name in recording.streams)
+    except TacpipeError as error:
+        return f"not readable: {error}"
+
+
+def _size(table: pa.Table) -> str:
+    rate_hz = streams.rate_hz(table)
+    return f"{f'{rate_hz:g} Hz, ' if rate_hz else ''}{counted(table.num_columns, 'column')}"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun.
+
+    >>> counted(1, "column"), counted(2, "column")
+    ('1 column', '2 columns')
+    """
+    return f"{count} {noun}{'s' if count != 1 else ''}"
+
+
+def _labels(dataset: Dataset) -> str:
+    """Return the labels that take few values, with how many recordings have each; the others are counted."""
+    names = list(dict.fromkeys(name for one in dataset for name in one.attributes))
+    found = []
+    for name in names:
+        values = Counter(str(one.attributes[name]) for one in dataset if name in one.attributes)
+        if len(values) <= _VALUES and not name.startswith(streams.TRUTH):
+            found.append(f"{name}: {', '.join(f'{value} ({count})' for value, count in sorted(values.items()))}")
+    shown = found[:_LABELS]
+    rest = len(names) - len(shown)
+    return "; ".join([*shown, *([f"{rest} more"] if rest else [])])
