@@ -31,6 +31,7 @@ named = toy_stages:named
 centre = toy_stages:centre
 total = toy_stages:total
 halves = toy_stages:halves
+page = toy_stages:page
 
 [tacpipe.formats]
 numbers = toy_stages:read

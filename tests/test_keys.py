@@ -77,7 +77,7 @@ def built(**options: Any) -> Params:
 
 
 def key(params: Any = None, inputs: Mapping[str, Any] | None = None, name: str = "cut", given: AnyStage = STAGE) -> str:
-    return digest(keys.identity(name, given, params or Params(), inputs or {}))
+    return digest(keys.identity(name, given.version, params or Params(), inputs or {}))
 
 
 def told(value: Any) -> Any:

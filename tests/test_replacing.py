@@ -120,17 +120,18 @@ def test_an_output_within_a_dataset_or_around_one_is_refused(lab: Lab) -> None:
 
 
 def test_a_page_does_not_replace_a_file_that_tacpipe_did_not_write(lab: Lab, tmp_path: Path) -> None:
-    from tacpipe.datasets import replacing
-    from tacpipe.engine import output
-    from tacpipe.engine.request import Request
-    from tacpipe.errors import UsageError
-
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
     Path("notes.html").write_text("mine")
-    plan = replacing.Plan("report", 1)
-    with pytest.raises(UsageError, match=r"notes\.html is a file that tacpipe did not write"):
-        output.refuse(lab.store, Request("report", None, Path("notes.html")), plan)
-    output.refuse(lab.store, Request("report", None, Path("notes.html"), replace=True), plan)
-    output.refuse(lab.store, Request("report", None, Path("new.html")), plan)
+    ran = lab.call("page data/s -o notes.html")
+    assert ran.code == 2 and "notes.html" in ran.err and Path("notes.html").read_text() == "mine"
+    lab.run("page data/s -o notes.html --replace")
+    assert Path("notes.html").read_text() == "<p>4 recordings</p>"
+    lab.run("page data/s -o notes.html")
+    Path("notes.html").write_text("changed by hand, and known to be ours")
+    lab.run("page data/s -o notes.html")
+    assert Path("notes.html").read_text() == "<p>4 recordings</p>"
+    lab.run("page data/s -o new.html")
 
 
 def test_an_emulated_rig_file_does_not_replace_another_one(lab: Lab) -> None:

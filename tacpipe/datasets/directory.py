@@ -6,7 +6,8 @@ import contextlib
 import os
 import re
 import uuid
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import adoption, replacing
@@ -21,24 +22,48 @@ _DRAFT = ".draft"
 _OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}{_DRAFT}", re.DOTALL)
 
 
-def publish(store: Store, manifest: Manifest, directory: Path) -> None:
-    """Make ``directory`` show ``manifest``: a root in the store, then shards linked (recordings copied), the manifest last.
+@dataclass(frozen=True)
+class Change:
+    """What a directory is to show.
 
-    The root comes first so that what a killed run left behind is known to be ours.
-    What an earlier manifest named and this one does not is removed. Raises `UsageError` if the directory holds
-    something that tacpipe did not write.
+    Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
+    Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes.
     """
+
+    manifest: Manifest
+    may_lack: Collection[str] = ()
+    relabelled: bool = False
+
+
+def publish(store: Store, manifest: Manifest, directory: Path) -> None:
+    """Make ``directory`` show ``manifest``, as `change` does; where it does already, only its root is set again."""
     directory = directory.absolute()
-    if shown(store, manifest, directory):
+    if shows(store, manifest, directory):
         store.roots.set(directory, bytes_digest(manifest.content))
         return
-    with changing(store, directory):
-        publish_alone(store, manifest, directory)
+    change(store, directory, lambda: Change(manifest))
 
 
-def shown(store: Store, manifest: Manifest, directory: Path) -> bool:
+def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
     """Return whether ``directory`` shows ``manifest`` already, with all that it names."""
     return _current(directory, manifest.content) and not _stale(store, manifest, directory)
+
+
+def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manifest:
+    """Make ``directory`` show what ``decide`` returns, and return its manifest: whatever is changed there goes this way.
+
+    ``decide`` is called once nobody else changes the directory, so it may read what is there first. Then come a root in
+    the store, which marks as ours what a killed run leaves behind, the shards, linked (recordings copied), and the manifest
+    last. What the dataset before held and cannot be computed again stays in the store, and so does its manifest; what it
+    named and this one does not is removed. Raises `UsageError` if the directory holds something that tacpipe did not write.
+    """
+    directory = directory.absolute()
+    with changing(store, directory):
+        wanted = decide()
+        if wanted.manifest.recorded:
+            store.put(wanted.manifest.content, durable=True)
+        _show(store, wanted, directory)
+    return wanted.manifest
 
 
 @contextlib.contextmanager
@@ -49,21 +74,13 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
         yield
 
 
-def publish_alone(
-    store: Store, manifest: Manifest, directory: Path, *, may_lack: Collection[str] = (), relabelled: bool = False
-) -> None:
-    """Do as `publish` does, in the block of `changing`.
-
-    Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
-    What the dataset before held and cannot be computed again stays in the store, and so does its manifest. Of one that was
-    ``relabelled`` nothing is gone and no shard is looked at: a label costs what it changes.
-    """
-    directory = directory.absolute()
+def _show(store: Store, wanted: Change, directory: Path) -> None:
+    manifest, relabelled = wanted.manifest, wanted.relabelled
     check_output(store, directory)
-    wanted = dict(manifest.objects())
+    objects = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    stale = [] if relabelled else _stale(store, manifest, directory) if current else list(wanted)
-    gone = set() if relabelled else _named(directory) - set(wanted)
+    stale = [] if relabelled else _stale(store, manifest, directory) if current else list(objects)
+    gone = set() if relabelled else _named(directory) - set(objects)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
@@ -73,8 +90,8 @@ def publish_alone(
         store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
         sweep(directory, shards=bool(stale))
         for path in stale:
-            with contextlib.suppress(*([MissingError] if path in may_lack else [])):
-                place(store, wanted[path], directory / path, copy=manifest.recorded)
+            with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
+                place(store, objects[path], directory / path, copy=manifest.recorded)
         _remove(directory, gone)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
@@ -123,7 +140,7 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         raise TacpipeError(
             f"{path} cannot be written: {error.strerror or error}. The result is kept in the store: run the same command "
-            f"again when that is mended."
+            f"again when that is fixed."
         ) from error
 
 

@@ -64,13 +64,16 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
     found = manifest_of.find(path)
     store, directory = locate(found.directory), found.directory
     _refuse_made(found.manifest, directory)
-    with store.at_work([found.digest]), directory_of.changing(store, directory):
-        found = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
-        names = _matching(found, patterns)
-        changed = found.manifest.labelled({name: dict(labels) for name in names})
-        store.put(found.content)
-        store.put(changed.content, durable=True)
-        directory_of.publish_alone(store, changed, directory, may_lack=dict(changed.objects()), relabelled=True)
+    names: list[str] = []
+
+    def labelled() -> directory_of.Change:
+        here = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
+        names.extend(_matching(here, patterns))
+        store.put(here.content)
+        return directory_of.Change(here.manifest.labelled({name: dict(labels) for name in names}), relabelled=True)
+
+    with store.at_work([found.digest]):
+        directory_of.change(store, directory, labelled)
     return Changed(directory, names)
 
 

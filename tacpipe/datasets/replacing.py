@@ -12,10 +12,10 @@ What was replaced stays in the store and is listed by `tacpipe store list`.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import recording_names
@@ -25,9 +25,6 @@ from tacpipe.io import places, regular
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.printable import listed, plain
 from tacpipe.store.store import Store
-
-if TYPE_CHECKING:
-    from tacpipe.engine.request import Request
 
 _SHOWN = 5  # names listed before the rest is counted
 _BACK = "What is there now stays in the store, and `tacpipe store list` names it."
@@ -55,16 +52,13 @@ class Plan:
     sources: Mapping[str, Any] = field(default_factory=dict)  # of ingest: recording to file to digest
 
 
-def refuse_inputs(request: Request) -> None:
-    """Raise `UsageError` if the output of ``request`` is one of its inputs, or an address."""
-    places.local(request.output)
-    named = {name: getattr(request, name) for name in ("model", "split", "codec", "extend", "init", "source")}
-    inputs = [*request.datasets, *(path for path in named.values() if path is not None)]
+def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
+    """Raise `UsageError` if ``output`` is one of the ``inputs`` of a command, or an address."""
+    places.local(output)
     for path in inputs:
-        if _same(request.output, path.parent if path.name == manifest_of.NAME else path):
+        if _same(output, path.parent if path.name == manifest_of.NAME else path):
             raise UsageError(
-                f"{request.output} is an input of this command, and writing there would replace it. Give -o another "
-                f"directory."
+                f"{output} is an input of this command, and writing there would replace it. Give -o another directory."
             )
 
 

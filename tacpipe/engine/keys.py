@@ -14,10 +14,10 @@ from tacpipe.plugins.stage import AnyStage
 from tacpipe.store.store import Store
 
 
-def identity(name: str, stage: AnyStage, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the key of a result is the digest of."""
+def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the key of a result is the digest of; ``params`` are a stage's dataclass, or its values by name."""
     values = params if isinstance(params, Mapping) else params_of.to_json(params)
-    return {"stage": name, "version": stage.version, "params": values, "inputs": inputs}
+    return {"stage": name, "version": version, "params": values, "inputs": inputs}
 
 
 def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: 
 
     def task(name: str, entry: Entry) -> Task:
         inputs = {recording: of_recording(entry, stage.reads or ()), **fitted}
-        named = identity(step["stage"], stage, step["params"], inputs)
+        named = identity(step["stage"], stage.version, step["params"], inputs)
         return Task(str(store.root), step["stage"], named, name, beside=beside)
 
     return [task(name, entry) for name, entry in sorted(given.included.items())]
@@ -79,7 +79,7 @@ def source_tasks(
         Task(
             str(store.root),
             name,
-            identity(name, stage, params, {argument: digests[recording]}),
+            identity(name, stage.version, params, {argument: digests[recording]}),
             recording,
             files={file: str(path) for file, path in files.items()},
         )
@@ -93,6 +93,11 @@ def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[T
     count = int(params.trials)
     width = max(3, len(str(count - 1)))
     return [
-        Task(str(store.root), name, identity(name, stage, params, {argument: number}), f"trial-{number:0{width}d}")
+        Task(
+            str(store.root),
+            name,
+            identity(name, stage.version, params, {argument: number}),
+            f"trial-{number:0{width}d}",
+        )
         for number in range(count)
     ]

@@ -32,6 +32,11 @@ class Outcome:
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
     unlike: list[str] = field(default_factory=list)  # in what the computers of results that differ are not the same
 
+    def begin(self) -> None:
+        """Count nothing and restore nothing: what the store answers, or what is computed, is added from here."""
+        self.ran = self.reused = 0
+        self.restore({})
+
     def add_record(self, stage: str, recording: str, record: Mapping[str, Any]) -> None:
         """Add what the record of one result holds besides it: notes, and the code that it was computed by."""
         made = record["provenance"]

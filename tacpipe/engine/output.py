@@ -1,8 +1,10 @@
-"""What is at a command's output, and making it show a result: a dataset with its labels, or one file of it."""
+"""What a command's output shows afterwards: a dataset with its labels, or one file of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 from tacpipe.datasets import directory, replacing
 from tacpipe.datasets.manifest import Manifest
@@ -10,114 +12,191 @@ from tacpipe.engine.request import Request
 from tacpipe.errors import DamagedError, UsageError, WouldChangeError
 from tacpipe.io.hashing import bytes_digest, file_digest
 from tacpipe.plugins.stage import Attribute
-from tacpipe.store.store import Store
+from tacpipe.store.store import MissingError, Store
 
 
-def shown(store: Store, request: Request, hit: Manifest) -> bool:
-    """Return whether the output holds the answer already and nothing is to be written; a dataset's root too is known."""
-    root = store.roots.get(request.output.absolute())
-    if root is None:
-        return False
-    if request.single_file:
-        known = root["manifest"] == bytes_digest(hit.content) and request.output.exists()
-        return known and file_digest(request.output) == hit.files[_single(request, hit)]["digest"]
-    wanted = settled(store, request, hit)
-    known = root["manifest"] == bytes_digest(wanted.content) and store.has(root["manifest"])
-    return known and directory.shown(store, wanted, request.output.absolute())
+class Work(Protocol):
+    """Where the result of a command comes from."""
+
+    @property
+    def reads(self) -> Sequence[str]:
+        """The digests of the manifests that it is made of."""
+
+    def answer(self) -> Manifest | None:
+        """Return the result if the store has it whole; nothing is run."""
+
+    def make(self) -> Manifest:
+        """Return the result, having run what was missing; the run is not remembered."""
+
+    def result(self, *, rerun: bool) -> Manifest:
+        """Return the result, answered by the store or made and remembered; ``rerun``: made in any case."""
 
 
-def settled(store: Store, request: Request, made: Manifest) -> Manifest:
-    """Return the manifest that the output shows after the command gave ``made``.
+def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> Manifest:
+    """Return the manifest that the output shows once the request is met; the only way in which a command writes it.
 
-    Recordings have the labels that were set on them by hand, also where they were deleted or replaced in the meantime and
-    come back; ingested ones are appended to those that are there. Raises `DamagedError` if what is there cannot be read.
+    ===============  ==================================  ==============================================
+    output           ``--check``                         otherwise
+    ===============  ==================================  ==============================================
+    shows the answer  nothing to do                       nothing to do
+    shows another     raises `WouldChangeError`           the answer, or what is made, is published
+    must not change   raises `UsageError`                 raises `UsageError`, before anything is run
+    ===============  ==================================  ==============================================
+
+    With ``--recompute-and-compare`` the result is made and the output stays as it is. While the result is made and
+    published nothing that it is made of is collected. Where the store turns out to be damaged as it is linked, the result
+    is made again.
     """
-    if not made.recorded:
+    place: _Place = _File(store, request) if request.single_file else _Directory(store, request)
+    hit = None if request.compare or request.rerun else work.answer()
+    shown = hit is not None and place.shows(hit)
+    if not (shown or request.compare):
+        place.refuse(plan)
+    if shown or request.check or request.compare:
+        made = place.settled(hit or work.make())
+        if request.check:
+            place.check(made)
         return made
-    before = replacing.occupant(store, request.output)
-    if before is not None and before.stage != made.stage:
-        before = None
-    returning = replacing.returning_labels(store, request.output, before, made)
-    if before is None:
-        return _labelled(made, returning)
-    if replacing.irreplaceable(made) and not request.replace:
-        made = replacing.appended(before, made)
-    return _labelled(made, {**returning, **before.labels})
+    with store.at_work(work.reads):
+        try:
+            return place.publish(work.result(rerun=request.rerun))
+        except MissingError:  # damaged in the store, which shows when it is linked: then it is made again
+            return place.publish(work.result(rerun=False))
+
+
+class _Place(ABC):
+    """The output of a request."""
+
+    def __init__(self, store: Store, request: Request) -> None:
+        self.store, self.request, self.path = store, request, request.output.absolute()
+
+    @property
+    def root(self) -> dict[str, Any] | None:
+        """What the store knows of what was last written there."""
+        return self.store.roots.get(self.path)
+
+    @abstractmethod
+    def shows(self, hit: Manifest) -> bool:
+        """Return whether it holds the answer already and nothing is to be written; its root too is known."""
+
+    @abstractmethod
+    def refuse(self, plan: replacing.Plan) -> None:
+        """Raise `UsageError` if the command would replace what it must not, before it computes anything."""
+
+    @abstractmethod
+    def publish(self, made: Manifest) -> Manifest:
+        """Show ``made`` and return the manifest that is shown now."""
+
+    def settled(self, made: Manifest) -> Manifest:
+        """Return the manifest that it shows after the command gave ``made``."""
+        return made
+
+    def check(self, made: Manifest) -> None:
+        """Raise `WouldChangeError` where it was made from anything else, `UsageError` where it would be refused."""
+        root = self.root
+        if root is None or root["manifest"] != bytes_digest(made.content):
+            raise WouldChangeError(f"{self.request.output} would change: it was made from other inputs or params.")
+
+
+class _Directory(_Place):
+    """The directory of a dataset."""
+
+    def shows(self, hit: Manifest) -> bool:
+        root = self.root
+        if root is None:
+            return False
+        wanted = self.settled(hit)
+        known = root["manifest"] == bytes_digest(wanted.content) and self.store.has(root["manifest"])
+        return known and directory.shows(self.store, wanted, self.path)
+
+    def refuse(self, plan: replacing.Plan) -> None:
+        directory.check_output(self.store, self.request.output)
+        if not self.request.replace:
+            replacing.refuse_plan(self._occupant(), self.request.output, plan)
+
+    def settled(self, made: Manifest) -> Manifest:
+        """Return ``made`` as it is shown.
+
+        Recordings have the labels that were set on them by hand, also where they were deleted or replaced in the meantime
+        and come back; ingested ones are appended to those that are there. Raises `DamagedError` if what is there cannot be
+        read.
+        """
+        if not made.recorded:
+            return made
+        before = replacing.occupant(self.store, self.request.output)
+        if before is not None and before.stage != made.stage:
+            before = None
+        returning = replacing.returning_labels(self.store, self.request.output, before, made)
+        if before is None:
+            return _labelled(made, returning)
+        if replacing.irreplaceable(made) and not self.request.replace:
+            made = replacing.appended(before, made)
+        return _labelled(made, {**returning, **before.labels})
+
+    def check(self, made: Manifest) -> None:
+        self._refuse_losses(made)
+        super().check(made)
+
+    def publish(self, made: Manifest) -> Manifest:
+        if not made.recorded and directory.shows(self.store, made, self.path):
+            self.store.roots.set(self.path, bytes_digest(made.content))
+            return made
+
+        def decided() -> directory.Change:  # somebody may have labelled what is there
+            wanted = self.settled(made)
+            self._refuse_losses(wanted)
+            return directory.Change(wanted)
+
+        return directory.change(self.store, self.request.output, decided)
+
+    def _refuse_losses(self, made: Manifest) -> None:
+        if not self.request.replace:
+            replacing.refuse_losses(self._occupant(), self.request.output, made)
+
+    def _occupant(self) -> Manifest | None:
+        """Return the manifest that is there; None also where both it and its root are damaged.
+
+        Recordings are not written there then, as `settled` says; what is computed from others is computed again.
+        """
+        try:
+            return replacing.occupant(self.store, self.request.output)
+        except DamagedError:
+            return None
+
+
+class _File(_Place):
+    """One file of a result, in place of a dataset."""
+
+    def shows(self, hit: Manifest) -> bool:
+        root = self.root
+        known = root is not None and root["manifest"] == bytes_digest(hit.content) and self.path.exists()
+        return known and file_digest(self.path) == self._digest(hit)
+
+    def refuse(self, plan: replacing.Plan) -> None:
+        if self.request.replace or not self.path.is_file() or self.root is not None:
+            return
+        if not self.store.has(file_digest(self.path)):
+            raise UsageError(
+                f"{self.request.output} is a file that tacpipe did not write. Give -o another name, or --replace."
+            )
+
+    def publish(self, made: Manifest) -> Manifest:
+        wanted = self._digest(made)
+        with directory.changing(self.store, self.path), directory.writing(self.path):
+            if not self.path.exists() or file_digest(self.path) != wanted:
+                directory.sweep_beside(self.path)
+                directory.place(self.store, wanted, self.path, copy=True)
+            self.store.roots.set(self.path, bytes_digest(made.content))
+        return made
+
+    def _digest(self, made: Manifest) -> str:
+        """Return the digest of the file that is asked for."""
+        suffix = self.path.suffix
+        found = next((file["digest"] for name, file in made.files.items() if name.endswith(suffix)), None)
+        if found is None:
+            raise UsageError(f"{self.request.name} makes no {suffix} file; give -o a directory.")
+        return str(found)
 
 
 def _labelled(made: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
     return made.labelled(labels) if labels else made
-
-
-def check(store: Store, request: Request, made: Manifest) -> None:
-    """Raise `WouldChangeError` where the output was made from anything else, `UsageError` where it would be refused."""
-    if not (request.single_file or request.replace):
-        replacing.refuse_losses(_occupant(store, request), request.output, made)
-    root = store.roots.get(request.output.absolute())
-    if root is None or root["manifest"] != bytes_digest(made.content):
-        raise WouldChangeError(f"{request.output} would change: it was made from other inputs or params.")
-
-
-def publish(store: Store, request: Request, made: Manifest) -> Manifest:
-    """Return the manifest that the output shows now."""
-    if request.single_file:
-        _publish_file(store, request, made)
-        return made
-    if not made.recorded and directory.shown(store, made, request.output.absolute()):
-        store.roots.set(request.output.absolute(), bytes_digest(made.content))
-        return made
-    with directory.changing(store, request.output):  # somebody may be about to label what is there
-        made = settled(store, request, made)
-        if not request.replace:
-            replacing.refuse_losses(_occupant(store, request), request.output, made)
-        if made.recorded:
-            store.put(made.content, durable=True)
-        directory.publish_alone(store, made, request.output)
-    return made
-
-
-def refuse(store: Store, request: Request, plan: replacing.Plan) -> None:
-    """Raise `UsageError` if the command would replace what it must not, before it computes anything."""
-    if request.single_file:
-        _refuse_file(store, request)
-        return
-    directory.check_output(store, request.output)
-    if not request.replace:
-        replacing.refuse_plan(_occupant(store, request), request.output, plan)
-
-
-def _occupant(store: Store, request: Request) -> Manifest | None:
-    """Return the manifest at the output; None also where both it and its root are damaged.
-
-    Recordings are not written there then, as `settled` says; what is computed from others is computed again.
-    """
-    try:
-        return replacing.occupant(store, request.output)
-    except DamagedError:
-        return None
-
-
-def _refuse_file(store: Store, request: Request) -> None:
-    output = request.output.absolute()
-    if request.replace or not output.is_file() or store.roots.get(output) is not None:
-        return
-    if not store.has(file_digest(output)):
-        raise UsageError(f"{request.output} is a file that tacpipe did not write. Give -o another name, or --replace.")
-
-
-def _publish_file(store: Store, request: Request, made: Manifest) -> None:
-    output = request.output.absolute()
-    wanted = made.files[_single(request, made)]["digest"]
-    with directory.changing(store, output), directory.writing(output):
-        if not output.exists() or file_digest(output) != wanted:
-            directory.sweep_beside(output)
-            directory.place(store, wanted, output, copy=True)
-        store.roots.set(output, bytes_digest(made.content))
-
-
-def _single(request: Request, made: Manifest) -> str:
-    """Return the name of the file that is asked for in place of a dataset."""
-    name = next((name for name in made.files if name.endswith(request.output.suffix)), None)
-    if name is None:
-        raise UsageError(f"{request.name} makes no {request.output.suffix} file; give -o a directory.")
-    return name

@@ -44,6 +44,12 @@ class Request:
     replace: bool = False  # the output may hold another stage's dataset, or recordings and labels that will go
 
     @property
+    def reads(self) -> list[Path]:
+        """All that was given to read: datasets, model, split and the like, the folder of a published source."""
+        named = (self.model, self.split, self.codec, self.extend, self.init, self.source)
+        return [*self.datasets, *(path for path in named if path is not None)]
+
+    @property
     def single_file(self) -> bool:
         """Whether the output is one file, such as a report, and no dataset directory."""
         return self.output.suffix == ".html"

@@ -13,7 +13,7 @@ import numpy as np
 from tacpipe.datasets import directory
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
-from tacpipe.engine import provenance
+from tacpipe.engine import keys, provenance
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
@@ -54,22 +54,19 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     if any(one.undecoded for one in sealed.values()):  # what no driver could read today, a better one may
         files[BYTES] = vars(store.put((spooled.folder / "bytes").read_bytes(), durable=True))
     result = {"recordings": {"": entry}, "files": files}
-    identity = {
-        "stage": ACQUIRE,
-        "version": VERSION,
-        "params": {"rig": text["digest"]},
-        "inputs": {"spool": spooled.folder.name},
-    }
+    identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
     made = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
     store.commit(identity, result, made, durable=True)
     output, named = output.absolute(), f"rig-{text['digest'][:8]}.toml"
-    with directory.changing(store, output):
+    names: list[str] = []  # of the recording
+
+    def appended() -> directory.Change:
         before = existing(output)
         there = {} if before is None else before.recordings
         known = next((name for name, other in there.items() if other["shards"] == shards), None)
         if before is not None and known is not None:  # a crash came between this and the spool's end
-            directory.publish_alone(store, before, output, may_lack=_others(before, known, named))
-            return known
+            names.append(known)
+            return directory.Change(before, may_lack=_others(before, known, named))
         name = _free(spooled.header["recording"], there)
         now = before or Manifest(ACQUIRE, VERSION)
         now = replace(
@@ -80,14 +77,16 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
         )
         try:
             manifest_of.check(now)
-            content = now.content
+            now.content  # noqa: B018  (what JSON cannot hold is refused here)
         except (ValueError, TypeError, KeyError) as error:  # what every reader would refuse is never published
             raise TacpipeError(
                 f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
             ) from error
-        store.put(content, durable=True)
-        directory.publish_alone(store, now, output, may_lack=_others(now, name, named))
-    return name
+        names.append(name)
+        return directory.Change(now, may_lack=_others(now, name, named))
+
+    directory.change(store, output, appended)
+    return names[-1]
 
 
 def _others(manifest: Manifest, name: str, rig: str) -> set[str]:

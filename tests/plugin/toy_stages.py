@@ -129,3 +129,9 @@ def halves(params: Read, recordings: Dataset) -> Result:
     fold = pa.array([0] * len(names), pa.int32())
     table = pa.table({"recording": names, "fold": fold, "role": roles})
     return Result(recordings={"split": RecordingOutput(table)})
+
+
+@stage(version=1)
+def page(params: Read, recordings: Dataset) -> Result:
+    """Return a page that counts the recordings."""
+    return Result(files={"page.html": f"<p>{len(recordings)} recordings</p>".encode()})
