@@ -157,4 +157,6 @@ def load(path: str | PathLike[str]) -> Any:
 
     model = open(path)
     with extras.named("A model"):
-        return model_files.task(model.files, str(path)).load(model.files, model.source.chain)
+        from tacpipe.tasks.opened import Chain
+
+        return model_files.task(model.files, str(path)).load(model.files, Chain(model))

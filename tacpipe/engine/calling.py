@@ -21,7 +21,7 @@ from tacpipe.plugins.stage import AnyStage
 
 Given = str | PathLike[str] | Dataset
 _CHECKED = {"jobs": NonNegativeInt, "fold": NonNegativeInt, "role": Literal["train", "val", "test"] | None}
-_STACK = 4  # frames from a warning to who called `tacpipe.run`
+_STACK = 3  # frames from a warning to who called `tacpipe.run`
 
 
 @dataclass(frozen=True)

@@ -3,45 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.manifest import chain_difference
 from tacpipe.errors import UsageError
 
-Chain = Sequence[Mapping[str, Any]]  # of a manifest: the stages that recordings went through one by one
+
+@dataclass(frozen=True)
+class Chain:
+    """The stages that a model was trained behind, and what they fitted: those of the opened ``model``."""
+
+    model: Dataset
+
+    @property
+    def steps(self) -> Sequence[Mapping[str, Any]]:
+        """The stages one by one, as manifests name them."""
+        return self.model.source.chain
 
 
 def opened(recordings: Dataset | Recording, chain: Chain | None) -> Dataset:
-    """Return a dataset, or the one of a recording alone, that went through the stages ``chain``; None: not known.
+    """Return a dataset, or the one of a recording alone, after the stages of ``chain``; None: as it is.
 
-    Raises `UsageError` for anything else, and where the stages are others.
+    Those stages that it has not been through yet are run, as ``tacpipe predict`` does. Raises `UsageError` for anything
+    else than a dataset or a recording, and where it went through other stages.
     """
     if isinstance(recordings, Recording):
         recordings = recordings.alone
     if not isinstance(recordings, Dataset):
         raise UsageError(
-            f"A {type(recordings).__name__} is not a dataset or a recording. Give tacpipe.open(PATH), or one of its shards."
+            f"A {type(recordings).__name__} is not a dataset or a recording. Give tacpipe.open(PATH), or one of its "
+            f"recordings: tacpipe.open(PATH)['trial-000']."
         )
-    if chain is not None:
-        _check(chain, recordings.source.chain)
-    return recordings
+    if chain is None or list(recordings.source.chain) == list(chain.steps):
+        return recordings
+    _check(chain.steps, recordings)
+    from tacpipe.engine import continuation
+
+    return continuation.continued(recordings, chain.model)
 
 
-def _check(wanted: Chain, found: Chain) -> None:
-    if list(found) == list(wanted):
-        return
-    if list(found) == list(wanted[: len(found)]):
+def _check(wanted: Sequence[Mapping[str, Any]], recordings: Dataset) -> None:
+    found = recordings.source.chain
+    if list(found) != list(wanted[: len(found)]):
+        raise UsageError(
+            f"These recordings went through other stages than those that the model was trained behind: "
+            f"{chain_difference(wanted, found)}. Give the recordings before that stage."
+        )
+    if recordings.path is None:
         missing = ", then ".join(f"`tacpipe {_command(step)}`" for step in wanted[len(found) :])
         raise UsageError(
-            f"These recordings did not go through all stages that the model was trained behind: {missing} is missing. Run "
-            f"it, or use `tacpipe predict MODEL RECORDINGS -o OUTPUT`, which does."
+            f"These recordings did not go through all stages that the model was trained behind: {missing} is missing. "
+            f"Run it, or give what tacpipe.open returned."
         )
-    raise UsageError(
-        f"These recordings went through other stages than those that the model was trained behind: "
-        f"{chain_difference(wanted, found)}. Use `tacpipe predict MODEL RECORDINGS -o OUTPUT` with the recordings before "
-        f"that stage."
-    )
 
 
 def _command(step: Mapping[str, Any]) -> str:

@@ -1,0 +1,32 @@
+"""Recordings brought to where a model reads them: through the stages that it was trained behind, outside of a command."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from tacpipe.datasets.dataset import Dataset
+from tacpipe.engine import execution
+from tacpipe.engine.by_recording import ByRecording
+from tacpipe.engine.outcome import Outcome
+from tacpipe.engine.request import Request
+from tacpipe.io.hashing import bytes_digest
+from tacpipe.store.store import locate
+
+
+def continued(recordings: Dataset, model: Dataset) -> Dataset:
+    """Return recordings after the stages of a model's chain that they have not been through yet.
+
+    What the store has is not computed again, and what is computed goes there, as with ``tacpipe predict``. Both datasets
+    were opened. Raises `UsageError` where the recordings went through other stages, `TacpipeError` where one of them
+    cannot be read.
+    """
+    assert recordings.path is not None and model.path is not None
+    source = recordings.source
+    given = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
+    beside = (str(recordings.path), str(model.path))
+    store = locate(recordings.path)
+    mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()))
+    with store.at_work([bytes_digest(source.content), bytes_digest(model.source.content)]):
+        made = mapping.replay(given, model.source, beside, str(recordings.path))
+    return Dataset(made, execution.reader(store, beside))

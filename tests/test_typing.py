@@ -1,0 +1,126 @@
+"""Stages under type checkers: those that the texts print pass as printed, and a call with wrong arguments does not."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.test_docs import blocks
+
+ROOT = Path(__file__).parents[1]
+STAGE = """
+from dataclasses import dataclass
+
+from tacpipe import Dataset, Recording, RecordingOutput, Result, Stage, stage
+
+
+@dataclass(frozen=True)
+class Params:
+    factor: int = 2
+
+
+@stage(version=1)
+def scale(params: Params, recording: Recording) -> RecordingOutput:
+    return RecordingOutput({})
+
+
+@stage(version=1)
+def total(params: Params, recordings: Dataset) -> Result:
+    return Result()
+
+
+def good(params: Params, recording: Recording, recordings: Dataset) -> dict[str, bytes]:
+    kept: Stage[[Params, Dataset], Result] = total
+    names: list[str] = [one.name for one in recordings.select(object="cup")]
+    made: RecordingOutput = scale(params, recording=recordings[names[0]])
+    return dict(kept(params, recordings).files) if made.notes else {}
+"""
+WRONG = {
+    "scale(Params(), 3)": "arg-type",
+    "scale(Params())": "call-arg",
+    "scale(Params(), recording, 1)": "call-arg",
+    "scale({'factor': 2}, recording)": "arg-type",
+    "total(Params(), recording)": "arg-type",
+    "scale(Params(), record=recording)": "call-arg",
+    "scale(Params(), recording).files": "attr-defined",
+}
+
+
+CONFIG = """
+[mypy]
+[mypy-tacpipe.*]
+follow_imports = silent
+[mypy-torch.*,pandas.*,polars.*,duckdb.*,pyarrow.*]
+follow_imports = skip
+ignore_missing_imports = True
+"""
+
+
+def checked(folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--no-error-summary",
+        "--config-file",
+        str(folder / "mypy.ini"),
+    ]
+    (folder / "mypy.ini").write_text(CONFIG)
+    cache = ["--cache-dir", str(ROOT / ".mypy_cache" / "texts")]
+    environment = {**os.environ, "MYPYPATH": str(ROOT)}  # which finds the package where it is installed as editable
+    arguments = [*command, *cache, *map(str, files)]
+    return subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def printed() -> dict[str, str]:
+    """Return every stage that a text prints, by the name of a module."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    found = [(page.stem, code) for page in pages for code in blocks(page.read_text(), "python") if "@stage(" in code]
+    return {f"{re.sub(r'[^a-z]', '_', stem.lower())}_{place}": code for place, (stem, code) in enumerate(found)}
+
+
+@pytest.mark.long
+def test_mypy_refuses_a_stage_called_with_wrong_arguments_and_accepts_the_right_ones(tmp_path: Path) -> None:
+    (tmp_path / "good.py").write_text(STAGE)
+    for place, call in enumerate(WRONG):
+        text = f"{STAGE}\n\ndef bad(recording: Recording) -> None:\n    {call}\n"
+        (tmp_path / f"wrong{place}.py").write_text(text)
+    ran = checked(tmp_path, *sorted(tmp_path.glob("*.py")))
+    told = [line for line in ran.stdout.splitlines() if "error:" in line]
+    for place, kind in enumerate(WRONG.values()):
+        (line,) = (one for one in told if one.startswith(f"wrong{place}.py"))
+        assert f"[{kind}]" in line
+    assert len(told) == len(WRONG), ran.stdout  # and none of good.py
+
+
+@pytest.mark.long
+def test_the_stages_of_the_texts_pass_mypy_strict_as_printed(tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.py" for name in printed()]
+    for file, code in zip(files, printed().values(), strict=True):
+        file.write_text(code)
+    ran = checked(tmp_path, *files)
+    assert files and (ran.returncode, ran.stdout) == (0, "")
+
+
+def test_the_stages_of_the_texts_pass_ruff_as_printed_with_the_rules_of_the_project() -> None:
+    found = printed()
+    assert found
+    for name, code in found.items():
+        for arguments in (["check"], ["format", "--check"]):
+            command = [
+                sys.executable,
+                "-m",
+                "ruff",
+                *arguments,
+                "--stdin-filename",
+                str(ROOT / "stages" / f"{name}.py"),
+                "-",
+            ]
+            ran = subprocess.run(command, input=code, capture_output=True, text=True, check=False)
+            assert ran.returncode == 0, f"{name}: {ran.stdout}{ran.stderr}"
