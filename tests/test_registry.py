@@ -1,5 +1,8 @@
+import ast
+import re
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +13,7 @@ from tests.conftest import Lab, forget
 
 def test_the_names_are_those_that_importlib_finds() -> None:
     forget()
-    for group in (registry.STAGES, registry.FORMATS, registry.TASKS):
+    for group in registry.GROUPS:
         expected = {point.name: point.value for point in entry_points(group=group)}
         assert {**expected} == {name: registry.entry_points()[group].get(name) for name in expected}
         assert expected
@@ -47,7 +50,7 @@ def test_a_broken_plug_in_spoils_its_own_name_alone(lab: Lab, tmp_path: Path, mo
     lab.run("simulate toy -o data/r")
     failed = lab.call("lost data/r -o data/x")
     assert failed.code == 1 and "nowhere" in failed.err
-    assert "no stage" in lab.call("plain data/r -o data/x").err
+    assert "plain_of:f" in lab.call("plain data/r -o data/x").err
 
 
 def test_an_unknown_stage_is_a_usage_error() -> None:
@@ -55,3 +58,55 @@ def test_an_unknown_stage_is_a_usage_error() -> None:
         registry.load("polish")
     with pytest.raises(TacpipeError, match="no task"):
         registry.load_task("polish")
+
+
+def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import json
+
+    from tacpipe.report import page
+    from tests.stages.learning_fakes import FakeDataset
+
+    (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
+    (tmp_path / "own/own.egg-info/entry_points.txt").write_text("[tacpipe.reports]\nweighing = own_report\n")
+    (tmp_path / "own/own_report.py").write_text(
+        'TITLE = "weights of objects"\n\n\ndef reads(dataset):\n    return False\n\n\n'
+        'def report(results, others, traces):\n    return f"<p>{len(results)} scales</p>"\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path / "own")
+    forget()
+    files = {"metrics.json": b"{}", "config.json": json.dumps({"task": "weighing"}).encode()}
+    result: Any = FakeDataset({}, files, {})
+    text = page.render([result, result]).decode()
+    assert "<h1>Weights of objects</h1>" in text and "<p>2 scales</p>" in text
+    assert registry.load_report("unheard-of") is None
+
+
+def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
+    names = "|".join(registry.entry_points()[registry.TASKS])
+    # words of data, as the label material, are no names of tasks where they stand alone
+    literal = re.compile(rf"forward|(?:.*[./])?(?:tasks|report|train|simulate|models|results)[./](?:{names})(?:\..*)?")
+    root = Path(registry.__file__).parents[1]
+    own = {root / part / name for part in ("tasks", "report") for name in names.split("|")}
+    found = {
+        str(file.relative_to(root))
+        for file in root.rglob("*.py")
+        if not own & set(file.parents) and any(literal.fullmatch(text) for text in _texts(file))
+    }
+    assert found <= {
+        "cli/candidates.py",
+        "cli/demo.py",
+        "cli/stages.py",
+    }  # examples, and the demonstration of all tasks
+
+
+def _texts(file: Path) -> set[str]:
+    """Return the texts in a module's code; its docstrings are other nodes."""
+    tree = ast.parse(file.read_text())
+    told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told
+    }

@@ -1,4 +1,4 @@
-"""Names of stages, formats, tasks and sensors, found through entry points and loaded when asked for."""
+"""Names of stages, formats, tasks, reports and sensors, found through entry points and loaded when asked for."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
+REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
+GROUPS = (STAGES, FORMATS, TASKS, REPORTS, SENSORS)
 
 
 @functools.cache
@@ -28,7 +30,7 @@ def entry_points() -> dict[str, dict[str, str]]:
     Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
     takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
     """
-    found: dict[str, dict[str, str]] = {STAGES: {}, FORMATS: {}, TASKS: {}, SENSORS: {}}
+    found: dict[str, dict[str, str]] = {group: {} for group in GROUPS}
     for folder in dict.fromkeys(sys.path):
         for file in _entry_point_files(folder):
             try:
@@ -74,7 +76,7 @@ def load(name: str) -> AnyStage:
         raise UsageError(f"There is no stage {name}; there are {', '.join(stages())}.")
     found = _import(name, target)
     if not isinstance(found, Stage):
-        raise TacpipeError(f"{target}, registered as stage {name}, is no stage: decorate it with @stage(version=1).")
+        raise TacpipeError(f"{target}, registered as stage {name}, is not a stage: decorate it with @stage(version=1).")
     return found
 
 
@@ -84,6 +86,16 @@ def load_task(name: str) -> Any:
     if target is None:
         raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
     return _import(name, target)
+
+
+def load_report(task: str) -> Any:
+    """Return the module that reports the results of a task, None where the task brings none.
+
+    It has ``TITLE``, what the task predicts in a few words; ``report(results, others, traces)``, which returns a part of a
+    page as HTML; and ``reads(dataset)``, whether that part can use a dataset that is not a result.
+    """
+    target = entry_points()[REPORTS].get(task)
+    return None if target is None else _import(task, target)
 
 
 def sensors() -> dict[str, str]:
@@ -130,7 +142,7 @@ def _package(target: str) -> str | None:
     """Return the name of the installed package whose entry point ``target`` is, if it is known."""
     from importlib.metadata import entry_points as every
 
-    found = (point for group in (STAGES, FORMATS, TASKS, SENSORS) for point in every(group=group))
+    found = (point for group in GROUPS for point in every(group=group))
     return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
 
 

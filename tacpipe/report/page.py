@@ -1,32 +1,26 @@
-"""One page of results: each task's package tells of its own."""
+"""One page of results, each task's part by the module that its plug-in brings for it."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tacpipe.report import contents, markup, plain
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-
-TASKS = {  # the package whose functions ``report`` and ``reads`` tell of a task's results, by the task's name
-    "forward": "tacpipe.report.forward",
-    "material": "tacpipe.report.material",
-    "touch": "tacpipe.report.touch",
-}
 
 
 def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> bytes:
     """Return the page for results of ``tacpipe evaluate``, as UTF-8; the same results give the same bytes.
 
     Without a ``title``, it is made of what the tasks on the page predict.
-    Results are told by task, in the order in which tasks first come, and datasets that are no results beside those whose
-    task can use them. Raises `TacpipeError` where none can, and without any result.
+    Results are reported by task, in the order in which tasks first come, with datasets that are not results next to those
+    whose task can use them. Raises `TacpipeError` where none can, and without any result.
     """
     with model_files.believed("the results"):
         return _rendered(given, title, traces)
@@ -40,7 +34,8 @@ def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
             results.setdefault(_task(one), []).append(one)
         else:
             others.append(one)
-    packages: dict[str, Any] = {name: importlib.import_module(TASKS[name]) for name in results if name in TASKS}
+    loaded = {name: registry.load_report(name) for name in results}
+    packages: dict[str, Any] = {name: package for name, package in loaded.items() if package is not None}
     if not results or not all(_users(one, packages) for one in others):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
     title = title or _title(results, packages)
