@@ -32,6 +32,6 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     from tacpipe.datasets import model_files
 
     task = model_files.task(model.files)
-    with model_files.believed("the model"):
+    with model_files.validated("the model"):
         result: Result = task.evaluate(model.files, recordings)
     return result

@@ -31,6 +31,6 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
 
     steps = sorted(set(STEPS.items(params.steps)))
     task = model_files.task(model.files)
-    with model_files.believed("the model"):
+    with model_files.validated("the model"):
         result: Result = task.predict(model.files, recordings, steps)
     return result

@@ -6,17 +6,17 @@ import re
 
 from tacpipe import printable
 
-LONGEST_WORD = 250  # letters: more is no path or name that a person gave
+LONGEST_WORD = 250  # letters: no path or name that a person gave is longer
 DONE, FAILED, USAGE, WOULD_CHANGE, DAMAGED, DEVICE, LOCKED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
 
 class TacpipeError(Exception):
-    """A mistake that its reader can mend: printed without traceback."""
+    """A mistake that its reader can fix: printed without traceback."""
 
     exit_code = FAILED
 
     def __str__(self) -> str:
-        """Return the sentence; what a stranger wrote in it is cut to a line's length, and says nothing to a terminal."""
+        """Return the sentence; untrusted text in it is cut to a line, and its control characters are escaped."""
         text = super().__str__()
         if len(text) > LONGEST_WORD:
             text = re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: f"{word[0][:100]}…{word[0][-100:]}", text)
@@ -24,7 +24,7 @@ class TacpipeError(Exception):
 
 
 class UsageError(TacpipeError):
-    """The command or its params are off."""
+    """The command or its params are wrong."""
 
     exit_code = USAGE
 
@@ -40,15 +40,15 @@ class MissingModuleError(TacpipeError, ImportError):
 
 
 class StorageError(TacpipeError):
-    """The disk or the store failed, which says nothing of what was to be stored."""
+    """The disk or the store failed, whatever was to be stored."""
 
 
 class ShortageError(StorageError):
-    """The computer ran out of memory, threads or processes, which says nothing of what was worked on."""
+    """The computer ran out of memory, threads or processes, whatever was worked on."""
 
 
 class DamagedError(TacpipeError):
-    """Stored bytes are not what they were, and cannot be made again."""
+    """Stored bytes are not what they were, and cannot be recomputed."""
 
     exit_code = DAMAGED
 

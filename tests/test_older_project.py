@@ -52,7 +52,7 @@ def test_a_command_finds_its_older_result_under_the_same_key(
 
 def test_an_older_dataset_is_opened_with_the_label_that_was_set_by_hand(older: Path) -> None:
     found = tacpipe.open("data/recordings")
-    assert found.shards["trial-001"].attributes["object"] == "cup"
+    assert found.recordings["trial-001"].attributes["object"] == "cup"
 
 
 def test_an_older_model_predicts_what_it_predicted_then(older: Path) -> None:

@@ -1,4 +1,4 @@
-"""An arm that moves a finger, as its streams tell: how fast, and how hard it presses."""
+"""An arm that moves a finger, from its streams: how fast, and how hard it presses."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def profile_table(
 def speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:
     """Return stamps and speed of the hand in m/s, each (time,); None without an arm.
 
-    It is told from the joints where they are recorded and are those of an iiwa 14, else from the velocity that the
+    It follows from the joints where they are recorded and are those of an iiwa 14, else from the velocity that the
     controller gave. Over 40 published slides the joints' median is 25.0 mm/s, as is path by time, and the controller's
     19.5 mm/s: its velocity does not belong to the recorded path.
     """

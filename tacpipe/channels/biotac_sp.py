@@ -1,7 +1,7 @@
 """The BioTac SP: where its electrodes lie, what a reading of two of them holds, and the ranges touch is scaled by.
 
 A grasp is felt by the thumb (``th``) and the middle finger (``mf``). Of each finger the pressure of the fluid (``pdc``)
-and 24 impedances (``e``) are foretold: four targets, 50 values.
+and 24 impedances (``e``) are predicted: four targets, 50 values.
 """
 
 from __future__ import annotations

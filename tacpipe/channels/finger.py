@@ -1,4 +1,4 @@
-"""A finger's stream: found among those of its recording, and mended where a reading cannot be."""
+"""A finger's stream: found among those of its recording, with readings repaired that cannot be true."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
 
 
 def mended(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, NDArray[np.int64]]:
-    """Return the stream with spikes of its tactile channels mended, and how many each row had (time,); see `hampel`."""
+    """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`."""
     import pyarrow as pa
 
     names = of_quantity(table, "tactile")

@@ -109,7 +109,7 @@ def wrench_fields() -> list[pa.Field]:
 
 
 def profile_fields() -> list[pa.Field]:
-    """Return the fields that tell how a slide went on: pressure, speed as recorded and smooth, force along z, phase."""
+    """Return the fields that describe a slide: pressure, speed as recorded and smooth, force along z, phase."""
     import pyarrow as pa
 
     pressure = pa.field("pressure_count", pa.float32(), metadata={"unit": "count", "quantity": "static_pressure"})

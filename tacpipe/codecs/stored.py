@@ -41,7 +41,7 @@ def load(files: Mapping[str, bytes]) -> Codec:
 
 def _tried(read: Callable[[], Codec]) -> Codec:
     """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` where they do not."""
-    with model_files.believed("the codec"), np.errstate(all="ignore"):
+    with model_files.validated("the codec"), np.errstate(all="ignore"):
         codec = read()
         if codec.of not in (LEVELS, INCREMENTS) or not all(isinstance(name, str) for name in codec.channels):
             raise ValueError(f"it is of {codec.of} and of {len(codec.channels)} channels")

@@ -125,7 +125,7 @@ def _remove_draft(path: Path) -> None:
 
 
 def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
-    """Have what was written in ``directory`` outlast a loss of power: recordings and their labels cannot be made again."""
+    """Have what was written in ``directory`` outlast a loss of power: recordings and their labels cannot be recomputed."""
     for folder in {(directory / path).parent for path in paths} - {directory}:
         sync_folder(str(folder))
     project = store.root.parent

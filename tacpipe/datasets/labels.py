@@ -36,7 +36,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
 
 
 def _value(text: str) -> Attribute:
-    """Return what a text stands for, where that is a number, true, false or null; else the text."""
+    """Return the value of a text, where that is a number, true, false or null; else the text."""
     from tacpipe.io import yaml_text
 
     try:

@@ -143,16 +143,16 @@ def to_text(tree: dict[str, Any]) -> str:
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
-def _lines(node: dict[str, Any], depth: int, told: set[str], argument: str = "") -> list[str]:
-    """Return the lines of a node and what it descends from; one that was ``told`` already is only named."""
+def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str = "") -> list[str]:
+    """Return the lines of a node and what it descends from; one that was ``described`` already is only named."""
     pad = "  " * depth
     label = f"{argument}: " if argument else ""
     if "lost" in node:
         return [f"{pad}{label}dataset {node['digest'][:12]}, whose manifest is not in this store"]
     place = f"{pad}{label}{node['path'] or '(no longer at a path)'}  [{node['digest'][:12]}]"
-    if node["manifest"] in told:
+    if node["manifest"] in described:
         return [f"{place}  as above"]
-    told.add(node["manifest"])
+    described.add(node["manifest"])
     what = f"{node['recordings']} recordings, {node['rows']} rows" if node["recordings"] else ", ".join(node["files"])
     params = ", ".join(f"{name}={value}" for name, value in node["params"].items())
     lines = [
@@ -172,5 +172,5 @@ def _lines(node: dict[str, Any], depth: int, told: set[str], argument: str = "")
         lines.append(f"{pad}  left out: {listed(sorted(node['skipped']), _SHOWN)}")
     for name, several in node["inputs"].items():
         for given in several:
-            lines += _lines(given, depth + 1, told, name)
+            lines += _lines(given, depth + 1, described, name)
     return lines

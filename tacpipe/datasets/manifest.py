@@ -1,4 +1,4 @@
-"""The manifest: what a dataset is, told in one deterministic JSON file."""
+"""The manifest: what a dataset is, as one deterministic JSON file."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Manifest:
 def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
     """Return the manifest of these bytes; ``verified`` ones come from the store and need no second look.
 
-    Raises `DamagedError` if they are no manifest, or if what they name does not give their digest.
+    Raises `DamagedError` if they are not a manifest, or if what they name does not give their digest.
     """
     regular.expect_parsed(where, len(content))
     try:
@@ -150,7 +150,7 @@ def safe_path(path: str) -> bool:
 
 
 def check(manifest: Manifest) -> None:
-    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: a stranger may have written it."""
+    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: it may be untrusted."""
     _check_lineage(manifest)
     contents = list(manifest.files.values())
     for entry in manifest.recordings.values():
@@ -161,7 +161,7 @@ def check(manifest: Manifest) -> None:
     counts = [one["bytes"] for one in contents] + [one["rows"] for one in contents[len(manifest.files) :]]
     for count in counts:
         if type(count) is not int or count < 0:
-            raise ValueError(f"{str(count)[:80]!r} is no count of rows or bytes")
+            raise ValueError(f"{str(count)[:80]!r} is not a count of rows or bytes")
     for one in contents:
         _expect_digest(one["digest"])
     _check_paths([path for path, _ in manifest.objects()])
@@ -201,7 +201,7 @@ def _expect_mapping(value: object, what: str) -> None:
 
 def _expect_digest(name: object) -> None:
     if not isinstance(name, str) or not DIGEST.fullmatch(name):
-        raise ValueError(f"{str(name)[:80]!r} is no digest")
+        raise ValueError(f"{str(name)[:80]!r} is not a digest")
 
 
 def shard_path(recording: str, stream: str) -> str:
@@ -244,7 +244,7 @@ def find(path: Path | str) -> Found:
     except (FileNotFoundError, NotADirectoryError):
         what = "is empty or not there" if not given.exists() else f"has no {NAME}"
         raise UsageError(
-            f"{given} {what}, so it is no dataset. Give the directory that a tacpipe command wrote with -o."
+            f"{given} {what}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
         ) from None
 
 
@@ -283,7 +283,7 @@ def chain_difference(wanted: Sequence[Mapping[str, Any]], found: Sequence[Mappin
     """
     for ours, theirs in zip(wanted, found, strict=False):
         if ours["stage"] != theirs["stage"]:
-            return f"{theirs['stage']} stands where {ours['stage']} should"
+            return f"{theirs['stage']} is where {ours['stage']} should be"
         if ours["version"] != theirs["version"]:
             return f"{ours['stage']} has version {theirs['version']} instead of {ours['version']}"
         for name in sorted({*ours["params"], *theirs["params"]}):

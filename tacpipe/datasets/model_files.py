@@ -1,6 +1,6 @@
-"""The files of a model or codec, which may come from a stranger: JSON and safetensors, looked at before they are believed.
+"""The files of a model or codec, which may be untrusted: JSON and safetensors, validated before they are used.
 
-Neither can hold a program. What a configuration claims is held against the tensors that are there: a network is built
+Neither can hold a program. What a configuration declares is checked against the tensors that are there: a network is built
 without memory first, and gets it once each of its tensors is in the file in the same shape.
 """
 
@@ -46,7 +46,7 @@ Kind = type | tuple[type, ...]
 
 
 @contextlib.contextmanager
-def believed(what: str) -> Iterator[None]:
+def validated(what: str) -> Iterator[None]:
     """Turn what goes wrong with files that were made or changed by hand into a sentence that names ``what`` they are of."""
     try:
         yield
@@ -65,7 +65,7 @@ def task(files: Mapping[str, bytes], where: str = "This") -> Any:
     from tacpipe.plugins import registry
 
     if CONFIG not in files:
-        raise UsageError(f"{where} is no model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
+        raise UsageError(f"{where} is not a model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
     return registry.load_task(tree(files, CONFIG, {"task": str})["task"])
 
 
@@ -77,7 +77,7 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
     try:
         found = json.loads(files[name])
     except (ValueError, RecursionError) as error:
-        raise TacpipeError(f"{name} is no JSON ({plain(str(error), 100)}). Copy the model again.") from error
+        raise TacpipeError(f"{name} is not JSON ({plain(str(error), 100)}). Copy the model again.") from error
     if not isinstance(found, dict):
         raise TacpipeError(f"{name} holds {excerpt(found)}; it must be a mapping. Copy the model again.")
     for path, kind in (needed or {}).items():
@@ -118,7 +118,7 @@ def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Ten
     """
     import torch
 
-    with believed("the model"), torch.device("meta"), warnings.catch_warnings():
+    with validated("the model"), torch.device("meta"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of layers of no width, which fit nothing
         network = build()
     wanted = {name: tuple(value.shape) for name, value in network.state_dict().items()}
@@ -139,7 +139,7 @@ def _readable(name: str, kind: type[Exception]) -> Iterator[None]:
         yield
     except (kind, ValueError, TypeError, LookupError, OverflowError, AttributeError, RuntimeError) as error:
         raise TacpipeError(
-            f"{name} is no safetensors file that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
+            f"{name} is not a safetensors file that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
             f"from whoever made it."
         ) from error
 
@@ -148,8 +148,8 @@ def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
     wrong = next((key for key, fine in finite.items() if not fine), None)
     if wrong is not None:
         raise TacpipeError(
-            f"{name} holds values that are not finite (NaN) in {plain(wrong)}; nothing can be foretold from them. Train the "
-            f"model again, or copy it from whoever made it."
+            f"{name} holds values that are not finite (NaN) in {plain(wrong)}; nothing can be predicted from them. "
+            f"Train the model again, or copy it from whoever made it."
         )
 
 

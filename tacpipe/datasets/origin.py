@@ -19,9 +19,9 @@ def together(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribu
     >>> together([{"published": "b"}, {"published": "a"}]), together([{"published": "a"}, {"simulated": True}])
     ({'published': 'a,b'}, {'simulated': True})
     """
-    told = list(recordings)
-    found: dict[str, Attribute] = {SIMULATED: True} if any(one.get(SIMULATED) for one in told) else {}
-    sets = {str(one.get(PUBLISHED) or "") for one in told}
+    every = list(recordings)
+    found: dict[str, Attribute] = {SIMULATED: True} if any(one.get(SIMULATED) for one in every) else {}
+    sets = {str(one.get(PUBLISHED) or "") for one in every}
     if sets and "" not in sets:
         found[PUBLISHED] = ",".join(sorted(sets))
     return found

@@ -131,7 +131,7 @@ class ByRecording:
 
 
 def error(exit_code: int, sentence: str) -> TacpipeError:
-    """Return an error with the exit code of the one that it stands for."""
+    """Return an error with the exit code of what it reports."""
     found = TacpipeError(sentence)
     found.exit_code = exit_code
     return found

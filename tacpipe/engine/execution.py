@@ -71,7 +71,7 @@ def compute(task: Task) -> Done:
             stage = stage_of(task.name)
             made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
             made |= {"code": provenance.code(stage), "notes": notes}
-            if stage.source:  # the record alone would tell that this is a recording, until a dataset's manifest does
+            if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
                 store.put(_manifest_of(task, stage, result).content, durable=True)
             record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
             shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
@@ -174,7 +174,7 @@ def _reader_at(root: str, beside: tuple[str, ...], sizes: Mapping[str, int]) -> 
 def reader(
     store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] = MappingProxyType({})
 ) -> Callable[[str, str], bytes]:
-    """Return a function (digest, path within its dataset) -> content that heals what it finds damaged.
+    """Return a function (digest, path within its dataset) -> content that repairs what it finds damaged.
 
     It reads from the store; what is missing there is adopted from the directories ``beside``, or recomputed from its
     record. ``sizes`` are those in bytes that a manifest declares, by digest: nothing much larger is read. Raises
@@ -198,7 +198,7 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
         acquired = identity["stage"] == ACQUIRE
         if acquired or stage_of(identity["stage"]).source:
             raise DamagedError(
-                f"{why} It is the recording {path}, which cannot be made again: restore it with `tacpipe store pull`"
+                f"{why} It is the recording {path}, which cannot be recomputed: restore it with `tacpipe store pull`"
                 f"{'' if acquired else ', or ingest it again'}."
             )
         stage = stage_of(identity["stage"])
@@ -226,7 +226,7 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
         other = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
     reason = other or f"nothing in the store says how {path} was made"
     raise DamagedError(
-        f"{why} It cannot be made again: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
+        f"{why} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
     )
 
 

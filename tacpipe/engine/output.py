@@ -45,7 +45,7 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
 
     With ``--recompute-and-compare`` the result is made and the output stays as it is. While the result is made and
     published nothing that it is made of is collected. Where the store turns out to be damaged as it is linked, the result
-    is made again.
+    is recomputed.
     """
     place: _Place = _File(store, request) if request.single_file else _Directory(store, request)
     hit = None if request.compare or request.rerun else work.answer()
@@ -60,7 +60,7 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
     with store.at_work(work.reads):
         try:
             return place.publish(work.result(rerun=request.rerun))
-        except MissingError:  # damaged in the store, which shows when it is linked: then it is made again
+        except MissingError:  # damaged in the store, which shows when it is linked: then it is recomputed
             return place.publish(work.result(rerun=False))
 
 

@@ -40,18 +40,18 @@ def threads() -> int:
 
 @functools.cache
 def _processor() -> dict[str, Any]:
-    told: dict[str, str] = {}  # of the first core
+    found: dict[str, str] = {}  # of the first core
     try:
         with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
             for line in lines:
                 name, _, value = line.partition(":")
                 if not value:
                     break
-                told[name.strip().lower()] = value.strip()
+                found[name.strip().lower()] = value.strip()
     except OSError:  # macOS
         pass
-    words = set(f"{told.get('flags', '')} {told.get('features', '')}".split())
+    words = set(f"{found.get('flags', '')} {found.get('features', '')}".split())
     return {
-        "model": told.get("model name") or platform.processor() or platform.machine(),
+        "model": found.get("model name") or platform.processor() or platform.machine(),
         "instructions": [name for name in _INSTRUCTIONS if name in words],
     }

@@ -230,7 +230,7 @@ def _capital(words: str) -> str:
 
 
 def _json(value: Any) -> Any:
-    """Return a value with null in place of what is no number, floats to 9 digits: more would differ between machines."""
+    """Return a value with null in place of what is not a number, floats to 9 digits: more would differ between machines."""
     if isinstance(value, dict):
         return {name: _json(one) for name, one in value.items()}
     if isinstance(value, list | tuple):

@@ -52,7 +52,7 @@ def rmse(true: Floats, predicted: Floats) -> float:
 def batch_mean_rmse(true: Floats, predicted: Floats, batch: int = BATCH) -> float:
     """Return the mean of the RMSE of successive batches of grasps, the last of which may be smaller; NaN without any.
 
-    It is no larger than `rmse` where batches are as large (Jensen), which is why both are told.
+    It is no larger than `rmse` where batches are as large (Jensen), which is why both are reported.
 
     >>> batch_mean_rmse(np.array([[0.0], [0.0]]), np.array([[1.0], [7.0]]), batch=1)
     4.0
@@ -104,9 +104,9 @@ def skill(rmse: float, baseline: float) -> float:
 def skill_interval(model: Floats, baseline: Floats, clusters: NDArray[Any]) -> Interval:
     """Return the skill of a model over a baseline and its 95 % interval, from `squared_sums` of both, each (grasp,).
 
-    ``clusters`` (grasp,) tells which grasps hang together: those of an object where the next object counts, a grasp and
-    what other runs said of it where objects are known. Each resample draws as many clusters as there are, with
-    replacement (cluster bootstrap; Davison and Hinkley, 1997, section 3.8). Raises `TacpipeError` for other shapes.
+    ``clusters`` (grasp,) groups the grasps that depend on each other: those of an object where the next object counts, a
+    grasp and what other runs predicted for it where objects are known. Each resample draws as many clusters as there are,
+    with replacement (cluster bootstrap; Davison and Hinkley, 1997, section 3.8). Raises `TacpipeError` for other shapes.
     """
     if not len(model) == len(baseline) == len(clusters):
         raise TacpipeError(

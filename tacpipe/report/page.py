@@ -22,7 +22,7 @@ def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> byt
     Results are reported by task, in the order in which tasks first come, with datasets that are not results next to those
     whose task can use them. Raises `TacpipeError` where none can, and without any result.
     """
-    with model_files.believed("the results"):
+    with model_files.validated("the results"):
         return _rendered(given, title, traces)
 
 
@@ -55,8 +55,8 @@ def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
 
 def _title(tasks: Iterable[str], packages: dict[str, Any]) -> str:
     """Return what the tasks on a page are about."""
-    told = [str(packages[name].TITLE) if name in packages else name.replace("_", " ") for name in tasks]
-    title = markup.listed([one for one in told if one]) or "results"
+    titles = [str(packages[name].TITLE) if name in packages else name.replace("_", " ") for name in tasks]
+    title = markup.listed([one for one in titles if one]) or "results"
     return f"{title[0].upper()}{title[1:]}"
 
 
@@ -66,5 +66,5 @@ def _task(result: Dataset) -> str:
 
 
 def _users(dataset: Dataset, packages: dict[str, Any]) -> list[str]:
-    """Return the tasks whose part of the page can use a dataset that is no result."""
+    """Return the tasks whose part of the page can use a dataset that is not a result."""
     return [name for name, package in packages.items() if package.reads(dataset)]

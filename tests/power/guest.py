@@ -218,7 +218,7 @@ def recovered(passed: list[str]) -> None:
     if not Path("data/acquired/manifest.json").exists():
         assert "acquired" not in passed, "the recording is gone"
         return
-    for recording in api.open("data/acquired").shards.values():
+    for recording in api.open("data/acquired").recordings.values():
         table = recording.table("wire")
         numbers = table.column("seq").to_pylist()
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "frames are missing or out of order"

@@ -156,7 +156,7 @@ class Forecaster:
         model = model_files.filled(
             lambda: network(config["params"], codec), model_files.tensors(files[WEIGHTS], WEIGHTS)
         )
-        with model_files.believed("the model"):
+        with model_files.validated("the model"):
             found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
             codec_files = (
                 {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}

@@ -148,7 +148,7 @@ class Classifier:
         if task != TASK:
             told = plain(str(task))
             raise TacpipeError(f"This model is of the task {told}, not {TASK}. Give one of `tacpipe train material`.")
-        with model_files.believed("the model"):
+        with model_files.validated("the model"):
             made = cls(files, chain)
             made._try()
         return made

@@ -76,7 +76,7 @@ class Predictor:
         config = model_files.tree(files, CONFIG, NEEDED)
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        with model_files.believed("the model"):
+        with model_files.validated("the model"):
             found = [
                 _member(config, about, under(f"{number}.", tensors), device)
                 for number, about in enumerate(config["members"])
