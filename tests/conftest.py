@@ -39,7 +39,7 @@ numbers = toy_stages:read
 pulse = toy_sensor:Pulse
 """
 
-settings.register_profile("tacpipe", deadline=None)  # nothing is timed in tests
+settings.register_profile("tacpipe", deadline=None, max_examples=40)  # nothing is timed in tests
 settings.register_profile("faults", deadline=None, max_examples=500)  # for `make test-faults`
 settings.load_profile("tacpipe")
 

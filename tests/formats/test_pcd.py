@@ -134,7 +134,7 @@ def test_points_that_are_not_finite_are_counted_and_the_first_is_named(tmp_path:
     points = points_m()
     points[[7, 31], [0, 2]] = np.nan, np.inf
     path = written(tmp_path / "cloud.pcd", header(50).encode() + packed(points, colours()))
-    with pytest.raises(TacpipeError, match=r"2 of 50 points .* point 7"):
+    with pytest.raises(TacpipeError, match=r"2 of 50 points.*point 7"):
         pcd.read(path)
 
 
