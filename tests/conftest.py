@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shlex
 import shutil
@@ -48,7 +49,13 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: program
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    gc.disable()  # until all is imported: what a collection makes stays, and looking through it takes seconds
     name_signals()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def name_signals() -> None:

@@ -42,6 +42,8 @@ def refused(lab: Lab, command: str) -> None:
 
 def quoted(text: str) -> str:
     """Return a text as TOML has it."""
+    if text.isprintable() and not set(text) & set('"\\'):
+        return f'"{text}"'
     return '"' + "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text) + '"'
 
 
