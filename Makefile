@@ -34,7 +34,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults test-power test-exits fuzz test-kernel lint types bless bench clean
+.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -86,11 +86,17 @@ test-kernel: $(VENV)/.dev ## run the tests of HID on Debian's kernel in a virtua
 	fi
 	@OMP_NUM_THREADS=1 TACPIPE_TEST_KERNEL=1 $(BIN)/pytest -q -s tests/kernel
 
+test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
+	@$(BIN)/python -m tests.packaging.environments
+
 test-power: $(VENV)/.dev ## replay a loss of power at each write on ext4, xfs and btrfs in User-mode Linux; EVERY=20 tries one of 20
 	@if [ -n "$$($(BIN)/python -c 'from tests.power import machine; print(machine.lacking())')" ]; then \
 	    $(call debian,$(BLOCK_REPLAY)); \
 	fi
 	@TACPIPE_TEST_POWER=$(EVERY) $(PYTEST) tests/power
+
+check: $(VENV)/.dev ## lint and types, next to one another
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync lint types
 
 lint: $(VENV)/.dev ## check style, and that imports follow the layers
 	@$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shlex
 import shutil
@@ -40,7 +41,7 @@ numbers = toy_stages:read
 pulse = toy_sensor:Pulse
 """
 
-settings.register_profile("tacpipe", deadline=None)  # nothing is timed in tests
+settings.register_profile("tacpipe", deadline=None, max_examples=40)  # nothing is timed in tests
 settings.register_profile("faults", deadline=None, max_examples=500)  # for `make test-faults`
 settings.load_profile("tacpipe")
 
@@ -49,7 +50,13 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: program
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    gc.disable()  # until all is imported: what a collection makes stays, and looking through it takes seconds
     name_signals()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def name_signals() -> None:

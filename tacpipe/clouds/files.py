@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.library import open3d
-from tacpipe.clouds.ply_points import parsed as parsed_ply
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 
 TEXT = (".pts", ".xyz", ".xyzn", ".xyzrgb")  # a line a point
 SUFFIXES = (".pcd", ".ply", *TEXT)
+DIGITS = 18  # of a number of points
 LARGEST_M = 10.0  # of what a hand's camera sees; a cloud in millimetres is a thousand times as large as one in metres
 
 
@@ -62,8 +61,9 @@ def _pcd(path: Path) -> Cloud:
 
 def _ply(path: Path) -> Cloud:
     """Return the cloud of a PLY file; open3d's parser writes beyond its memory where a header is made to have it do so."""
-    ply.points(path)
-    xyz, colours = parsed_ply(path, regular.content(path))
+    from tacpipe.clouds import ply
+
+    xyz, colours = ply.parsed(path, regular.content(path))
     _require_finite(path, xyz)
     return Cloud(xyz, colours)
 
@@ -81,7 +81,7 @@ def _told(path: Path) -> int:
     filled = [line.split() for line in lines if line.strip() and not line.startswith(b"#")]
     if path.suffix.lower() != ".pts":
         return len(filled)
-    if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > ply.DIGITS:
+    if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > DIGITS:
         raise TacpipeError(f"{path} is no PTS file: its first line must be the number of points alone.")
     told = int(filled[0][0])
     if _rows(path) < told:  # open3d takes memory for as many as are told

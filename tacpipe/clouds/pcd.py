@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.clouds import text_points
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
@@ -25,7 +26,6 @@ POSITION = ("x", "y", "z")
 COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alpha is left out
 LONGEST_HEADER = 65_536  # bytes; a file without the line DATA in so many is none
 DIGITS = 18  # of a number in a header
-LONGEST_NUMBER = 64  # letters of a number in a file of text
 LARGEST_POINT = 65_536  # bytes, fields that are skipped included
 LZF_MOST = 88  # by which compression makes points smaller at most: three bytes stand for 264
 
@@ -226,49 +226,10 @@ def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
 
 def _of_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
     """Return the points (point,) of the lines behind a header, a line a point."""
-    try:
-        text = content[header.length :].decode("ascii")
-    except UnicodeDecodeError as error:
+    lines = text_points.filled(content[header.length :])
+    if len(lines) != header.points:
         raise TacpipeError(
-            f"{path} says DATA ascii, and bytes follow that are no text. Copy the file again."
-        ) from error
-    rows = [line.split() for line in text.splitlines() if line.strip()]
-    if len(rows) != header.points:
-        raise TacpipeError(
-            f"{path} was cut off or its header is wrong: it tells {header.points} points, and {len(rows)} lines follow. "
+            f"{path} was cut off or its header is wrong: it declares {header.points} points, and {len(lines)} lines follow. "
             f"Copy the file again."
         )
-    names = header.point.names or ()
-    widths = [int(np.prod(header.point[name].shape)) for name in names]
-    for row, words in enumerate(rows):
-        if len(words) != sum(widths):
-            raise TacpipeError(
-                f"{path}, point {row}: the line has {len(words)} numbers; it must have {sum(widths)}. Copy the file again."
-            )
-    found = np.zeros(header.points, header.point)
-    for place, name in enumerate(names):
-        if name in (*POSITION, *COLOURS):
-            found[name] = _column(path, [words[sum(widths[:place])] for words in rows], header.point[name])
-    return found
-
-
-def _column(path: Path, words: list[str], kind: np.dtype[np.void]) -> NDArray[np.void]:
-    """Return the numbers of a column of text. Raises `TacpipeError`, naming the point, for what is none."""
-    long = next((row for row, word in enumerate(words) if len(word) > LONGEST_NUMBER), None)
-    if long is not None:  # an array of words makes room in each row for the longest
-        raise TacpipeError(
-            f"{path}, point {long}: a number of {len(words[long])} letters is longer than {LONGEST_NUMBER}. Copy the file "
-            f"again."
-        )
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what the type does not hold is not finite then
-            return np.array(words).astype(kind)
-    except (ValueError, OverflowError) as error:
-        for row, word in enumerate(words):
-            try:
-                np.array([word]).astype(kind)
-            except (ValueError, OverflowError):
-                raise TacpipeError(
-                    f"{path}, point {row}: {word[:40]!r} is no number of the declared type. Copy the file again."
-                ) from error
-        raise
+    return text_points.parsed(path, lines, header.point, (*POSITION, *COLOURS))

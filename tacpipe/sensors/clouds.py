@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.clouds import pcd, ply_points
+from tacpipe.clouds import pcd, ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.depth_frame import MAGIC, DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
@@ -73,7 +73,7 @@ class Clouds(Sensor):
         points = (samples.values[0] / np.float32(self.unit_m)).astype(np.float32)
         edges = np.flatnonzero(np.diff(samples.rows)) + 1
         groups = np.split(np.arange(len(samples)), edges)
-        return [ply_points.packed(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
+        return [ply.packed(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
 
     def _points(self, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
         """Return the points that were seen (point, xyz), metres, and their colours (point, rgb)."""
@@ -96,5 +96,5 @@ def _parsed(content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | No
     if content.startswith(MAGIC):
         return DepthFrame.of_bytes(content).points()
     if content.startswith(b"ply"):
-        return ply_points.parsed(NAMED, content)
+        return ply.parsed(NAMED, content)
     return pcd.parsed(NAMED, content)

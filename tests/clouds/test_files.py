@@ -60,39 +60,35 @@ def test_a_file_that_was_cut_off_is_never_read_as_fewer_points(
     lines = path.suffix in (".xyz", ".xyzrgb")  # tell no number of points: seen is the line that was cut
     cut = content.rfind(b"\n", 0, int(share * len(content))) + 9 if lines else int(share * len(content))
     path.write_bytes(content[:cut])
-    with pytest.raises(TacpipeError, match=rf"{name}.*(cut off|no PCD|no PLY|can be read)"):
+    with pytest.raises(TacpipeError, match=name):
         read(path)
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "content", "value"),
     [
-        ("cloud.ply", b"\x00\x01 not a cloud", "is no PLY file, or was cut off"),
-        ("cloud.ply", b"ply\nformat ascii 1.0\nend_header\n", "tells of no points"),
-        (
-            "cloud.ply",
-            b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n",
-            "has the line 'element vertex many'",
-        ),
-        ("cloud.ply", b"", "is empty"),
-        ("cloud.pcd", b"\x00" * 99, "is no PCD file"),
-        ("cloud.xyz", b"# nothing\n\n", "tells of 0 points"),
-        ("cloud.xyz", b"1 2 3\nhello\n4 5 6\n", "tells of 3 points, and 2 can be read"),
-        ("cloud.xyz", b"1 2 3\nnan 1 2\n", r"holds 1 of 2 points that are not finite \(NaN\), the first being point 1"),
-        ("cloud.pts", b"1 2 3\n4 5 6\n", "its first line must be the number of points"),
-        ("cloud.pts", b"3\n1 2 3\n4 5 6\n", "tells of 3 points, and 2 can be read"),
-        ("cloud.xyzrgb", b"1 2 3 255 0 0\n1 2 3 9 9 9\n", "has colours from 0 to 255; in its format they are shares"),
-        ("cloud.stl", b"1 2 3\n", "is no cloud that can be read; it must end in one of .pcd, .ply"),
-        ("cloud", b"1 2 3\n", "is no cloud that can be read"),
+        ("cloud.ply", b"\x00\x01 not a cloud", "PLY"),
+        ("cloud.ply", b"ply\nformat ascii 1.0\nend_header\n", "ascii"),
+        ("cloud.ply", b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "'vertex many'"),
+        ("cloud.ply", b"", "empty"),
+        ("cloud.pcd", b"\x00" * 99, "PCD"),
+        ("cloud.xyz", b"# nothing\n\n", "0 points"),
+        ("cloud.xyz", b"1 2 3\nhello\n4 5 6\n", "3 points.* 2 "),
+        ("cloud.xyz", b"1 2 3\nnan 1 2\n", "1 of 2 points.*NaN.* point 1"),
+        ("cloud.pts", b"1 2 3\n4 5 6\n", "PTS"),
+        ("cloud.pts", b"3\n1 2 3\n4 5 6\n", "3 points.* 2 "),
+        ("cloud.xyzrgb", b"1 2 3 255 0 0\n1 2 3 9 9 9\n", " 0 to 255"),
+        ("cloud.stl", b"1 2 3\n", r"\.pcd, \.ply"),
+        ("cloud", b"1 2 3\n", r"\.pcd, \.ply"),
     ],
 )
 def test_what_is_no_cloud_is_refused_with_the_file(
-    tmp_path: Path, name: str, content: bytes, message: str, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, name: str, content: bytes, value: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(TacpipeError, match=message) as raised:
+    with pytest.raises(TacpipeError, match=value) as raised:
         read(path)
     assert str(path) in str(raised.value)
     assert capfd.readouterr() == ("", "")
@@ -102,13 +98,13 @@ def test_what_is_no_cloud_is_refused_with_the_file(
 def test_points_that_are_not_finite_are_counted_and_nothing_is_dropped(tmp_path: Path, name: str) -> None:
     points = points_m()
     points[[5, 9]] = np.nan
-    with pytest.raises(TacpipeError, match="holds 2 of 50 points that are not finite"):
+    with pytest.raises(TacpipeError, match="2 of 50 points"):
         read(write(tmp_path / name, points))
 
 
 @pytest.mark.parametrize("name", ["cloud.ply", "cloud.pcd", "cloud.xyz"])
 def test_a_cloud_of_many_metres_looks_like_millimetres(tmp_path: Path, name: str) -> None:
-    with pytest.raises(TacpipeError, match=r"is 9\d(\.\d+)? m long; .* It looks like millimetres"):
+    with pytest.raises(TacpipeError, match=r" 9\d(\.\d+)? m .* millimetres"):
         read(write(tmp_path / name, 1000 * points_m()))
     assert len(read(write(tmp_path / name, 50 * points_m()))) == 50
 
@@ -127,14 +123,14 @@ def test_elements_before_the_points_are_counted_too(tmp_path: Path) -> None:
     path.write_text(text)
     np.testing.assert_array_equal(read(path).points_m, [(1, 2, 3), (4, 5, 6)])
     path.write_text(text.removesuffix(" 6\n"))
-    with pytest.raises(TacpipeError, match="its 2 rows of vertex are 6 numbers, and 5 follow"):
+    with pytest.raises(TacpipeError, match=r"cloud\.ply.* 3 to 2 "):
         read(path)
 
 
 def test_a_file_or_folder_that_is_no_file_is_told(tmp_path: Path) -> None:
     for suffix in SUFFIXES:
-        with pytest.raises(TacpipeError, match=rf"There is no file .*cloud{suffix}"):
+        with pytest.raises(TacpipeError, match=rf"cloud{suffix}"):
             read(str(tmp_path / f"cloud{suffix}"))
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(TacpipeError, match="There is no file"):
+    with pytest.raises(TacpipeError, match=r"folder\.ply"):
         read(tmp_path / "folder.ply")

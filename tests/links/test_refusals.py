@@ -82,9 +82,7 @@ def test_what_the_network_answers_becomes_a_sentence(
 
 
 def test_what_is_no_websocket_is_told(rude_port: int) -> None:
-    with pytest.raises(
-        DeviceError, match=rf"what answers at 127\.0\.0\.1 port {rude_port} is no websocket .+; check the port"
-    ):
+    with pytest.raises(DeviceError, match=rf"127\.0\.0\.1 port {rude_port}"):
         made(f"ws:127.0.0.1:{rude_port}", Quiet())
 
 
@@ -96,7 +94,7 @@ def test_a_can_interface_that_is_missing_lists_those_that_are_there(
         (tmp_path / name / "type").write_text(f"{kind}\n")
     monkeypatch.setattr(can, "INTERFACES", tmp_path)
 
-    with pytest.raises(DeviceError, match=r"there is no CAN interface can9; there is can1\. Plug the adapter in"):
+    with pytest.raises(DeviceError, match=r"CAN interface can9; there is can1\."):
         made("can:socketcan:can9", Quiet())
 
 
@@ -116,16 +114,16 @@ def test_a_can_interface_that_does_not_open_tells_how_to_bring_it_up(
 
 
 def test_a_missing_adapter_of_slcan_is_told_as_any_serial_port() -> None:
-    with pytest.raises(DeviceError, match="there is no port /dev/ttyNOWHERE; there "):
+    with pytest.raises(DeviceError, match="/dev/ttyNOWHERE"):
         made("can:slcan:/dev/ttyNOWHERE@1000000", Quiet())
 
 
 @pytest.mark.parametrize("address", ["can:can0", "can:socketcan:", "can:slcan:/dev/ttyACM0@fast", "can:pcan:1"])
 def test_a_can_address_that_is_none_is_refused(address: str) -> None:
-    with pytest.raises(UsageError, match="is no CAN bus; it should read can:KIND:CHANNEL"):
+    with pytest.raises(UsageError, match=r"CAN.*can:KIND:CHANNEL"):
         made(address, Quiet())
 
 
 def test_an_unknown_kind_of_address_lists_all() -> None:
-    with pytest.raises(UsageError, match=r"'bluetooth:1' is no address of a device; .+ serial:/dev/ttyACM0"):
+    with pytest.raises(UsageError, match=r"'bluetooth:1'.*serial:/dev/ttyACM0"):
         parse("bluetooth:1")

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tacpipe.clouds import files as cloud_files
-from tacpipe.clouds import pcd, ply_points
+from tacpipe.clouds import pcd, ply
 from tacpipe.clouds.depth_frame import DepthFrame
 from tacpipe.codecs import stored
 from tacpipe.codecs.pca import fit
@@ -61,7 +61,7 @@ def targets() -> dict[str, Target]:
         Target("rig", _rig, lambda: [path.read_bytes() for path in sorted((HERE / "rigs").glob("*.toml"))]),
         Target("spool", _spool, _spools),
         Target("pcd", lambda data: pcd.parsed(NAMED, data), _pcds),
-        Target("ply", lambda data: ply_points.parsed(NAMED, data), _plys),
+        Target("ply", lambda data: ply.parsed(NAMED, data), _plys),
         Target("depth-frame", lambda data: DepthFrame.of_bytes(data).points(), _frames),
         Target("report-descriptor", report_descriptor.parse, _descriptors),
         Target("codec", _codec, lambda: _parts(_codec_files())),
@@ -175,10 +175,10 @@ def _pcds() -> list[bytes]:
 @functools.cache
 def _plys() -> list[bytes]:
     points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
-    whole = ply_points.packed(points, colours)
+    whole = ply.packed(points, colours)
     text = whole[: whole.index(b"end_header")].replace(b"binary_little_endian", b"ascii") + b"end_header\n"
     rows = "".join(f"{x:g} {y:g} {z:g} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(points, colours, strict=True))
-    return [whole, ply_points.packed(points, None), text + rows.encode()]
+    return [whole, ply.packed(points, None), text + rows.encode()]
 
 
 @functools.cache

@@ -42,6 +42,8 @@ def refused(lab: Lab, command: str) -> None:
 
 def quoted(text: str) -> str:
     """Return a text as TOML has it."""
+    if text.isprintable() and not set(text) & set('"\\'):
+        return f'"{text}"'
     return '"' + "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text) + '"'
 
 
@@ -225,7 +227,7 @@ def test_anchors_that_a_person_writes_are_read() -> None:
 def test_what_aliases_stand_for_is_counted_by_what_they_name() -> None:
     few = "a: &a [" + ", ".join("1" * 1 for _ in range(999)) + "]\n"
     assert len(yaml_text.load(few + "b: [" + ", ".join(["*a"] * 90) + "]")["b"]) == 90  # 90,000 values
-    with pytest.raises(ValueError, match="more than 100000 values"):
+    with pytest.raises(ValueError, match="100000"):
         yaml_text.load(few + "b: [" + ", ".join(["*a"] * 110) + "]")
 
 

@@ -29,9 +29,9 @@ def declare(folder: Path, **values: Any) -> None:
 
 
 def beside(lab: Lab) -> set[Path]:
-    """Return all that lies outside of the project's store."""
-    around = lab.folder.parent
-    return {path for path in around.rglob("*") if not path.is_relative_to(lab.store.root)}
+    """Return all that lies in the project outside of its store, and what lies next to the project."""
+    project = {path for path in lab.folder.rglob("*") if not path.is_relative_to(lab.store.root)}
+    return project | set(lab.folder.parent.iterdir())
 
 
 def refused(lab: Lab, folder: Path) -> str:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.channels import schema
-from tacpipe.clouds import ply_points
+from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import estimated_wrist
 from tacpipe.clouds.grasp import Grasp
@@ -42,7 +42,7 @@ def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     told = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
 
     came = {
-        "scene": acquired(Clouds(), ply_points.packed(whole.cloud.points_m, whole.cloud.colours)),
+        "scene": acquired(Clouds(), ply.packed(whole.cloud.points_m, whole.cloud.colours)),
         "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": told}).encode()),
     }
 

@@ -123,5 +123,5 @@ def test_the_vendors_client_is_served() -> None:
 
 
 def test_no_magnetometer_is_refused() -> None:
-    with pytest.raises(UsageError, match="anyskin: magnetometers is 0; it must be between 1 and 200"):
+    with pytest.raises(UsageError, match=r"magnetometers is 0.*1.*200"):
         AnySkin(magnetometers=0)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tacpipe.clouds import files, ply_points
+from tacpipe.clouds import files, ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.depth_frame import DepthFrame
 from tacpipe.errors import TacpipeError, UsageError
@@ -154,7 +154,7 @@ def test_what_is_no_whole_cloud_is_malformed(content: bytes) -> None:
 
 def test_a_cloud_without_the_colours_that_the_rig_tells_of_is_refused() -> None:
     points, colours = made(3, 0)
-    bare, coloured = ply_points.packed(points, None), ply_points.packed(points, colours)
+    bare, coloured = ply.packed(points, None), ply.packed(points, colours)
 
     for sensor, right in ((Clouds(colour=False), bare), (Clouds(), coloured)):
         runs, losses = sensor.framer().feed(Chunks.of([(1, bare), (2, coloured)]))

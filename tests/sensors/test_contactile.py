@@ -146,7 +146,7 @@ def test_frames_before_the_watch_for_slip_began_have_no_sample() -> None:
 
 def test_a_controller_with_other_sensors_is_named() -> None:
     runs, _ = made.through(ONE.framer(), [BY_HAND])
-    with pytest.raises(DeviceError, match="sensors of 1 pillars and the options say 2 of 9"):
+    with pytest.raises(DeviceError, match=r"sensors of 1 pillars.*2 of 9"):
         Contactile().decode(runs[0].frames)
 
 

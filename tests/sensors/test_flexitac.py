@@ -95,7 +95,7 @@ def test_the_vendors_client_is_served() -> None:
 
 
 def test_a_grid_of_nothing_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"flexitac: rows is 0; it must be above 0\."):
+    with pytest.raises(UsageError, match=r"rows is 0.*above 0"):
         FlexiTac(rows=0)
-    with pytest.raises(UsageError, match="rows times columns is 10000; it must be between 1 and 4094"):
+    with pytest.raises(UsageError, match=r"columns is 10000.*1.*4094"):
         FlexiTac(rows=100, columns=100)

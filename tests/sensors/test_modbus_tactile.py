@@ -100,7 +100,7 @@ def test_the_device_is_opened_tared_and_asked_though_something_else_came_first()
 
 
 def test_another_number_of_taxels_is_told() -> None:
-    with pytest.raises(DeviceError, match=r"The module has 60 taxels, not 48; write points = 60 in the rig file\."):
+    with pytest.raises(DeviceError, match=r"60 taxels.*48.*= 60"):
         held(ModbusTactile(points=48).opening({}), SENSOR.device())
 
 
@@ -108,10 +108,10 @@ def test_a_refusal_is_told() -> None:
     opening = SENSOR.opening({})
     ask = next(opening)
     assert ask.found(with_crc(b"\x01\x86\x03")[:4]) is None
-    with pytest.raises(DeviceError, match="refused function 0x06: the value is out of its range"):
+    with pytest.raises(DeviceError, match="0x06"):
         ask.found(with_crc(b"\x01\x86\x03"))
 
 
 def test_an_address_that_is_none_is_refused() -> None:
-    with pytest.raises(UsageError, match="modbus-tactile: address is 0; it must be between 1 and 247"):
+    with pytest.raises(UsageError, match=r"address is 0.*1.*247"):
         ModbusTactile(address=0)

@@ -103,5 +103,5 @@ def test_fields_stand_for_what_is_decoded() -> None:
 
 
 def test_a_rate_that_it_does_not_have_is_refused() -> None:
-    with pytest.raises(UsageError, match="rate_hz is 200; it must be one of 1000, 333, 100, 30, 10"):
+    with pytest.raises(UsageError, match=r"rate_hz is 200.*one of 1000, 333, 100, 30, 10"):
         OptoForce(rate_hz=200)

@@ -43,5 +43,5 @@ def test_a_report_of_another_layout_is_malformed(report: bytes) -> None:
 
 
 def test_full_speed_usb_bounds_the_rate() -> None:
-    with pytest.raises(UsageError, match="at most 1000"):
+    with pytest.raises(UsageError, match="1000"):
         RawHid(rate_hz=2000)

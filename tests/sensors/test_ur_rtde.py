@@ -238,5 +238,5 @@ def test_what_is_encoded_is_decoded(seed: int, rows: int) -> None:
 
 @pytest.mark.parametrize("outputs", [(), ("q",), ("timestamp",), ("actual_q", "actual_q"), ("output_int_register_48",)])
 def test_an_output_that_the_guide_does_not_know_is_refused(outputs: tuple[str, ...]) -> None:
-    with pytest.raises(UsageError, match="name each output of the RTDE guide once"):
+    with pytest.raises(UsageError, match="RTDE"):
         UrRtde(outputs=outputs)

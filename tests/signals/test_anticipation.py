@@ -299,9 +299,9 @@ def test_what_does_not_fit_is_refused() -> None:
         anticipation.difference_sd(truth, groups, horizon=0)
     with pytest.raises(TacpipeError, match="one a row"):
         anticipation.difference_sd(truth, groups[1:], horizon=1)
-    with pytest.raises(TacpipeError, match=r"sd of \(3,\) does not fit"):
+    with pytest.raises(TacpipeError, match=r"sd of \(3,\)"):
         anticipation.changes(truth, groups, horizon=1, sd=np.ones(3))
-    with pytest.raises(TacpipeError, match=r"ahead of \(29, 2\) does not fit"):
+    with pytest.raises(TacpipeError, match=r"ahead of \(29, 2\)"):
         anticipation.calibrate(truth, truth[1:], groups, horizon=1, sd=one, rate_hz=RATE_HZ)
-    with pytest.raises(TacpipeError, match=r"theta of \(1,\) does not fit"):
+    with pytest.raises(TacpipeError, match=r"theta of \(1,\)"):
         anticipation.score(truth, truth, groups, horizon=1, sd=one, theta=one[1:], rate_hz=RATE_HZ)

@@ -212,9 +212,9 @@ def test_one_sample_is_where_it_came() -> None:
 
 def test_clocks_that_are_none_are_refused() -> None:
     _, device_ns, arrival_ns = link(50, 10, 2.0)
-    with pytest.raises(TacpipeError, match="stands still at 3 ns in all 500 rows"):
+    with pytest.raises(TacpipeError, match=r"3 ns.*500 rows"):
         fit_clock(np.full(500, 3), arrival_ns)
-    with pytest.raises(TacpipeError, match=r"runs at 0\.001 times the host's over 0\.009\d* s; .* in nanoseconds"):
+    with pytest.raises(TacpipeError, match=r"0\.001.*0\.009\d* s"):
         fit_clock(device_ns // 1000, arrival_ns)
-    with pytest.raises(TacpipeError, match="499 device stamps and 500 arrivals"):
+    with pytest.raises(TacpipeError, match=r"499 device.*500 arrivals"):
         fit_clock(device_ns[1:], arrival_ns)

@@ -35,7 +35,7 @@ def test_the_load_is_the_mean_length_of_the_taxels_vectors() -> None:
 
 
 def test_channels_that_are_no_whole_taxels_are_refused() -> None:
-    with pytest.raises(TacpipeError, match="4 tactile channels are not whole taxels of 3 axes"):
+    with pytest.raises(TacpipeError, match=r"4 tactile.*taxels of 3 axes"):
         load(np.zeros((1, 4)), np.zeros(4))
 
 
@@ -45,7 +45,7 @@ def test_by_the_axis_mean_all_taxels_begin_at_its_whole_part() -> None:
     means = values[0].reshape(16, 3).mean(axis=0)
     assert tared[0].reshape(16, 3).tolist() == [[int(mean) for mean in means]] * 16
     np.testing.assert_array_equal(np.diff(tared, axis=0), np.diff(values.astype(float), axis=0))
-    with pytest.raises(TacpipeError, match="not whole taxels of 5 axes"):
+    with pytest.raises(TacpipeError, match="taxels of 5 axes"):
         axis_mean_level(values, axes=5)
     with pytest.raises(TacpipeError, match="without rows"):
         axis_mean_level(values[:0])

@@ -82,16 +82,14 @@ def test_the_rows_of_a_reading_follow_from_the_rate() -> None:
 def test_a_finger_that_never_presses_is_told_with_its_rise() -> None:
     pressure, t_ns = closing()
     pressure[:, 1] = 2779 + 3 * (np.arange(400) == 200)
-    with pytest.raises(
-        TacpipeError, match=r"There is no contact: .* rise by 200, 3 counts at most, and must all be 20"
-    ):
+    with pytest.raises(TacpipeError, match=r"200, 3 counts.*20"):
         contact_row(pressure, t_ns, LIMITS)
 
 
 def test_pressures_that_never_rest_are_told_with_what_they_vary_by() -> None:
     pressure, t_ns = closing()
     pressure[:, 0] += np.arange(400) % 2 * 40.0
-    with pytest.raises(TacpipeError, match=r"never rest after contact: within 0\.2 s they vary by 40 counts or more"):
+    with pytest.raises(TacpipeError, match=r"0\.2 s.*40 counts"):
         settled_rows(pressure, t_ns, 161, LIMITS)
     with pytest.raises(TacpipeError, match="never rest"):
         settled_rows(*closing(rows=195), 161, LIMITS)
@@ -100,5 +98,5 @@ def test_pressures_that_never_rest_are_told_with_what_they_vary_by() -> None:
 @pytest.mark.parametrize("rows", [0, 1, 20])
 def test_a_stream_without_rows_to_hold_is_told(rows: int) -> None:
     pressure, t_ns = closing()
-    with pytest.raises(TacpipeError, match=f"stream has {rows} rows"):
+    with pytest.raises(TacpipeError, match=rf"{rows} rows"):
         contact_row(pressure[:rows], t_ns[:rows], LIMITS)

@@ -53,5 +53,5 @@ def test_the_median_is_that_of_ndimage(values: np.ndarray, rows: int) -> None:
 
 @pytest.mark.parametrize("cutoff_hz", [0.0, 25.0, -1.0, float("nan")])
 def test_a_cutoff_beyond_half_the_rate_is_refused(cutoff_hz: float) -> None:
-    with pytest.raises(TacpipeError, match="below half the rate, 25 Hz"):
+    with pytest.raises(TacpipeError, match="25 Hz"):
         butterworth(cutoff_hz, 50.0)

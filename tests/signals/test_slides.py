@@ -19,7 +19,7 @@ def test_the_trigger_is_the_first_row_at_or_above_the_threshold(pressure: list[i
     if rows:
         assert slides.trigger_row(np.array(pressure), 40.0) == rows[0]
     else:
-        with pytest.raises(TacpipeError, match=f"never reaches 40 counts, its most is {max(pressure)}"):
+        with pytest.raises(TacpipeError, match=rf"40 counts.*{max(pressure)}"):
             slides.trigger_row(np.array(pressure), 40.0)
 
 
@@ -41,7 +41,7 @@ def test_an_arm_slides_from_its_first_steady_motion_to_its_last() -> None:
 def test_the_middle_of_a_slide_is_as_far_from_both_ends(first: int, length: int, frames: int) -> None:
     slide = (first, first + length)
     if frames > length:
-        with pytest.raises(TacpipeError, match=f"has {length} rows from row {first} .*{frames} are to be kept"):
+        with pytest.raises(TacpipeError, match=rf"{length} rows.*row {first} .*{frames}"):
             slides.kept_rows(slide, frames, "middle", 0)
         return
     start, stop = slides.kept_rows(slide, frames, "middle", 0)
@@ -53,16 +53,16 @@ def test_the_middle_of_a_slide_is_as_far_from_both_ends(first: int, length: int,
 def test_the_published_crop_begins_101_rows_behind_the_trigger() -> None:
     assert slides.kept_rows((0, 600), 400, "offset", 101) == (101, 501)
     assert slides.kept_rows((8, 800), 400, "offset", 101) == (101, 501)
-    with pytest.raises(TacpipeError, match="has 399 rows from row 101"):
+    with pytest.raises(TacpipeError, match=r"399 rows.*row 101"):
         slides.kept_rows((0, 500), 400, "offset", 101)
-    with pytest.raises(TacpipeError, match="has 0 rows from row 101"):
+    with pytest.raises(TacpipeError, match=r"0 rows.*row 101"):
         slides.kept_rows((0, 50), 400, "offset", 101)
 
 
 def test_no_frames_and_unknown_crops_are_refused() -> None:
     with pytest.raises(TacpipeError, match="and 0 are to be kept"):
         slides.kept_rows((0, 800), 0, "middle", 0)
-    with pytest.raises(TacpipeError, match="crop is 'end'; it must be middle, offset or none"):
+    with pytest.raises(TacpipeError, match="'end'"):
         slides.kept_rows((0, 800), 400, "end", 0)
 
 

@@ -283,9 +283,9 @@ def test_ground_truth_is_marked_as_such() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(TacpipeError, match=r"A trial of 1\.0 s ends before its lift"):
+    with pytest.raises(TacpipeError, match=r"trial of 1\.0 s"):
         simulate_trial(0, 0, Rig(duration_s=1.0))
-    with pytest.raises(TacpipeError, match="There is no protocol 'free'"):
+    with pytest.raises(TacpipeError, match="'free'"):
         simulate_trial(0, 0, Rig(protocol="free"))
 
 

@@ -361,11 +361,9 @@ def test_materials_sessions_and_trials_have_random_numbers_of_their_own() -> Non
 
 
 def test_a_rig_that_cannot_be_is_refused() -> None:
-    with pytest.raises(
-        TacpipeError, match="There are no spectra 'other'; those of the sensors are shared or independent"
-    ):
+    with pytest.raises(TacpipeError, match="'other'"):
         simulate_trial(0, 0, Rig(spectra="other"))
-    with pytest.raises(TacpipeError, match="materials is 0; the rig needs 1 or more"):
+    with pytest.raises(TacpipeError, match=r"materials is 0.*1"):
         simulate_trial(0, 0, Rig(materials=0))
-    with pytest.raises(TacpipeError, match=r"speed_m_s is 0\.0; it must be above 0"):
+    with pytest.raises(TacpipeError, match=r"speed_m_s is 0\.0.*above 0"):
         simulate_trial(0, 0, Rig(speed_m_s=0.0))

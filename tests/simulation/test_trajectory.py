@@ -66,7 +66,7 @@ def test_a_hand_that_is_still_is_still_and_aloft() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(TacpipeError, match=r"A trial of 2\.0 s ends before its lift"):
+    with pytest.raises(TacpipeError, match=r"trial of 2\.0 s"):
         path("controlled", 0, 2.0)
-    with pytest.raises(TacpipeError, match="There is no protocol 'shaken'"):
+    with pytest.raises(TacpipeError, match="'shaken'"):
         path("shaken", 0)

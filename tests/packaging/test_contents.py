@@ -1,0 +1,38 @@
+"""What the wheel contains: every package of the sources, and of the extras each one is tried by `make test-install`."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.packaging import environments
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def settings() -> dict[str, Any]:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_every_package_of_the_sources_is_in_the_wheel(settings: dict[str, Any]) -> None:
+    packages = settings["tool"]["setuptools"]["packages"]
+
+    assert packages == sorted(set(packages))
+    folders = [path.parent.relative_to(ROOT) for path in (ROOT / "tacpipe").rglob("__init__.py")]
+    assert set(packages) == {*(".".join(folder.parts) for folder in folders), "tacpipe_stages"}
+
+
+def test_every_folder_with_modules_is_a_package() -> None:
+    folders = {path.parent for top in ("tacpipe", "stages") for path in (ROOT / top).rglob("*.py")}
+
+    assert [folder for folder in folders if not (folder / "__init__.py").is_file()] == []
+
+
+def test_every_extra_for_users_is_tried_in_an_environment_of_its_own(settings: dict[str, Any]) -> None:
+    extras = set(settings["project"]["optional-dependencies"])
+
+    assert set(environments.EXTRAS) == extras - set(environments.NOT_FOR_USERS)
