@@ -96,19 +96,20 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
 
 @stage(version=2, fit=fit)
 def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
-    """Add the principal components of the tactile channels as columns ``z00``, ``z01``, ….
+    """Compress tactile channels to their principal components.
 
-    Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
+    They are added as columns ``z00``, ``z01``, …. Raises `TacpipeError` where the recording's channels are not
+    those the codec was fitted on.
     """
     return _encoded(recording, codec)
 
 
 @stage(version=1, fit=fit_autoencoder)
 def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) -> pa.Table:
-    """Add what an autoencoder makes of the tactile channels as columns ``z00``, ``z01``, ….
+    """Compress tactile channels to the latents of an autoencoder.
 
-    Of the training recordings 15 % are held out to say when its training ends. Raises `TacpipeError` where the
-    recording's channels are not those the codec was fitted on.
+    They are added as columns ``z00``, ``z01``, …. 15 % of the training recordings are held out for early stopping.
+    Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
     """
     return _encoded(recording, codec)
 

@@ -1,4 +1,4 @@
-"""Cut grasps down to what touch is foretold from, and to what was felt: the object's points and one reading."""
+"""Cut grasps down to what touch is predicted from, and to what was measured: the object's points and one reading."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class Params:
 
 @stage(version=2)
 def grasps(params: Params, recording: Recording) -> RecordingOutput:
-    """Find the grasped object in the camera's view, and what the fingers felt once they had closed on it.
+    """Extract the grasped object and the fingers' readings.
 
     Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
-    of each channel after contact, stamped where it begins; ``contact_ns`` tells when both fingers first touched. Other
+    of each channel after contact, stamped where it begins; ``contact_ns`` is when both fingers first touched. Other
     streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
     already stays as it is; one that was not made yet has no ``biotac_sp``, and gets no ``reading``.
     """

@@ -1,4 +1,4 @@
-"""Put results on one page that needs nothing but a browser.
+"""Show results on one page that needs only a browser.
 
 Results of the same task are compared, seeds and folds of a method pooled. Of more than two of the task ``forward``, only
 the best method's and that of the paper are told in full; outputs of ``tacpipe compress`` may be given besides, which tell
@@ -30,7 +30,10 @@ class Params:
 
 @stage(version=4)
 def report(params: Params, results: Datasets) -> Result:
-    """Put results on one page: headline, figures, tables, and where every number comes from."""
+    """Show results on one page that needs only a browser.
+
+    It has headline, figures, tables, and where every number comes from.
+    """
     from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 

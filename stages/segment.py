@@ -65,13 +65,14 @@ class Params:
 
 @stage(version=2)
 def contacts(params: Params, recording: Recording) -> RecordingOutput:
-    """Mark the rows in which either finger touches something, numbered from 0 in ``contact``; -1 in all others.
+    """Mark the rows in which a finger touches something.
 
-    Each tactile channel's level without load is written into its field metadata ``rest``. Contact is told from the
-    median of the first seconds, whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and
-    ``off_count``. One in any other unit has those of ``on_level`` and ``off_level`` or of its noise at rest (see
-    `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off`` and
-    ``<stream>_contact_unit`` say which these were. A recording without a contact has a note.
+    The column ``contact`` numbers the contacts from 0, and is -1 in all other rows. Each tactile channel's level
+    without load is written into its field metadata ``rest``. Contact is found from the median of the first seconds,
+    whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and ``off_count``. One in any other unit
+    has those of ``on_level`` and ``off_level`` or of its noise at rest (see
+    `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off``
+    and ``<stream>_contact_unit`` record which these were. A recording without a contact has a note.
     """
     import numpy as np
     import pyarrow as pa
@@ -148,12 +149,12 @@ class SlipParams:
 
 @stage(version=1)
 def slips(params: SlipParams, recording: Recording) -> pa.Table:
-    """Mark where the held object slips, and from where on it is dropped, by its distance from the wrist.
+    """Mark where the held object slips or is dropped.
 
-    Adds the labels ``slip``, told with all of the recording at hand, ``slip_online``, told from the rows so far, and
-    ``dropped``. Run it behind ``segment contacts``: each contact is a grasp, and a drop lasts until the next one. Without
-    the column ``contact`` all of the recording is one. Outside of contacts, after a drop and where there is no reading
-    nothing slips.
+    Both follow from its distance to the wrist. Adds the labels ``slip``, from the whole recording, ``slip_online``,
+    from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each contact is a grasp, and a drop lasts
+    until the next one. Without the column ``contact`` all of the recording is one. Outside of contacts, after a drop
+    and where there is no reading nothing slips.
     """
     import numpy as np
     import pyarrow as pa
@@ -238,12 +239,13 @@ class SlideParams:
 
 @stage(version=1)
 def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
-    """Cut a recording down to its slide, all of the same number of frames, with single wrong tactile readings mended.
+    """Cut each recording down to its slide.
 
-    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure goes
-    on; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``,
-    its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
-    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
+    All slides have the same number of frames; single wrong tactile readings are repaired. The slide starts where the
+    static pressure first reaches its trigger, and lasts to the end, whatever the pressure does after; where the arm was
+    recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``, its speed, force
+    and phase over the whole recording. A slide that differs from the protocol is marked ``outside_protocol`` and kept.
+    Recordings of sensors without static pressure stay whole.
     """
     from tacpipe.channels import arm
     from tacpipe.channels.finger import finger, mended
@@ -274,7 +276,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
         params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
     )
     rows = slice(first, stop)
-    told = found.told(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    told = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
     why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, told)
     attributes: dict[str, Attribute] = {**told, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
     attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})

@@ -107,10 +107,10 @@ Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 
 @stage(version=1)
 def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
-    """Return one table, ``split``, with a row a recording and fold: recording, fold, role.
+    """Give each recording its role: train, val or test.
 
-    Recordings that have a role in the older split ``extend`` keep it. A note names folds without validation recordings,
-    unless ``val`` is 0.
+    Returns one table, ``split``, with a row a recording and fold: recording, fold, role. Recordings that have a role in
+    the older split ``extend`` keep it. A note names folds without validation recordings, unless ``val`` is 0.
     """
     import pyarrow as pa
 

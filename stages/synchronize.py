@@ -1,4 +1,4 @@
-"""Bring the streams of each recording onto one clock: one table, one row a grid point."""
+"""Bring the streams of each recording onto one clock."""
 
 from __future__ import annotations
 
@@ -85,7 +85,10 @@ class _Stream:
 
 @stage(version=2, reads=("master",))
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
-    """Return one table on one clock, over the time that all streams cover, with masks of holds and gaps."""
+    """Bring the streams of each recording onto one clock.
+
+    Returns one table over the time that all streams cover, one row a grid point, with masks of repeats and gaps.
+    """
     import pyarrow as pa
 
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz

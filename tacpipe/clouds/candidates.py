@@ -84,8 +84,8 @@ def candidates(
     bounds = np.linspace(-shift, shift, count + 1) * frame.length_m
     draws = np.random.default_rng(seed).uniform(size=(count, TRIES))
     found = []
-    for low, high, shares in zip(bounds[:-1], bounds[1:], draws, strict=True):
-        tried = [cuts.best(low + share * (high - low)) for share in (shares if shift else shares[:1])]
+    for low, high, fractions in zip(bounds[:-1], bounds[1:], draws, strict=True):
+        tried = [cuts.best(low + fraction * (high - low)) for fraction in (fractions if shift else fractions[:1])]
         held = [candidate for candidate in tried if candidate is not None]
         if held:
             found.append(max(held, key=lambda candidate: candidate.score))
@@ -191,7 +191,7 @@ class _Cuts:
         rights = cut[(position >= high - EDGE * width) & (position <= high)]
         if not len(lefts) or not len(rights):
             return None
-        scores, cosines = self._judged(lefts, rights, shift_m)
+        scores, cosines = self._scored(lefts, rights, shift_m)
         left, right = np.unravel_index(int(np.argmax(scores)), scores.shape)
         if not np.isfinite(scores[left, right]):
             return None
@@ -200,7 +200,7 @@ class _Cuts:
         score = float(scores[left, right] - OFF_CENTRE * abs(shift_m) / self._frame.length_m)
         return Candidate(grasp, score, off_deg, float(shift_m))
 
-    def _judged(self, lefts: NDArray[np.intp], rights: NDArray[np.intp], shift_m: float) -> tuple[Floats, Floats]:
+    def _scored(self, lefts: NDArray[np.intp], rights: NDArray[np.intp], shift_m: float) -> tuple[Floats, Floats]:
         """Return the scores (left, right) of all pairs, and the cosine of the closing axis to the worse normal."""
         apart = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
         opening = np.linalg.norm(apart, axis=2)

@@ -159,8 +159,12 @@ def _outwards(normal: Floats, place_m: float) -> Floats:
 
 def _colours(colours: Floats) -> dict[str, float]:
     """Return mean, spread and quantiles of the colours, and of their shares, which shade leaves as they are."""
-    shares = colours / (colours.sum(axis=1, keepdims=True) + 1)
+    proportions = colours / (colours.sum(axis=1, keepdims=True) + 1)
     found = _named("colour_mean", colours.mean(axis=0), "rgb") | _named("colour_spread", colours.std(axis=0), "rgb")
     for share, values in zip((10, 50, 90), np.quantile(colours, (0.1, 0.5, 0.9), axis=0), strict=True):
         found |= _named(f"colour_quantile{share}", values, "rgb")
-    return found | _named("share_mean", shares.mean(axis=0), "rgb") | _named("share_spread", shares.std(axis=0), "rgb")
+    return (
+        found
+        | _named("share_mean", proportions.mean(axis=0), "rgb")
+        | _named("share_spread", proportions.std(axis=0), "rgb")
+    )

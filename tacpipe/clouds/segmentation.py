@@ -87,22 +87,22 @@ def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -
     """
     left = np.arange(len(points_m))
     found: list[tuple[float, Floats]] = []
-    shares: list[float] = []
-    while len(shares) < PLANES and len(left) >= max(3.0, limits.plane_share * len(points_m)):
+    fractions: list[float] = []
+    while len(fractions) < PLANES and len(left) >= max(3.0, limits.plane_share * len(points_m)):
         plane = _largest_plane(points_m[left], limits, seed)
         within = np.abs(heights_m(points_m[left], plane)) <= limits.plane_m
-        shares.append(np.count_nonzero(within) / len(points_m))
+        fractions.append(np.count_nonzero(within) / len(points_m))
         height_m = float(heights_m(grasp.middle_m[None], plane)[0])
-        if shares[-1] >= limits.plane_share and height_m > limits.plane_m:
+        if fractions[-1] >= limits.plane_share and height_m > limits.plane_m:
             found.append((height_m, plane))
         left = left[~within]
     if found:
         return min(found, key=lambda item: item[0])[1]
-    told = ", ".join(f"{100 * share:.0f}" for share in shares) or "0"
+    percentages = ", ".join(f"{100 * fraction:.0f}" for fraction in fractions) or "0"
     raise TacpipeError(
-        f"No table is found: the largest planes hold {told} % of {len(points_m)} points, and one with the grasp in front of "
-        f"it must hold {100 * limits.plane_share:g} %. Give the view with its table, or the object's points as the stream "
-        f"`cloud`."
+        f"No table is found: the largest planes hold {percentages} % of {len(points_m)} points, and one with the grasp in "
+        f"front of it must hold {100 * limits.plane_share:g} %. Give the view with its table, or the object's points as "
+        f"the stream `cloud`."
     )
 
 

@@ -76,7 +76,7 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
         ours, theirs = context.Pipe()
         alive, life = context.Pipe(duplex=False)
         workers[ours] = life
-        with termination.held(), _death_told():  # a worker that heard half of what it is to do would say so
+        with termination.deferred(), _death_told():  # a worker that heard half of what it is to do would say so
             context.Process(target=_work, args=(theirs, alive)).start()
         theirs.close()
         alive.close()
@@ -116,7 +116,7 @@ def _work(tasks: Connection, alive: Connection) -> None:
 
 def _computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
     try:
-        with memory.told():
+        with memory.raising_shortage():
             return [compute(task) for task in chunk]
     except Exception as error:  # a mistake in a stage, which is raised again where the stage was asked for
         import pickle

@@ -172,8 +172,8 @@ def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds
             return f"{path}, row {line} has {len(cells)} fields instead of {len(names)}; {cause}. Copy the file again."
         for name, cell in zip(names, cells, strict=True):
             if not _NUMBER.fullmatch(cell):
-                told = f"column {plain(name)} holds {excerpt(cell)}"
-                return f"{path}, row {line}, {told}, which is no number. Put the cell right."
+                described = f"column {plain(name)} holds {excerpt(cell)}"
+                return f"{path}, row {line}, {described}, which is no number. Put the cell right."
             if name == seconds and not _STAMP.fullmatch(cell):
                 return (
                     f"{path}, row {line}, column {name} holds {plain(cell)}; it must be seconds since 1970 with "

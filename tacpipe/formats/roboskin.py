@@ -84,7 +84,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def roboskin(params: Params, files: Files) -> RecordingOutput:
-    """Return the stream roboskin of a slide: 60 columns, triangle by triangle, one row a frame; stamps are made."""
+    """Read published slides of an iCub RoboSkin.
+
+    Returns the stream roboskin: 60 columns, triangle by triangle, one row a frame; stamps follow from the mean rate.
+    """
     import numpy as np
 
     from tacpipe.channels import schema
@@ -93,7 +96,7 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.signals.scrambling import scramble
 
     (block, place), (labels, _) = sorted((path, _place(name)) for name, path in files.items())
-    slide = _felt(block, place)  # (triangle, taxel, time)
+    slide = _values(block, place)  # (triangle, taxel, time)
     if params.layout == "authors":
         slide = scramble(slide)
     frames = slide.shape[-1]
@@ -147,9 +150,9 @@ def _slides(path: Path) -> int:
             f"{path} has the shape {excerpt(shape)}; it must be (slide, triangle, taxel, time). Give the set's own files."
         )
     if kind is None:
-        told = excerpt(head["descr"])
+        described = excerpt(head["descr"])
         raise TacpipeError(
-            f"{path} cannot be read as an array of numbers: it holds {told}. Copy it again from its source."
+            f"{path} cannot be read as an array of numbers: it holds {described}. Copy it again from its source."
         )
     if math.prod(shape) * int(kind[1]) > held:
         raise TacpipeError(
@@ -172,7 +175,7 @@ def _part(block: Path) -> dict[str, Attribute]:
     return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
 
 
-def _felt(path: Path, place: int) -> NDArray[np.float32]:
+def _values(path: Path, place: int) -> NDArray[np.float32]:
     """Return a slide as it was felt (triangle, taxel, time), float32; its values are checked.
 
     Where a slide alone does not tell which of its axes is time, because next to nothing was touched, its block does.
@@ -198,12 +201,12 @@ def _felt(path: Path, place: int) -> NDArray[np.float32]:
             f"{path}, slide {place} holds values from {slide.min():g} to {slide.max():g}; readings lie from 0 to "
             f"{LARGEST:g}. It looks like 8-bit numbers that wrapped. Copy the file again, or leave the slide out."
         )
-    for told_by in (slide, block):
-        if is_time(told_by, -1, ALONG_TIME):
+    for evidence in (slide, block):
+        if is_time(evidence, -1, ALONG_TIME):
             return slide
-        if is_time(unscramble(told_by), -1, ALONG_TIME):
-            felt: NDArray[np.float32] = unscramble(slide)
-            return felt
+        if is_time(unscramble(evidence), -1, ALONG_TIME):
+            values: NDArray[np.float32] = unscramble(slide)
+            return values
     raise TacpipeError(
         f"{path}, slide {place}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
         f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {ALONG_TIME} or "
@@ -258,5 +261,5 @@ def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
 
 
 def _unreadable(path: Path, error: BaseException) -> TacpipeError:
-    told = plain(" ".join(str(error).split()), 200)
-    return TacpipeError(f"{path} cannot be read as an array of numbers: {told}. Copy it again from its source.")
+    described = plain(" ".join(str(error).split()), 200)
+    return TacpipeError(f"{path} cannot be read as an array of numbers: {described}. Copy it again from its source.")

@@ -76,7 +76,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def vision2tactile(params: Params, files: Files) -> RecordingOutput:
-    """Return the streams cloud, grasp and reading of a grasp; one with the reading of an earlier one is marked."""
+    """Read published grasps with a point cloud and BioTac SPs.
+
+    Returns the streams cloud, grasp and reading; a grasp with the reading of an earlier one is marked.
+    """
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema

@@ -165,7 +165,7 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
     )
 
 
-def told(error: OSError) -> str:
+def describe(error: OSError) -> str:
     """Return in words what the file system said of anything else."""
     return (
         f"{error.filename or 'A file'} cannot be used: {error.strerror or error}. Nothing was half written; mend that, then "

@@ -36,8 +36,8 @@ def available() -> int:
     """Return how many bytes this process can still take: by the computer, its container and its own limit."""
     left = [1 << 62]
     with contextlib.suppress(OSError, ValueError, IndexError):
-        told = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
-        left.append(int(told["MemAvailable"].split()[0]) << 10)
+        fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
+        left.append(int(fields["MemAvailable"].split()[0]) << 10)
     with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
         left.append(int((GROUP / "memory.max").read_text()) - int((GROUP / "memory.current").read_text()))
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -123,7 +123,7 @@ def require_library(name: str) -> None:
 
 
 @contextlib.contextmanager
-def told() -> Iterator[None]:
+def raising_shortage() -> Iterator[None]:
     """Raise what says that memory ran out as `ShortageError`."""
     try:
         yield
@@ -140,15 +140,16 @@ def require(needed: int, what: str, *, error: type[TacpipeError] = TacpipeError)
     left = int(available() * KEPT)
     if needed > left:
         raise error(
-            f"{what} claims to be {_told(needed)} of data, and {_told(left)} of memory are left. If it is what you expect, "
-            f"read it on a computer with more memory or in parts; if it came from a stranger, do not trust it."
+            f"{what} declares {readable_size(needed)} of data, and {readable_size(left)} of memory are left. If that "
+            "is what you expect, read it on a computer with more memory or in parts; if its source is untrusted, do "
+            "not use it."
         )
 
 
-def _told(count: int) -> str:
+def readable_size(count: int) -> str:
     """Return a number of bytes in a unit that is read at a glance.
 
-    >>> _told(2_500_000_000), _told(10)
+    >>> readable_size(2_500_000_000), readable_size(10)
     ('2.5 GB', '0.00001 MB')
     """
     return (

@@ -38,8 +38,8 @@ class Candidate:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        told = ", ".join(f"{name} = {value}" for name, value in self.options.items())
-        return f"{self.kind} ({told})" if told else self.kind
+        described = ", ".join(f"{name} = {value}" for name, value in self.options.items())
+        return f"{self.kind} ({described})" if described else self.kind
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class Finding:
         rate = f" at {self.rate_hz:.4g} Hz" if self.rate_hz else ""
         alone = "by the size of the packets alone"
         chance = alone if self.chance > POSSIBLE else f"{100 * self.chance:.1f} % by chance"
-        share = f"{100 * self.explained:.1f} % of {self.bytes:,} bytes"
-        return f"{self.candidate}: {self.frames:,} frames{rate}, {share} ({chance})"
+        part = f"{100 * self.explained:.1f} % of {self.bytes:,} bytes"
+        return f"{self.candidate}: {self.frames:,} frames{rate}, {part} ({chance})"
 
 
 def candidates(data: Chunks, scheme: str) -> list[Candidate]:
@@ -100,11 +100,11 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[Candidate] | None = N
     shuffled = _shuffled(data)
     found = []
     for candidate in candidates(data, scheme) if sensors is None else sensors:
-        frames, share, rate_hz = _tried(candidate.sensor, data)
-        if frames < FEWEST or share < POSSIBLE:
+        frames, part, rate_hz = _tried(candidate.sensor, data)
+        if frames < FEWEST or part < POSSIBLE:
             continue
         _, chance, _ = _tried(candidate.sensor, shuffled)
-        finding = Finding(candidate, frames, rate_hz, len(data.data), share, chance)
+        finding = Finding(candidate, frames, rate_hz, len(data.data), part, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
             found.append(finding)
     return sorted(found, key=_rank)

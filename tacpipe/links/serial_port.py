@@ -89,7 +89,9 @@ def _cause(error: OSError) -> OSError:
 
 
 def _busy(place: str, held: list[str], name: str) -> DeviceError:
-    return DeviceError(f"{name}: {place} is held by {holders.told(held)}; end it, because two readers share no bytes.")
+    return DeviceError(
+        f"{name}: {place} is held by {holders.describe(held)}; end it, because two readers share no bytes."
+    )
 
 
 def _right(place: str) -> str:

@@ -77,7 +77,7 @@ def bound(host: str, port: int, name: str) -> socket.socket:
     except OSError as error:
         made.close()
         if error.errno == errno.EADDRINUSE:
-            held = holders.told(holders.of_port("udp", port))
+            held = holders.describe(holders.of_port("udp", port))
             raise DeviceError(f"{name}: UDP port {port} is held by {held}; end it, or take another port.") from error
         if error.errno == errno.EADDRNOTAVAIL:
             raise DeviceError(
@@ -161,7 +161,7 @@ class UdpLink(Descriptor):
         found: Arrived = []
         for _ in range(MOST_QUEUED):
             try:
-                data, told, _, sender = self.socket.recvmsg(MOST, ROOM)
+                data, ancillary, _, sender = self.socket.recvmsg(MOST, ROOM)
             except BlockingIOError:
                 return found
             except OSError as error:
@@ -169,7 +169,7 @@ class UdpLink(Descriptor):
                     return found
                 self._failed = self._refused(error)  # which the kernel tells once, before what waits
                 continue
-            arrival_ns = self._arrival(told)
+            arrival_ns = self._arrival(ancillary)
             if self._counts(sender):
                 self._sender = sender
                 found.append((arrival_ns, data))
@@ -190,10 +190,10 @@ class UdpLink(Descriptor):
             return self.lost("the host is there, but refuses the port", "the port, and that it streams")
         return self.lost(error.strerror or str(error))
 
-    def _arrival(self, told: list[tuple[int, int, bytes]]) -> int:
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> int:
         """Return the arrival that the ancillary messages of a datagram tell, and take note of drops."""
         wall_ns = None
-        for level, kind, data in told:
+        for level, kind, data in ancillary:
             if level == socket.SOL_SOCKET and kind == STAMPS:
                 seconds, nanoseconds = struct.unpack("@ll", data[: struct.calcsize("@ll")])
                 wall_ns = seconds * 1_000_000_000 + nanoseconds

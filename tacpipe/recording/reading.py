@@ -153,9 +153,9 @@ class Reading:
             if counted.reset[row]:
                 events.append(Event(at_ns, RESET, detail=f"began anew at {counted.seq[row]}"))
             for loss in [loss for loss in self._unexplained if loss.t_ns <= at_ns]:
-                share = min(loss.frames, missing)
-                missing -= share
-                events.append(_event(loss, share))
+                count = min(loss.frames, missing)
+                missing -= count
+                events.append(_event(loss, count))
                 self._unexplained.remove(loss)
             if missing:
                 events.append(Event(at_ns, LINK, frames=missing))

@@ -98,8 +98,8 @@ def parse(text: str, where: str = "rig.toml") -> Rig:
     labels = _table(found, "labels", where)
     for name, value in labels.items():
         if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
-            told = f"label {plain(name)} is {excerpt(value)}"
-            raise UsageError(f"{where}: {told}; it must be text, a finite number, true or false.")
+            described = f"label {plain(name)} is {excerpt(value)}"
+            raise UsageError(f"{where}: {described}; it must be text, a finite number, true or false.")
     return Rig(streams, master, labels, _table(found, "emulate", where), text)
 
 

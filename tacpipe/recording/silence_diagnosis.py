@@ -25,8 +25,8 @@ def sentence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, reply: bo
     if not joined.data:
         rate = f", set to {stream.sensor.baud} baud as we are" if serial else ""
         end = f"; {probe} tries all rates" if serial else ""
-        told = f"{about}, but nothing came. Check power and cable, and that it is {stream.kind}{rate}{end}."
-        return f"{told} {stream.sensor.exclusive}".strip()
+        described = f"{about}, but nothing came. Check power and cable, and that it is {stream.kind}{rate}{end}."
+        return f"{described} {stream.sensor.exclusive}".strip()
     about += f", but {len(joined.data):,} bytes came that hold none."
     known = _known(stream, joined, reply=reply)
     if known:

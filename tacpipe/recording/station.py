@@ -128,9 +128,9 @@ class Station:
         link, self._link = self._link, None
         if link is not None:
             with contextlib.suppress(Exception):  # whatever a device says to its end, the others are to be closed too
-                said = self.stream.sensor.closing()
-                if said:
-                    link.write(said)
+                answer = self.stream.sensor.closing()
+                if answer:
+                    link.write(answer)
             with contextlib.suppress(Exception):
                 link.close()
 
@@ -186,9 +186,9 @@ class Station:
             self._obey(link, pace)
             if answers:
                 for _, chunk in came:
-                    said = sensor.answer(chunk)
-                    if said:
-                        link.write(said)
+                    answer = sensor.answer(chunk)
+                    if answer:
+                        link.write(answer)
                         pace.resume(clock.now_ns())
             if link.overruns != self._overruns:
                 self._overran(link.overruns)
@@ -216,8 +216,10 @@ class Station:
         if came or address.scheme not in TALKING or sensor.listens or not sensor.awaited:
             return now_s
         if now_s - before_s > MUTE_S:
-            told = f"Stream {self.stream.name} ({address}) is lost: nothing came for {MUTE_S:g} s. {sensor.exclusive}"
-            raise LinkLostError(told.strip())
+            described = (
+                f"Stream {self.stream.name} ({address}) is lost: nothing came for {MUTE_S:g} s. {sensor.exclusive}"
+            )
+            raise LinkLostError(described.strip())
         return before_s
 
     def _ask(self, link: Link, asked: bytes, pace: Pace) -> None:
@@ -240,8 +242,8 @@ class Station:
 
     def _note_foreign(self, link: Link | None) -> None:
         if link is not None and link.foreign > self._foreign:
-            told = f"{link.foreign - self._foreign} packets of other senders were left out"
-            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, told))
+            described = f"{link.foreign - self._foreign} packets of other senders were left out"
+            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, described))
             self._foreign, self._foreign_s = link.foreign, time.monotonic()
 
     def _overran(self, overruns: int) -> None:

@@ -124,7 +124,7 @@ class Tap:
             )
         self._since_ns = [clock.now_ns() for _ in self._watches]
 
-    def said(self, word: str) -> bool:
+    def received(self, word: str) -> bool:
         """Return whether ``{"event": word}`` came since this was made; what came up to it, or at all, is dealt with."""
         for number, watch in enumerate(self._watches):
             for chunk in watch.heard:

@@ -13,9 +13,9 @@ from tacpipe.report import markup
 def box(sentences: Sequence[tuple[str, str]]) -> str:
     """Return sentences with their verdicts (`tacpipe.metrics.headline.verdict`), green only where it is ``better``."""
     return "\n".join(
-        f'<p class="{f"headline {verdict}".strip()}">{escape(_unbroken(told))}</p>'
-        for told, verdict in sentences
-        if told
+        f'<p class="{f"headline {verdict}".strip()}">{escape(_unbroken(described))}</p>'
+        for described, verdict in sentences
+        if described
     )
 
 
@@ -31,5 +31,5 @@ def table(headlines: Sequence[Headline]) -> str:
     )
 
 
-def _unbroken(told: str) -> str:
-    return told.replace(" %", "\N{NO-BREAK SPACE}%")
+def _unbroken(described: str) -> str:
+    return described.replace(" %", "\N{NO-BREAK SPACE}%")

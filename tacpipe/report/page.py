@@ -60,8 +60,8 @@ def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
 
 def _title(tasks: Iterable[str], packages: dict[str, Any]) -> str:
     """Return what the tasks on a page are about."""
-    told = [str(packages[name].TITLE) if name in packages else name.replace("_", " ") for name in tasks]
-    title = markup.listed([one for one in told if one]) or "results"
+    described = [str(packages[name].TITLE) if name in packages else name.replace("_", " ") for name in tasks]
+    title = markup.listed([one for one in described if one]) or "results"
     return f"{title[0].upper()}{title[1:]}"
 
 

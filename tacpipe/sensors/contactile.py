@@ -121,8 +121,8 @@ class Contactile(Sensor):
                 )
             if self.slip and not layout.slips:
                 continue
-            told = frames[rows]
-            parts.append((rows, self._values(told, layout), _gathered(told, layout.places(pts.HUB), 12)[:, 0]))
+            selected = frames[rows]
+            parts.append((rows, self._values(selected, layout), _gathered(selected, layout.places(pts.HUB), 12)[:, 0]))
         if not parts:
             return self._nothing()
         rows = np.concatenate([part[0] for part in parts])

@@ -176,8 +176,8 @@ class Generic(Sensor):
 
     def _sizes(self, heads: Bytes) -> NDArray[np.int64]:
         assert self.length is not None
-        told = self._places[self.length.number].take(heads)[:, 0]
-        sizes: NDArray[np.int64] = np.minimum(told.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
+        declared = self._places[self.length.number].take(heads)[:, 0]
+        sizes: NDArray[np.int64] = np.minimum(declared.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
         return sizes
 
     def _is_right(self, frames: Bytes) -> NDArray[np.bool_]:

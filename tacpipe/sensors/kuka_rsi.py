@@ -166,10 +166,10 @@ def _table(outputs: tuple[str, ...], packets: tuple[bytes, ...]) -> Floats | Non
 @functools.lru_cache(maxsize=BATCHES_AT_HAND)
 def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Pattern, NDArray[np.intp]] | None:
     """Return the pattern of a text in which each number stands for itself, and which ones are IPOC and the outputs."""
-    pattern, told = number_texts.pattern(text), _numbers(outputs, text)
-    if pattern is None or told is None:
+    pattern, content = number_texts.pattern(text), _numbers(outputs, text)
+    if pattern is None or content is None:
         return None
-    columns = np.array(told) - number_texts.FIRST
+    columns = np.array(content) - number_texts.FIRST
     known = (columns >= 0) & (columns < len(pattern.before))
     return (pattern, columns.astype(np.intp)) if known.all() else None
 
@@ -185,8 +185,8 @@ def _texts(root: ElementTree.Element, name: str) -> list[str]:
     if element is None:
         return []
     if name not in ATTRIBUTES and not attribute:
-        told = (element.text or "").strip()
-        return [TRUTH.get(told.lower(), told)]
+        content = (element.text or "").strip()
+        return [TRUTH.get(content.lower(), content)]
     texts = [element.get(part) for part in ATTRIBUTES.get(name, (attribute,))]
     return [TRUTH.get(text.lower(), text) for text in texts if text is not None]
 

@@ -161,8 +161,8 @@ class Paxini(Sensor):
         there = _modules(_data(active), _data(counts))
         if there != self.points:
             raise DeviceError(
-                f"The board ({_text(_data(version))}) has {_told(there)}; the rig file says "
-                f"{_told(self.points)}. Correct modules and variants there: {_suggestion(there)}."
+                f"The board ({_text(_data(version))}) has {_module_list(there)}; the rig file says "
+                f"{_module_list(self.points)}. Correct modules and variants there: {_suggestion(there)}."
             )
         taken = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
         if _data(taken)[:1] not in (b"", b"\x00"):
@@ -234,8 +234,8 @@ def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, i
             head = REPLY + bytes([code]) + two(register)
             start = came.find(head)
             while start >= 0:
-                told = number(came[start + 6 : start + 8]) if len(came) >= start + REPLY_HEADER else 0
-                for length in (told, 0) if function != READ_FUNCTION else (told,):
+                declared = number(came[start + 6 : start + 8]) if len(came) >= start + REPLY_HEADER else 0
+                for length in (declared, 0) if function != READ_FUNCTION else (declared,):
                     stop = start + REPLY_HEADER + length + 1
                     if stop <= len(came) and sums(came[start:stop]):
                         if code != function:
@@ -280,7 +280,7 @@ def _modules(active: bytes, counts: bytes) -> dict[str, int]:
     return {slot: number(counts[2 * n : 2 * n + 2]) for n, slot in enumerate(SLOTS) if bits >> n & 1}
 
 
-def _told(modules: Mapping[str, int]) -> str:
+def _module_list(modules: Mapping[str, int]) -> str:
     return ", ".join(f"{slot} of {count} points" for slot, count in modules.items()) or "no module"
 
 

@@ -49,7 +49,7 @@ class Layout:
 
     entries: dict[int, tuple[tuple[int, ...], ...]]  # block to the places of values: by sensor, and by pillar in it
     fixed: Places  # (byte,), places of all bytes that are no values
-    told: Bytes  # (byte,), what stands there
+    expected: Bytes  # (byte,), what stands there
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -67,7 +67,7 @@ class Layout:
 
     def fits(self, frames: Bytes) -> NDArray[np.bool_]:
         """Return which of ``frames`` (frame, byte) have this layout."""
-        same: NDArray[np.bool_] = (frames[:, self.fixed] == self.told).all(axis=1)
+        same: NDArray[np.bool_] = (frames[:, self.fixed] == self.expected).all(axis=1)
         return same
 
 

@@ -205,14 +205,14 @@ class _Fingertips(Device):
             size = HEADER + self.heard[start + 3]
             if len(self.heard) < start + size:
                 break
-            told = bytes(self.heard[start : start + size])
+            message = bytes(self.heard[start : start + size])
             del self.heard[: start + size]
-            if told[2] in (SYNCHRONOUS, ASYNCHRONOUS) and size == HEADER + 1:
-                self.streaming = told[4] > 0
-                self.rate_hz = 1000 / told[4] if told[4] else None
-            elif told[2] == READ:
+            if message[2] in (SYNCHRONOUS, ASYNCHRONOUS) and size == HEADER + 1:
+                self.streaming = message[4] > 0
+                self.rate_hz = 1000 / message[4] if message[4] else None
+            elif message[2] == READ:
                 self.asked += 1
-            elif told[2] == VERSION:
+            elif message[2] == VERSION:
                 replies.append(command(VERSION, self.version))
         return replies
 

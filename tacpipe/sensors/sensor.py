@@ -55,8 +55,8 @@ class Ask:
 
     def found(self, came: bytes) -> tuple[int, int] | None:
         """Return where the reply is in what came since, (start, stop), None while it is not whole or none is awaited."""
-        told = self.until(came) if self.until is not None and came else 0
-        return told if isinstance(told, tuple) else (0, told) if told else None
+        end = self.until(came) if self.until is not None and came else 0
+        return end if isinstance(end, tuple) else (0, end) if end else None
 
 
 Dialogue = Generator[Ask, bytes, None]  # yields what is asked, is sent the reply

@@ -87,10 +87,10 @@ class SpaceMouse(Sensor):
         axes_bytes = np.ascontiguousarray(axes, "<i2").view(np.uint8)
         state = np.hstack([axes_bytes, np.ascontiguousarray(buttons, "<u4").view(np.uint8)])  # (sample, byte)
         differs = np.diff(state.astype(np.int16), axis=0, prepend=0) != 0
-        told = np.where(differs[:, 6:12].any(axis=1) & self.split, ROTATION, TRANSLATION)
-        told[differs[:, 12:].any(axis=1)] = BUTTONS
+        reported = np.where(differs[:, 6:12].any(axis=1) & self.split, ROTATION, TRANSLATION)
+        reported[differs[:, 12:].any(axis=1)] = BUTTONS
         reports = []
-        for number, row in zip(told.tolist(), state, strict=True):
+        for number, row in zip(reported.tolist(), state, strict=True):
             part = row[:12] if number == TRANSLATION and not self.split else row[PARTS[number]]
             reports.append(bytes([number]) + part.tobytes())
         return reports
@@ -141,8 +141,8 @@ def merged(reports: Sequence[bytes], state: Bytes) -> Bytes:
     return frames[1:]
 
 
-def _carry(frames: Bytes, place: slice, told: NDArray[np.bool_], said: Bytes) -> None:
+def _carry(frames: Bytes, place: slice, reported: NDArray[np.bool_], sent: Bytes) -> None:
     """Write a part of the state into ``frames``, whose first row is that before: where it was told, and on from there."""
-    frames[1:, place][told] = said[told]
-    last = np.maximum.accumulate(np.where(told, np.arange(1, len(told) + 1), 0))
+    frames[1:, place][reported] = sent[reported]
+    last = np.maximum.accumulate(np.where(reported, np.arange(1, len(reported) + 1), 0))
     frames[1:, place] = frames[last, place]

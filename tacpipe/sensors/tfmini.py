@@ -141,41 +141,41 @@ class _TfMini(Device):
             size = self.heard[start + 1]
             if len(self.heard) < start + size:
                 break
-            told = bytes(self.heard[start : start + size])
+            message = bytes(self.heard[start : start + size])
             del self.heard[: start + max(size, 1)]
-            if size >= 4 and command(told[2], told[3:-1]) == told:
-                replies += self._done(told[2], told[3:-1])
+            if size >= 4 and command(message[2], message[3:-1]) == message:
+                replies += self._done(message[2], message[3:-1])
         return replies
 
-    def _done(self, number: int, said: bytes) -> list[bytes]:
+    def _done(self, number: int, payload: bytes) -> list[bytes]:
         if number == VERSION:
             return [command(VERSION, b"\x01\x02\x03")]
         if number == SAVE:
             return [command(SAVE, b"\x00")]
         if number == RATE:
-            self.rate_hz = float(int.from_bytes(said, "little")) or None
+            self.rate_hz = float(int.from_bytes(payload, "little")) or None
         if number == ENABLE:
-            self.streaming = said == b"\x01"
-        return [command(number, said)] if number in (RATE, UNIT, ENABLE) else []
+            self.streaming = payload == b"\x01"
+        return [command(number, payload)] if number in (RATE, UNIT, ENABLE) else []
 
 
-def command(number: int, said: bytes = b"") -> bytes:
+def command(number: int, payload: bytes = b"") -> bytes:
     """Return a command to the sensor, or its reply.
 
     >>> command(0x03, (100).to_bytes(2, "little")).hex(" ")
     '5a 06 03 64 00 c7'
     """
-    body = bytes([0x5A, len(said) + 4, number]) + said
+    body = bytes([0x5A, len(payload) + 4, number]) + payload
     return body + bytes([sum(body) & 0xFF])
 
 
-def _asked(number: int, said: bytes = b"") -> Ask:
-    return Ask(command(number, said), until=_reply(number, said), what=f"the reply to command {number:#04x}")
+def _asked(number: int, payload: bytes = b"") -> Ask:
+    return Ask(command(number, payload), until=_reply(number, payload), what=f"the reply to command {number:#04x}")
 
 
-def _reply(number: int, said: bytes) -> Callable[[bytes], int | tuple[int, int]]:
+def _reply(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, int]]:
     """Return what finds the reply among frames, which may hold its first bytes by chance."""
-    size = 5 if number == SAVE else len(said) + 4
+    size = 5 if number == SAVE else len(payload) + 4
     head = bytes([0x5A, size, number])
 
     def until(data: bytes) -> int | tuple[int, int]:

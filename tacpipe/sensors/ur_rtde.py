@@ -124,8 +124,8 @@ class UrRtde(Sensor):
             )
         names = (STAMP, *self.outputs)
         reply = yield _ask(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(names).encode())
-        said = reply[HEADER.size :]
-        recipe, kinds = said[:1], said[1:].decode("latin-1").split(",")
+        answer = reply[HEADER.size :]
+        recipe, kinds = answer[:1], answer[1:].decode("latin-1").split(",")
         for name, kind in zip(names, kinds, strict=False):
             if kind != type_of(name):
                 raise DeviceError(
@@ -157,24 +157,24 @@ class _Controller(Device):
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         replies = []
-        for kind, told in _taken(self.heard):
+        for kind, package in _taken(self.heard):
             if kind == VERSION:
-                replies.append(packed(kind, bytes([told == PROTOCOL.to_bytes(2, "big")])))
+                replies.append(packed(kind, bytes([package == PROTOCOL.to_bytes(2, "big")])))
             elif kind == CONTROLLER:
                 replies.append(packed(kind, struct.pack(">4I", *EMULATED)))
             elif kind == OUTPUTS:
-                replies.append(self._recipe(told))
+                replies.append(self._recipe(package))
             elif kind == INPUTS:
-                kinds = ",".join(type_of(name) or "NOT_FOUND" for name in told.decode("latin-1").split(","))
+                kinds = ",".join(type_of(name) or "NOT_FOUND" for name in package.decode("latin-1").split(","))
                 replies.append(packed(kind, b"\1" + kinds.encode()))
             elif kind in (START, PAUSE):
                 self.streaming = kind == START
                 replies.append(packed(kind, b"\1"))
         return replies
 
-    def _recipe(self, told: bytes) -> bytes:
-        names = tuple(told[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
-        self.rate_hz = float(struct.unpack(">d", told[:8])[0])
+    def _recipe(self, package: bytes) -> bytes:
+        names = tuple(package[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
+        self.rate_hz = float(struct.unpack(">d", package[:8])[0])
         kinds = ",".join(str(type_of(name)) if name in self.known else "NOT_FOUND" for name in names)
         return packed(OUTPUTS, bytes([names == self.known]) + kinds.encode())
 

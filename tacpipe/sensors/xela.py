@@ -117,9 +117,9 @@ class Xela(Sensor):
 
     def _are_right(self, packets: Sequence[bytes]) -> bool:
         texts = _parsed(tuple(packets))
-        return texts is not None and all(map(self._says, texts))
+        return texts is not None and all(map(self._is_servers, texts))
 
-    def _says(self, text: Any) -> bool:
+    def _is_servers(self, text: Any) -> bool:
         """Return whether a text is the server's: with what this sensor's part must have, or without this sensor."""
         if not isinstance(text, dict) or "message" not in text:
             return False

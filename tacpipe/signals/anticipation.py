@@ -37,8 +37,8 @@ Flags = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
 ON_SD, OFF_SD = 3.0, 1.5  # of the differences, between which a change begins and ends
-ONSET_SHARE = 0.05  # of a change, up to which it has not begun
-EARLY_SHARE = 0.2  # of the horizon, by which an alarm may come too early and still not be false
+ONSET_FRACTION = 0.05  # of a change, up to which it has not begun
+EARLY_FRACTION = 0.2  # of the horizon, by which an alarm may come too early and still not be false
 FALSE_ALARMS_PER_MINUTE = 1.0  # of each feature, where nothing happens
 
 
@@ -185,7 +185,7 @@ def _changes_of(truth: Floats, moved: Floats, spaced: Rows, horizon: int, sd: fl
     apart = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
     starts, stops = starts[np.append(True, apart)], stops[np.append(apart, True)]
     before = starts[:, None] + np.arange(-horizon, 0)  # (change, row)
-    begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_SHARE * size[starts][:, None]
+    begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_FRACTION * size[starts][:, None]
     lasts = np.argmin(begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
     return np.stack([starts - lasts, stops], axis=1)
 
@@ -195,7 +195,7 @@ def _free(deviation: Floats, those: Rows, stretches: Rows, horizon: int) -> Flag
     free: Flags = np.isfinite(deviation)
     free[max(len(free) - horizon, 0) :] = False
     free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
-    early = horizon + round(EARLY_SHARE * horizon)
+    early = horizon + round(EARLY_FRACTION * horizon)
     for onset, stop in those:
         near = slice(max(onset - early, 0), stop)
         free[near] &= stretches[near] != stretches[onset]

@@ -87,10 +87,10 @@ def pressure(force_n: Floats, noise_count: Floats) -> Counts:
     return tared(np.rint(PRESSURE_COUNT_N * force_n + noise_count))
 
 
-def vibration(felt_n: Floats, noise_scale: float, rng: np.random.Generator) -> Counts:
+def vibration(contact_n: Floats, noise_scale: float, rng: np.random.Generator) -> Counts:
     """Return PAC (time, reading) of what is felt at `VIBRATION_RATE_HZ` (time * reading,), N."""
-    noise = rng.normal(0, VIBRATION_NOISE_COUNT, len(felt_n))
-    change = np.diff(felt_n, prepend=felt_n[:1]) * VIBRATION_RATE_HZ
+    noise = rng.normal(0, VIBRATION_NOISE_COUNT, len(contact_n))
+    change = np.diff(contact_n, prepend=contact_n[:1]) * VIBRATION_RATE_HZ
     return counted(VIBRATION_COUNT_S_N * change + noise_scale * noise).reshape(-1, schema.VIBRATIONS)
 
 

@@ -64,7 +64,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Felt:
+class Readings:
     """What both sensors feel at contact: truth, and what they show of it without noise (finger, channel), counts."""
 
     touch: pinch.Touch
@@ -126,12 +126,12 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     raise TacpipeError(f"The object {of.name} could not be seen and grasped in {TRIES} poses; take another seed.")
 
 
-def feel(made: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Felt:
+def read_sensors(made: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Readings:
     """Return what both sensors feel of a scene at ``t_ns``; where the camera is does not matter."""
     touch = pinch.touch(scene.situation, scene.hidden)
     off = fingertip_sp.drift(made.phases_rad, rig.drift_count_day, t_ns)
     shown = fingertip_sp.signal(made, touch.force_n, touch.contact_m, touch.skin_m, touch.centre_m)[0]
-    return Felt(touch, off, shown + off)
+    return Readings(touch, off, shown + off)
 
 
 def _scaled(scene: Scene, scale: float) -> Scene:

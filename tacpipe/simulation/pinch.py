@@ -97,8 +97,8 @@ def unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen
 
 def limits_n(opening_m: float) -> Floats:
     """Return the force that the joints' torque allows each finger (finger,), N: it falls with the opening."""
-    share = (opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
-    return np.array([narrow + share * (wide - narrow) for narrow, wide in FORCE_N])
+    fraction = (opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    return np.array([narrow + fraction * (wide - narrow) for narrow, wide in FORCE_N])
 
 
 def touch(of: Situation, hidden: Unseen) -> Touch:
@@ -127,8 +127,8 @@ def centre(of: Situation, hidden: Unseen) -> Floats:
     A round tip touches where its normal is the object's. Tips that are shifted by e over a surface of curvature k roll
     to where the normal leans by e k / (1 + k R).
     """
-    share = (of.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
-    lean = of.lean_rad + np.array([BEND_RAD * (2 * share - 1), 0.0]) + hidden.tilt_rad
+    fraction = (of.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    lean = of.lean_rad + np.array([BEND_RAD * (2 * fraction - 1), 0.0]) + hidden.tilt_rad
     lean = lean + hidden.shift_m * of.bending_1_m / (1 + of.bending_1_m * TIP_M)
     at = np.array(CENTRE_M) + TIP_M * lean
     at[:, 1, 1] += hidden.side_m

@@ -158,10 +158,10 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
 def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
     """Return what each channel feels in a trial (time, channel), counts without noise."""
     gain, lean, along_m, aperture_m = sensitivity(scene)
-    felt_n = texture.felt(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
+    contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
     factor, offset_n = nuisance(seed, index, gain.shape[1], rig)
     pressed_n = scene.force_n[:, None] * (1 + scene.of.friction * lean)
-    found: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (felt_n + offset_n))
+    found: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (contact_n + offset_n))
     return found
 
 
@@ -171,7 +171,7 @@ def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
         shape = (len(scene.true_ns), schema.ELECTRODES)
         gain, lean = (np.broadcast_to(known, shape) for known in (fingertip.gains(), fingertip.leans()))
         return gain, lean, fingertip.ALONG_M, fingertip.APERTURE_M
-    gain = forearm.GAIN_COUNT_N * forearm.shares(scene.patch_m)
+    gain = forearm.GAIN_COUNT_N * forearm.fractions(scene.patch_m)
     return gain, forearm.leans(scene.patch_m), forearm.ALONG_M, forearm.APERTURE_M
 
 
@@ -228,11 +228,11 @@ def _rolled(
 ) -> Scene:
     """Return a slide of RoboSkin: in contact from first to last frame, at a speed that wanders."""
     at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
-    share = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
+    variation = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
     period_s, phase = rng.uniform(*WANDER_S), rng.uniform(0, 2 * np.pi)
     turn = 2 * np.pi / period_s
-    speed = rig.roboskin_speed_m_s * (1 + share * np.sin(turn * at_s + phase))
-    way = rig.roboskin_speed_m_s * (at_s - share / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
+    speed = rig.roboskin_speed_m_s * (1 + variation * np.sin(turn * at_s + phase))
+    way = rig.roboskin_speed_m_s * (at_s - variation / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
     start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
     return Scene(
         which,
@@ -268,7 +268,9 @@ def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) ->
     if rig.pac:
         rows = np.arange(pac.size) / schema.VIBRATIONS
         at, contact = (np.interp(rows, np.arange(len(signal)), known) for known in (scene.position_m, scene.contact))
-        pac = fingertip.vibration(contact * texture.felt(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng)
+        pac = fingertip.vibration(
+            contact * texture.contact_force(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng
+        )
     return [tdc, tac, scene.pressure_count, *pac.T, *electrodes.T]
 
 

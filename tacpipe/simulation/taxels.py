@@ -61,7 +61,7 @@ def skin(rng: np.random.Generator) -> Skin:
     return Skin(centre, float(rng.uniform(*SIGMA_M)), mixing * np.array(GAIN_COUNT_N)[:, None], base)
 
 
-def shares(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
+def fractions(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
     """Return the share of the normal force that each taxel bears (time, taxel); they add up to one.
 
     ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it.
@@ -69,8 +69,8 @@ def shares(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
     moved = one.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
     centre = PAD_M * np.tanh(moved / PAD_M)
     distance2 = ((PLACES_M - centre[:, None]) ** 2).sum(axis=2)
-    share = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * one.sigma_m**2))
-    whole: Floats = share / share.sum(axis=1, keepdims=True)
+    fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * one.sigma_m**2))
+    whole: Floats = fraction / fraction.sum(axis=1, keepdims=True)
     return whole
 
 

@@ -56,13 +56,13 @@ class Waves:
 
 def material(rng: np.random.Generator) -> Material:
     """Return a random material."""
-    share, roughness = rng.uniform(*BACKGROUND), rng.uniform(*ROUGHNESS_N)
+    fraction, roughness = rng.uniform(*BACKGROUND), rng.uniform(*ROUGHNESS_N)
     amplitude = rng.uniform(*AMPLITUDE, GRATINGS)
-    amplitude *= roughness * np.sqrt((1 - share) / (amplitude**2 / 2).sum())
+    amplitude *= roughness * np.sqrt((1 - fraction) / (amplitude**2 / 2).sum())
     return Material(
         wavelength_m=rng.uniform(*WAVELENGTH_M, GRATINGS),
         amplitude_n=amplitude,
-        background_n=float(roughness * np.sqrt(share)),
+        background_n=float(roughness * np.sqrt(fraction)),
         exponent=float(rng.uniform(*EXPONENT)),
         friction=float(rng.uniform(*FRICTION)),
         stiffness_n_m=float(rng.uniform(*STIFFNESS_N_M)),
@@ -88,11 +88,11 @@ def passed(number_per_m: Floats, aperture_m: float) -> Floats:
     >>> passed(np.array([0.0, 125.0, 250.0]), 0.0018).round(3).tolist()
     [1.0, 0.368, 0.018]
     """
-    share: Floats = np.exp(-2 * (np.pi * aperture_m * number_per_m) ** 2)
-    return share
+    fraction: Floats = np.exp(-2 * (np.pi * aperture_m * number_per_m) ** 2)
+    return fraction
 
 
-def felt(surface: Waves, position_m: Floats, aperture_m: float) -> Floats:
+def contact_force(surface: Waves, position_m: Floats, aperture_m: float) -> Floats:
     """Return what is felt of a surface at ``position_m`` (any shape), N, of the same shape."""
     low, high = float(position_m.min()), float(position_m.max())
     grid = low + GRID_M * np.arange(int((high - low) / GRID_M) + 2)

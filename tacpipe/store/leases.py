@@ -23,7 +23,7 @@ from tacpipe.io.files import read_json, readable_errors, write_all
 from tacpipe.store import layout
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
-TELL_AFTER_S = 2.0  # a shorter wait is no news
+REPORT_AFTER_S = 2.0  # a shorter wait is no news
 LEASE_BYTES = 1 << 30  # the largest lease that is read: it names 16 million objects
 _POLL_S = 0.02
 _UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts where the file system has no locks
@@ -97,10 +97,10 @@ class Leases:
             try:
                 handle = _try_lock(path, create=False)
                 if handle is None:
-                    found.append(_told(path))
+                    found.append(_parsed(path))
                     continue
                 if not _has_locks(handle) and _seems_alive(path):
-                    found.append(_told(path))
+                    found.append(_parsed(path))
                 else:
                     path.unlink(missing_ok=True)
                 os.close(handle)
@@ -145,11 +145,11 @@ class Announcing:
     def __init__(self, path: Path | str) -> None:
         self.path = str(path)
         self._handle = -1
-        self._told: set[str] = set()
+        self._parsed: set[str] = set()
 
     def announce(self, names: Iterable[str]) -> None:
         """Tell that objects are used. Raises `TacpipeError` if the process that began the run is gone."""
-        new = [name for name in names if name not in self._told]
+        new = [name for name in names if name not in self._parsed]
         if not new:
             return
         with readable_errors(Path(self.path).parent):
@@ -159,7 +159,7 @@ class Announcing:
                 except FileNotFoundError:
                     raise TacpipeError("The process that began this run is gone; nothing more is written.") from None
             write_all(self._handle, "".join(f"{name}\n" for name in new).encode())
-        self._told.update(new)
+        self._parsed.update(new)
 
     def close(self) -> None:
         """Announce nothing more."""
@@ -176,7 +176,7 @@ def _release(path: Path, handle: int) -> None:
         os.close(handle)
 
 
-def _told(path: Path) -> Run:
+def _parsed(path: Path) -> Run:
     first, _, rest = regular.content(path, LEASE_BYTES, follow=False).decode("latin-1").partition("\n")
     try:
         note = json.loads(first)
@@ -203,7 +203,7 @@ def _timeout_s() -> float:
 def _wait(path: Path, what: str, timeout_s: float) -> int:
     """Return the handle once the lock is free; tell on stderr who is waited for."""
     began_s = time.monotonic()
-    told = False
+    reported = False
     while True:
         waited_s = time.monotonic() - began_s
         if waited_s >= timeout_s:
@@ -211,9 +211,9 @@ def _wait(path: Path, what: str, timeout_s: float) -> int:
                 f"{_holder(path)} has held {what} for over {timeout_s:g} s. Wait for it or stop it; "
                 f"TACPIPE_LOCK_TIMEOUT_S sets how long to wait."
             )
-        if not told and waited_s >= TELL_AFTER_S:
-            told = True
-            progress.say(f"waiting for {_holder(path, 'another process')}, which is at work on {what}.")
+        if not reported and waited_s >= REPORT_AFTER_S:
+            reported = True
+            progress.report(f"waiting for {_holder(path, 'another process')}, which is at work on {what}.")
         time.sleep(_POLL_S)
         handle = _try_lock(path)
         if handle is not None:
@@ -241,7 +241,7 @@ def _stopped(note: dict[str, Any]) -> bool:
 
 def _seems_alive(path: Path) -> bool:
     """Return whether a run may be at work on a file system that knows no locks."""
-    note = _told(path).note
+    note = _parsed(path).note
     if note.get("host") == platform.node() and "pid" in note:
         try:
             os.kill(note["pid"], 0)

@@ -30,18 +30,18 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
     """
     read = [methods.Run.read(one) for one in results if methods.comparable(one)]
     runs = [run for run in read if run.errors.recordings]  # others have nothing to compare
-    told, parts = list(results), []
+    described, parts = list(results), []
     if len(runs) > 1:
         found = Overview(runs)
         simulated = any(provenance.simulated(run.dataset) for run in runs)
         parts.append(overview.render(found, sweep.read([*results, *others]), simulated))
         if len(runs) > IN_FULL:
             compared = {id(run.dataset) for run in runs}
-            chosen = [run.dataset for run in found.told_apart()]
-            told = [*chosen, *(one for one in results if id(one) not in compared)]
-            parts.append(markup.note(f"Below, {len(told)} of the {len(results)} results in full."))
+            chosen = [run.dataset for run in found.representative_runs()]
+            described = [*chosen, *(one for one in results if id(one) not in compared)]
+            parts.append(markup.note(f"Below, {len(described)} of the {len(results)} results in full."))
     elif others:
         published = all(provenance.published(one, overview.PAPERS_SETS) for one in results)
         parts.append(representations.section(sweep.read([*results, *others]), published))
-    parts += [section.render(one, number, len(told), traces) for number, one in enumerate(told, 1)]
+    parts += [section.render(one, number, len(described), traces) for number, one in enumerate(described, 1)]
     return "".join(parts)

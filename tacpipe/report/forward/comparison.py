@@ -69,9 +69,9 @@ class Pool:
         """Return the pool of these of its recordings alone."""
         rows = [self.recordings.index(name) for name in recordings]
         parts = {name: getattr(self, name)[rows] for name in ("windows", "squared", "absolute", "baseline")}
-        told = (self.distinct_windows, self.runs, self.steps, self.channels)
+        described = (self.distinct_windows, self.runs, self.steps, self.channels)
         windows, squared, absolute, baseline = parts.values()
-        return Pool(tuple(recordings), windows, *told, squared, absolute, baseline)
+        return Pool(tuple(recordings), windows, *described, squared, absolute, baseline)
 
 
 @dataclass(frozen=True)
@@ -183,9 +183,9 @@ def _sums(runs: Sequence[Run], predictor: str, steps: Sequence[int], known: bool
         squared, absolute, still = (one.at(values, steps) for values in (one.squared, one.absolute, one.baseline))
         for at, name in enumerate(one.recordings):
             values = float(one.windows[at]) * one.channels
-            told = headlines.sums(squared[at], absolute[at], still[at], values)
+            described = headlines.sums(squared[at], absolute[at], still[at], values)
             key = run.config["params"].get("seed"), name
-            found[key] = found[key] + told if key in found else told
+            found[key] = found[key] + described if key in found else described
     return found
 
 
@@ -217,10 +217,10 @@ def represented(method: Method) -> Represented | None:
     known = [found for run in method.runs if (found := pool([run], MODEL, "feature", known=True)) is not None]
     # the recurrent model is trained by this very error, so its loss tells it too
     validation = [run.config.get("validation", {}) for run in method.runs]
-    told = [one.get("mse_feature", one.get("loss") if method.recurrent else None) for one in validation]
+    described = [one.get("mse_feature", one.get("loss") if method.recurrent else None) for one in validation]
     return Represented(
         method,
-        spread([float(one) for one in told if one is not None]),
+        spread([float(one) for one in described if one is not None]),
         spread([float(one.mse.mean()) for one in pooled]),
         spread([float(one.mse.mean()) for one in known]) if known else None,
         spread([float(one.baseline_mse.mean()) for one in pooled]),
@@ -229,8 +229,8 @@ def represented(method: Method) -> Represented | None:
 
 def anticipation(method: Method, predictor: str) -> dict[str, float] | None:
     """Return recall, leads and false alarms of a predictor, averaged over runs by their numbers of events."""
-    told = [run.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
-    held = [one for one in told if one and one.get("events")]
+    described = [run.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
+    held = [one for one in described if one and one.get("events")]
     if not held:
         return None
     found: dict[str, float] = {"events": sum(float(one["events"]) for one in held)}
@@ -250,8 +250,8 @@ def _part(run: Run, predictor: str, group: str, known: bool | None) -> Pool | No
         return None
     names = tuple(name for name, kept in zip(errors.recordings, held, strict=True) if kept)
     windows = errors.windows[held]
-    told = (int(windows.sum()), 1, errors.steps, errors.channels[group])
-    return Pool(names, windows, *told, sums[0][held], sums[1][held], baseline[0][held])
+    described = (int(windows.sum()), 1, errors.steps, errors.channels[group])
+    return Pool(names, windows, *described, sums[0][held], sums[1][held], baseline[0][held])
 
 
 def _skills(weights: NDArray[Any], pooled: Pool, steps: Sequence[int]) -> Floats:
@@ -275,8 +275,8 @@ def _row(name: str, predictor: str, method: Method, steps: Sequence[int], known:
     each = [found for run in method.runs if (found := pool([run], predictor, known=known)) is not None]
     scores = [float(_skills(np.ones((1, len(one.recordings))), one, steps)[0, -1]) for one in each]
     standard = pool(method.runs, predictor, "standard", known)
-    told = skill(standard, steps) if standard else None
-    return Row(name, predictor, method, pooled, standard, skill(pooled, steps), spread(scores).sd, told)
+    described = skill(standard, steps) if standard else None
+    return Row(name, predictor, method, pooled, standard, skill(pooled, steps), spread(scores).sd, described)
 
 
 def own(predictor: str) -> bool:

@@ -89,8 +89,8 @@ def skill_of_methods(
             axes[0].plot(
                 ahead, mean, color=COLOURS[colour], linestyle=line, marker="o", markersize=3, linewidth=1.8, label=name
             )
-        told = [value for found in skill.values() for part in ("mean", "low", "high") for value in found[part]]
-        highest, lowest = np.nanmax([0.05, *told]), max(floor, np.nanmin([0.0, *told]))
+        described = [value for found in skill.values() for part in ("mean", "low", "high") for value in found[part]]
+        highest, lowest = np.nanmax([0.05, *described]), max(floor, np.nanmin([0.0, *described]))
         room = 0.05 * (highest - lowest)
         axes[0].set_ylim(lowest - (room if lowest > floor else 0), highest + room)
         axes[0].set_xlabel(f"time ahead ({unit})")

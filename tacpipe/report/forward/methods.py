@@ -99,8 +99,8 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     made = []
     for same in found.values():
         config = same[0].config
-        told = _differing(_params(config), alike[_key(config, params=False)])
-        made.append(Method(_name(config, usual, told), tuple(same)))
+        described = _differing(_params(config), alike[_key(config, params=False)])
+        made.append(Method(_name(config, usual, described), tuple(same)))
     return sorted(made, key=lambda method: method.name)
 
 
@@ -167,14 +167,14 @@ def _params(config: Tree) -> dict[str, Any]:
 
 def _key(config: Tree, *, params: bool, without: str = "") -> str:
     """Return what names a method, seed and split left out."""
-    told = {
+    described = {
         "architecture": config["architecture"],
         "codec": config["codec"]["name"],
         "actions": _actions(config),
         "timeline": _timeline(config),
         "params": _params(config) if params else {},
     }
-    return json.dumps({name: value for name, value in told.items() if name != without}, sort_keys=True)
+    return json.dumps({name: value for name, value in described.items() if name != without}, sort_keys=True)
 
 
 def _differing(params: Tree, alike: Sequence[Tree]) -> dict[str, Any]:

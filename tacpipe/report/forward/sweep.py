@@ -53,12 +53,12 @@ def losses(codecs: Sequence[Tree]) -> list[Loss]:
         if codec.get("reconstruction"):
             found.setdefault((series(codec), int(codec["latents"])), []).append(codec["reconstruction"])
     made = []
-    for (name, latents), told in sorted(found.items()):
+    for (name, latents), described in sorted(found.items()):
         errors = {
-            measure: float(np.mean([one[part][measure] for one in told]))
+            measure: float(np.mean([one[part][measure] for one in described]))
             for measure in ("mse_standardised", "mae_counts")
         }
-        made.append(Loss(name, latents, len(told), part, **errors))
+        made.append(Loss(name, latents, len(described), part, **errors))
     return made
 
 

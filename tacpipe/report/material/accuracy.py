@@ -25,9 +25,9 @@ class Accuracy:
     """The share of slides named right, pooled over runs."""
 
     correct: int  # verdicts of all runs added
-    judged: int
+    evaluated: int
     slides: int  # each counted once
-    share: float
+    fraction: float
     low: float  # 95 % interval over slides (Wilson)
     high: float
     mean: float  # over runs
@@ -40,7 +40,7 @@ class Verdicts:
     """The share of runs that named each slide right."""
 
     recordings: tuple[str, ...]
-    share: Floats  # (slide,)
+    fraction: Floats  # (slide,)
 
 
 def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accuracy | None:
@@ -49,13 +49,13 @@ def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accura
     if not each:
         return None
     found = _pooled(each)
-    correct, judged = sum(sum(one.values()) for one in each), sum(len(one) for one in each)
+    correct, evaluated = sum(sum(one.values()) for one in each), sum(len(one) for one in each)
     slides = len(found.recordings)
-    share = correct / judged
-    shares = [sum(one.values()) / len(one) for one in each]
-    low, high = wilson(round(share * slides), slides)
-    sd = float(np.std(shares, ddof=1)) if len(shares) > 1 else float("nan")
-    return Accuracy(correct, judged, slides, share, low, high, float(np.mean(shares)), sd, len(each))
+    fraction = correct / evaluated
+    fractions = [sum(one.values()) / len(one) for one in each]
+    low, high = wilson(round(fraction * slides), slides)
+    sd = float(np.std(fractions, ddof=1)) if len(fractions) > 1 else float("nan")
+    return Accuracy(correct, evaluated, slides, fraction, low, high, float(np.mean(fractions)), sd, len(each))
 
 
 def verdicts(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Verdicts:
@@ -68,22 +68,22 @@ def skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> float:
 
     1 is perfect, 0 no better than what the time-averaged channels tell.
     """
-    held = [run for run in runs if LEVEL in run.predictions.said and predictor in run.predictions.said]
+    held = [run for run in runs if LEVEL in run.predictions.predicted and predictor in run.predictions.predicted]
     found, level = (accuracy(held, sensor, name) for name in (predictor, LEVEL))
-    if found is None or level is None or level.share == 1:
+    if found is None or level is None or level.fraction == 1:
         return float("nan")
-    return 1 - (1 - found.share) / (1 - level.share)
+    return 1 - (1 - found.fraction) / (1 - level.fraction)
 
 
 def named_right(run: Run, sensor: str, predictor: str) -> dict[str, bool]:
     """Return whether each slide was named right, by recording."""
     rows = run.predictions.of(sensor)
-    if predictor not in rows.said:
+    if predictor not in rows.predicted:
         return {}
-    said = rows.said[predictor]
+    predicted = rows.predicted[predictor]
     return {
         str(name): bool(one == truth)
-        for name, one, truth in zip(rows.recordings, said, rows.materials, strict=True)
+        for name, one, truth in zip(rows.recordings, predicted, rows.materials, strict=True)
         if one != NOTHING
     }
 

@@ -59,11 +59,11 @@ def difference(
     common = [name for name in one.recordings if name in set(other.recordings)]
     if not common:
         return None
-    places = [dict(zip(found.recordings, found.share, strict=True)) for found in (one, other)]
-    shares = np.array([[place[name] for name in common] for place in places])  # (method, slide)
-    gain = shares[0] - shares[1]
+    places = [dict(zip(found.recordings, found.fraction, strict=True)) for found in (one, other)]
+    fractions = np.array([[place[name] for name in common] for place in places])  # (method, slide)
+    gain = fractions[0] - fractions[1]
     low, high = forecast.bounds((_draws(len(common)) @ gain / len(common))[:, None])
-    right = shares >= 0.5
+    right = fractions >= 0.5
     unit, pairs = _paired(first, second, sensor, predictors)
     return Difference(
         len(common),
@@ -150,5 +150,5 @@ def _by_unit(
     for run in runs:
         if (key := rule(run)) is not None:
             units.setdefault(key, []).append(run)
-    told = {key: accuracy.accuracy(same, sensor, predictor) for key, same in units.items()}
-    return {key: found.mean for key, found in told.items() if found}
+    described = {key: accuracy.accuracy(same, sensor, predictor) for key, same in units.items()}
+    return {key: found.mean for key, found in described.items() if found}

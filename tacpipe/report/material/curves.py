@@ -58,8 +58,12 @@ def alignment(methods: Sequence[Method]) -> str:
 
 def aligned(run: Run) -> list[float]:
     """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not tell it."""
-    told = [line.get("alignment") for line in run.history]
-    return [float("nan") if one is None else float(one) for one in told] if any(one is not None for one in told) else []
+    described = [line.get("alignment") for line in run.history]
+    return (
+        [float("nan") if one is None else float(one) for one in described]
+        if any(one is not None for one in described)
+        else []
+    )
 
 
 def few_slides(methods: Sequence[Method]) -> str:
@@ -98,15 +102,19 @@ def _add(points: dict[str, _Points], line: str, method: Method, sensor: str) -> 
     found = accuracy(method.of(sensor), sensor)
     if found is None:
         return
-    told = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
-    if told:
-        points.setdefault(line, _Points()).found[max(told)] = (found.share, found.low, found.high)
+    described = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
+    if described:
+        points.setdefault(line, _Points()).found[max(described)] = (found.fraction, found.low, found.high)
 
 
 def _validation(run: Run, sensor: str) -> list[float]:
     """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is told."""
-    told = [line.get("val", {}).get(sensor, {}).get("accuracy") for line in run.history]
-    return [float("nan") if one is None else 100 * one for one in told] if any(one is not None for one in told) else []
+    described = [line.get("val", {}).get(sensor, {}).get("accuracy") for line in run.history]
+    return (
+        [float("nan") if one is None else 100 * one for one in described]
+        if any(one is not None for one in described)
+        else []
+    )
 
 
 def _pair(drawn: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tacpipe.report.material.methods import Method, Run, Tree, base_name, ordered, shown
-from tacpipe.report.naming import told_apart
+from tacpipe.report.naming import distinct_names
 
 # In these, runs of one method may differ; setting and quantities are told as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "setting", "quantities")
@@ -36,7 +36,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
         whole = _whole([one for one, other in zip(runs, places, strict=True) if other == place])
         settings: Tree = {**_settings(run), "elsewhere": place != main, **_few(run, whole, few)}
         found.setdefault(json.dumps(settings, sort_keys=True), (settings, []))[1].append(run)
-    names = told_apart([(base_name(settings), settings) for settings, _ in found.values()], _USUAL)
+    names = distinct_names([(base_name(settings), settings) for settings, _ in found.values()], _USUAL)
     made = [
         Method(name, settings, marks, tuple(same))
         for (name, marks), (settings, same) in zip(names, found.values(), strict=True)
@@ -80,8 +80,8 @@ def _place(run: Run) -> tuple[str, str]:
     """Return the split and the layout of a run's slides: what is told together of results is of one of each."""
     split = run.config.get("split", "")
     layouts = {one.get("layout", "time") for one in run.config.get("sensors", {}).values()}
-    told = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
-    return told, "authors" if "authors" in layouts else "time"
+    described = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
+    return described, "authors" if "authors" in layouts else "time"
 
 
 def _whole(runs: Sequence[Run]) -> dict[str, int]:
@@ -93,21 +93,21 @@ def _whole(runs: Sequence[Run]) -> dict[str, int]:
     return whole
 
 
-def _few(run: Run, whole: Mapping[str, int], told: list[float]) -> dict[str, str]:
+def _few(run: Run, whole: Mapping[str, int], described: list[float]) -> dict[str, str]:
     """Return the number of training slides of a run where it has not all, and the sensor that this is so for if not all.
 
-    Numbers are rounded to those of other runs that have about as many; ``told`` has the shares of before. A sensor that
+    Numbers are rounded to those of other runs that have about as many; ``described`` has the shares of before. A sensor that
     learns from some batches alone has all slides: that is a setting.
     """
     fewer = {}
     for sensor in ordered(set(run.trained)):
-        share = run.trained[sensor] / max(whole[sensor], 1)
-        if share > _SAME:
+        fraction = run.trained[sensor] / max(whole[sensor], 1)
+        if fraction > _SAME:
             continue
-        same = [one for one in told if _SAME < one / share < 1 / _SAME]
+        same = [one for one in described if _SAME < one / fraction < 1 / _SAME]
         if not same:
-            told.append(share)
-        fewer[sensor] = str(round((same or [share])[0] * whole[sensor]))
+            described.append(fraction)
+        fewer[sensor] = str(round((same or [fraction])[0] * whole[sensor]))
     if set(fewer) == set(run.trained) and len(set(fewer.values())) == 1:
         return {"few": next(iter(fewer.values())), "few_of": ""}
     few = ", ".join(f"{shown(sensor)} {count}" for sensor, count in fewer.items())

@@ -27,17 +27,19 @@ class Predictions:
     recordings: NDArray[np.str_]  # (slide,)
     sensors: NDArray[np.str_]  # (slide,)
     materials: NDArray[np.int64]  # (slide,), the truth
-    said: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
+    predicted: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
     latents: Floats | None  # (slide, latent); None where the model has none
     sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that tell of none
 
     def of(self, sensor: str) -> Predictions:
         """Return the rows of one sensor."""
         rows = self.sensors == sensor
-        said = {name: values[rows] for name, values in self.said.items()}
+        predicted = {name: values[rows] for name, values in self.predicted.items()}
         latents = None if self.latents is None else self.latents[rows]
         sessions = None if self.sessions is None else self.sessions[rows]
-        return Predictions(self.recordings[rows], self.sensors[rows], self.materials[rows], said, latents, sessions)
+        return Predictions(
+            self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, sessions
+        )
 
     @property
     def one_session_each(self) -> bool:

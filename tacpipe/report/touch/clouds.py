@@ -32,10 +32,10 @@ def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
     shards = {name: shard for one in datasets for name, shard in one.shards.items() if _whole(shard)}
     if not shards:
         return ""
-    told = {name: words for name, words in chosen.items() if name in shards} or dict.fromkeys(
+    described = {name: words for name, words in chosen.items() if name in shards} or dict.fromkeys(
         sorted(shards)[:SHOWN], ""
     )
-    drawn = [_figure(shards[name], words) for name, words in told.items()]
+    drawn = [_figure(shards[name], words) for name, words in described.items()]
     note = (
         "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the "
         "cloud, though a finger may touch it."

@@ -39,7 +39,7 @@ def figure_8(methods: Sequence[Method]) -> str:
         return ""
     method, target = max(found, key=lambda one: (len(_curves(one[0], one[1], "train_loss")[0]), len(one[0].runs)))
     named = {"training": "train_loss", "validation": "val_loss"}
-    curves = {name: told for name, loss in named.items() if (told := _curves(method, target, loss))}
+    curves = {name: described for name, loss in named.items() if (described := _curves(method, target, loss))}
     quantity = "loss (RMSE, share of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
     svg = epochs.by_epoch(curves, quantity, "Training and validation loss by epoch", log=True)
     simulated = " Simulated." if method.simulated else ""
@@ -60,8 +60,8 @@ def losses(run: Run, target: str, name: str) -> list[float]:
     networks: dict[object, list[float]] = {}
     for line in run.history:
         if line.get("target", ALL) == target:
-            told = line.get(name)
-            networks.setdefault(line.get("network"), []).append(float("nan") if told is None else float(told))
+            described = line.get(name)
+            networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
     length = min(map(len, networks.values()), default=0)
     mean = [sum(values) / len(values) for values in zip(*(one[:length] for one in networks.values()), strict=True)]
     return mean if any(not math.isnan(value) for value in mean) else []

@@ -59,12 +59,12 @@ def chosen(runs: Sequence[Run]) -> list[Chosen]:
     if not fingers or not len(rows.recordings):
         return []
     squared = [
-        np.square(biotac_sp.normalised(one, rows.said[MODEL][one]) - biotac_sp.normalised(one, rows.true[one]))
+        np.square(biotac_sp.normalised(one, rows.predicted[MODEL][one]) - biotac_sp.normalised(one, rows.true[one]))
         for one in fingers
     ]
     error = np.sqrt(np.hstack(squared).mean(axis=1))
     order = np.lexsort((rows.recordings, error))
-    found = [(place, int(order[round(share * (len(order) - 1))])) for place, share in PLACES.items()]
+    found = [(place, int(order[round(place_fraction * (len(order) - 1))])) for place, place_fraction in PLACES.items()]
     return [Chosen(place, row, str(rows.recordings[row]), float(error[row])) for place, row in found]
 
 
@@ -87,14 +87,14 @@ def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> str:
     tips, errors = [], []
     for target in fingers:
         finger = wording.FINGERS[target]
-        true, said = (touch[target][one.row] for touch in (rows.true, rows.said[MODEL]))
-        constant = rows.said.get(CONSTANT, {}).get(target)
+        true, predicted = (touch[target][one.row] for touch in (rows.true, rows.predicted[MODEL]))
+        constant = rows.predicted.get(CONSTANT, {}).get(target)
         usual = rows.true[target].mean(axis=0) if constant is None else constant[one.row]
         widest = float(np.abs(true - usual).max()) or 1.0
-        for title, values in (("true", true), ("predicted", said)):
+        for title, values in (("true", true), ("predicted", predicted)):
             texts = [f"{value:.0f}" for value in values]
             tips.append(Fingertip(f"{finger}, {title}", (usual - values) / widest, texts))
-        errors.append(f"{finger} {regression.rmse(true[None], said[None]):.0f} counts")
+        errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
     known = wording.OBJECTS[bool(rows.known[one.row])].removesuffix("s")
     caption = (
         f"{one.place.capitalize()} by error: {one.recording}, {rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of "

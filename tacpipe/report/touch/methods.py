@@ -11,7 +11,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import contents, provenance
-from tacpipe.report.naming import told_apart
+from tacpipe.report.naming import distinct_names
 from tacpipe.report.touch import predictions
 from tacpipe.report.touch.predictions import Predictions
 from tacpipe.tasks.touch.result_names import PREDICTIONS
@@ -159,7 +159,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     made = []
     for architecture in dict.fromkeys(str(settings["architecture"]) for settings, _ in found.values()):
         same = [one for one in found.values() if one[0]["architecture"] == architecture]
-        names = told_apart([(architecture, settings) for settings, _ in same], _usual(same))
+        names = distinct_names([(architecture, settings) for settings, _ in same], _usual(same))
         made += [
             Method(" · ".join([*_called(settings), *marks]), settings, tuple(held))
             for (_, marks), (settings, held) in zip(names, same, strict=True)

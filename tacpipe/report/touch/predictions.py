@@ -31,7 +31,7 @@ class Predictions:
     objects: NDArray[np.str_]  # (grasp,)
     known: NDArray[np.bool_]  # (grasp,), whether the model was trained on other grasps of the object
     true: Touch
-    said: Mapping[str, Touch]  # by predictor
+    predicted: Mapping[str, Touch]  # by predictor
     t_ns: NDArray[np.int64] | None = None  # (grasp,)
 
     @property
@@ -45,7 +45,7 @@ class Predictions:
     @property
     def targets(self) -> tuple[str, ...]:
         """What the model foretells, in the order of tables."""
-        return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.said[MODEL])
+        return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
     def of(self, known: bool | None) -> Predictions:
         """Return the rows of known or of novel objects, or all."""
@@ -53,10 +53,12 @@ class Predictions:
 
     def rows(self, chosen: NDArray[Any]) -> Predictions:
         """Return some rows, told by a mask (grasp,) or by their numbers."""
-        said = {name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.said.items()}
+        predicted = {
+            name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.predicted.items()
+        }
         true = {target: one[chosen] for target, one in self.true.items()}
         t_ns = None if self.t_ns is None else self.t_ns[chosen]
-        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, said, t_ns)
+        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, predicted, t_ns)
 
 
 def read(shard: Recording) -> Predictions:

@@ -30,8 +30,8 @@ def _figure(method: Method, target: str) -> str:
     objects = []
     for novel, name in parts:
         held = rows.rows((rows.objects == name) & (rows.known != novel))
-        objects.append(Scattered(name, novel, held.true[target][:, 0], held.said[MODEL][target][:, 0]))
-    constant = rows.said.get(CONSTANT, {}).get(target)
+        objects.append(Scattered(name, novel, held.true[target][:, 0], held.predicted[MODEL][target][:, 0]))
+    constant = rows.predicted.get(CONSTANT, {}).get(target)
     level = float("nan") if constant is None else float(constant[0, 0])
     name = wording.TARGETS[target]
     svg = figures.scatter(objects, level, "(counts)", f"Predicted over true {name}")

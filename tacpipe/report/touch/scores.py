@@ -42,21 +42,21 @@ class Score:
         return in_counts(self.target, self.rmse)
 
 
-def in_counts(target: str, share: float) -> float:
+def in_counts(target: str, fraction: float) -> float:
     """Return a share of a target's range in device counts.
 
     >>> in_counts("pdc_th", 0.1)
     90.0
     """
     low, high = biotac_sp.RANGES[target]
-    return share * (high - low)
+    return fraction * (high - low)
 
 
 class _Rows(NamedTuple):
     """What a run tells of a target."""
 
     true: Floats  # (grasp, value), normalised
-    said: Floats  # (grasp, value)
+    predicted: Floats  # (grasp, value)
     constant: Floats  # (grasp, value), NaN where the result holds none
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
@@ -74,11 +74,11 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
     rows = _pooled(parts)
     return Score(
         target,
-        regression.rmse(rows.true, rows.said),
-        spread([regression.rmse(one.true, one.said) for one in parts]),
-        float(np.mean([regression.batch_mean_rmse(one.true, one.said) for one in parts])),
-        regression.mae(rows.true, rows.said),
-        regression.r2(rows.true, rows.said),
+        regression.rmse(rows.true, rows.predicted),
+        spread([regression.rmse(one.true, one.predicted) for one in parts]),
+        float(np.mean([regression.batch_mean_rmse(one.true, one.predicted) for one in parts])),
+        regression.mae(rows.true, rows.predicted),
+        regression.r2(rows.true, rows.predicted),
         _skill(rows, rows.recordings if known else rows.objects),
         len(np.unique(rows.recordings)),
         len(np.unique(rows.objects)),
@@ -91,9 +91,9 @@ def headline(method: Method, target: str, known: bool | None) -> Headline | None
     errors: dict[str, dict[tuple[object, str], tuple[float, int]]] = {}
     objects: dict[str, str] = {}
     for run in method.runs:
-        for predictor in run.predictions.said:
+        for predictor in run.predictions.predicted:
             for rows in _rows([run], target, known, predictor):
-                squared = regression.squared_sums(rows.true, rows.said)
+                squared = regression.squared_sums(rows.true, rows.predicted)
                 objects |= dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
                 for name, one in zip(rows.recordings.tolist(), squared.tolist(), strict=True):
                     key = run.params.get("seed"), name
@@ -106,18 +106,18 @@ def headline(method: Method, target: str, known: bool | None) -> Headline | None
 
 def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:
     """Return the method whose runs tell of a baseline: that with most runs which hold it; None where none does."""
-    held = [one for one in methods if any(target in run.predictions.said.get(predictor, ()) for run in one.runs)]
+    held = [one for one in methods if any(target in run.predictions.predicted.get(predictor, ()) for run in one.runs)]
     return max(held, key=lambda one: len(one.runs), default=None)
 
 
 def baselines(methods: Sequence[Method]) -> list[str]:
     """Return the predictors that are no model's own, in the order of their names."""
-    return sorted({name for one in methods for run in one.runs for name in run.predictions.said if name != MODEL})
+    return sorted({name for one in methods for run in one.runs for name in run.predictions.predicted if name != MODEL})
 
 
 def best(methods: Sequence[Method], target: str, known: bool | None) -> Method | None:
     """Return the method of least RMSE on a target; of two that err alike the first."""
-    found = [(told.rmse, one) for one in methods if (told := score(one.runs, target, known))]
+    found = [(described.rmse, one) for one in methods if (described := score(one.runs, target, known))]
     return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
@@ -129,20 +129,22 @@ def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> Floats
 
 def of_object(runs: Sequence[Run], name: str) -> list[Run]:
     """Return runs as if they had been judged on the grasps of one object alone."""
-    told = [(run, run.predictions) for run in runs]
-    return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in told]
+    described = [(run, run.predictions) for run in runs]
+    return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in described]
 
 
 def _rows(runs: Sequence[Run], target: str, known: bool | None, predictor: str) -> list[_Rows]:
     """Return what each run tells that holds the target, the predictor and such objects."""
     found = []
     for rows in (run.predictions.of(known) for run in runs):
-        said = rows.said.get(predictor, {})
-        if target not in said or target not in rows.true or not len(rows.recordings):
+        predicted = rows.predicted.get(predictor, {})
+        if target not in predicted or target not in rows.true or not len(rows.recordings):
             continue
-        constant = rows.said.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
-        true, told, mean = (biotac_sp.normalised(target, one) for one in (rows.true[target], said[target], constant))
-        found.append(_Rows(true, told, mean, rows.recordings, rows.objects))
+        constant = rows.predicted.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
+        true, described, mean = (
+            biotac_sp.normalised(target, one) for one in (rows.true[target], predicted[target], constant)
+        )
+        found.append(_Rows(true, described, mean, rows.recordings, rows.objects))
     return found
 
 
@@ -153,5 +155,5 @@ def _pooled(parts: Sequence[_Rows]) -> _Rows:
 def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Interval:
     """Return the skill over the constant on rows where there is one."""
     held = ~np.isnan(rows.constant).any(axis=1)
-    model, baseline = (regression.squared_sums(rows.true[held], one[held]) for one in (rows.said, rows.constant))
+    model, baseline = (regression.squared_sums(rows.true[held], one[held]) for one in (rows.predicted, rows.constant))
     return regression.skill_interval(model, baseline, clusters[held])

@@ -63,8 +63,8 @@ def baseline(predictor: str) -> str:
 
 def skill(found: Score) -> str:
     """Return a skill over the constant above its interval."""
-    told = markup.sure(*found.skill)
-    return NONE if math.isnan(found.skill.mean) else told
+    described = markup.sure(*found.skill)
+    return NONE if math.isnan(found.skill.mean) else described
 
 
 def skill_within(found: Score) -> str:
@@ -72,14 +72,14 @@ def skill_within(found: Score) -> str:
     mean, low, high = found.skill
     if math.isnan(mean):
         return "no constant to compare with"
-    told = markup.decimals(mean)
-    return told if math.isnan(low) else f"{told} ({markup.decimals(low)} to {markup.decimals(high)})"
+    described = markup.decimals(mean)
+    return described if math.isnan(low) else f"{described} ({markup.decimals(low)} to {markup.decimals(high)})"
 
 
-def share(value: float) -> str:
+def percentage(value: float) -> str:
     """Return an error as a share of a range.
 
-    >>> share(0.05496), share(float("nan"))
+    >>> percentage(0.05496), percentage(float("nan"))
     ('0.0550', '–')
     """
     return NONE if math.isnan(value) else f"{value:.4f}"
@@ -105,18 +105,18 @@ def signed_short(value: float) -> str:
     return f"−{-value:.1f}" if value > -9 else "< −9"
 
 
-def split(told: str) -> str:
+def split(described: str) -> str:
     """Return how grasps were parted, where somebody said so."""
-    return told.replace("-", " ").replace("_", " ") or "one split"
+    return described.replace("-", " ").replace("_", " ") or "one split"
 
 
-def place(told: str, simulated: bool) -> str:
+def place(described: str, simulated: bool) -> str:
     """Return how grasps were parted and whether they were simulated.
 
     >>> place("by-day", True), place("simulated", True), place("", False)
     ('by day, simulated', 'simulated', 'one split')
     """
-    name = split(told)
+    name = split(described)
     return f"{name}, simulated" if simulated and "simulated" not in name else name
 
 
@@ -126,24 +126,24 @@ def schedule(run: Run) -> str:
         return "fitted without epochs"
     params = run.params
     epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
-    told = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
+    described = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
     if run.architecture != PAPERS or not run.published:
-        return told
+        return described
     if (batch, rate) == (printed.BATCH, printed.LEARNING_RATE) and int(epochs or 0) >= printed.EPOCHS:
-        return f"paper schedule ({told})"
-    return f"quick ({told}; the paper: {printed.EPOCHS}, {printed.BATCH}, {printed.LEARNING_RATE})"
+        return f"paper schedule ({described})"
+    return f"quick ({described}; the paper: {printed.EPOCHS}, {printed.BATCH}, {printed.LEARNING_RATE})"
 
 
 def basis(methods: Sequence[Method]) -> str:
     """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
     runs = [run for one in methods for run in one.runs]
-    told = [
+    described = [
         f"{count} run{'s' if count > 1 else ''}: {one}"
         for one, count in Counter(schedule(run) for run in runs).most_common()
     ]
     trained = sorted({run.trained for run in runs if run.trained is not None})
     counts = f" Trained on {span(trained)} grasps." if trained else ""
-    return f"{'; '.join(told)}.{counts}"
+    return f"{'; '.join(described)}.{counts}"
 
 
 def span(counts: Sequence[int]) -> str:

@@ -105,7 +105,7 @@ class Harm:
             return items
         until_ns = items[-1].due_ns + 1
         self._change(items, until_ns)
-        self._judge(items, frames)
+        self._mark_undetectable(items, frames)
         items = self._lose(items)
         items = self._move(items) if self.packets else items
         items = self._add_noise(items, until_ns)
@@ -141,7 +141,7 @@ class Harm:
                 items[row] = items[row]._replace(data=data[:start] + random + data[start + there :], cause=BURST)
             row, start, count = row + 1, 0, 0 if self.packets else count - there
 
-    def _judge(self, items: list[Item], frames: Sequence[bytes]) -> None:
+    def _mark_undetectable(self, items: list[Item], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
             if item.cause in CHANGED:
                 items[row] = item._replace(invisible=undetectable_faults.passes(self.sensor, frames, row, item.data))

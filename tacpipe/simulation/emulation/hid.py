@@ -46,8 +46,10 @@ class Server:
         self.root = self.line().decode()
         if not self.root:
             assert self.process.stderr is not None
-            told = self.process.stderr.read().decode().strip().splitlines()[-1:]
-            raise DeviceError(f"umockdev did not start ({' '.join(told)}). Install gir1.2-umockdev-1.0 and python3-gi.")
+            message = self.process.stderr.read().decode().strip().splitlines()[-1:]
+            raise DeviceError(
+                f"umockdev did not start ({' '.join(message)}). Install gir1.2-umockdev-1.0 and python3-gi."
+            )
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "root").write_text(f"{self.root}\n", encoding="utf-8")
         self.devices: list[Hid] = []
@@ -64,7 +66,7 @@ class Server:
             found += piece
         return found.strip()
 
-    def tell(self, command: str) -> None:
+    def send(self, command: str) -> None:
         """Give the server a command."""
         assert self.process.stdin is not None
         self.process.stdin.write(command.encode() + b"\n")
@@ -100,7 +102,7 @@ class Host:
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send each piece as a report."""
         for piece in pieces:
-            self.endpoint.server.tell(f"send {self.endpoint.number} {piece.hex()}")
+            self.endpoint.server.send(f"send {self.endpoint.number} {piece.hex()}")
         return [len(piece) for piece in pieces]
 
 
@@ -118,7 +120,7 @@ class Hid:
         named = address.place.partition("?")[0] if ":" in address.place else (*sensor.usb_ids, "16c0:0486")[0]
         vendor, _, product = named.lower().partition(":")
         descriptor = bytes.fromhex(DESCRIPTORS.get(named.lower(), RAW)).hex()
-        self.server.tell(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
+        self.server.send(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
         self.server.line()
         self._away = False
         self.peers = [Host(self)]

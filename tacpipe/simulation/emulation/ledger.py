@@ -64,7 +64,7 @@ class Ledger:
         self._invisible.append(item.invisible)
         self._source.append(len(self.sources) - 1)
 
-    def tell(self, t_ns: int, what: str, more: str = "") -> None:
+    def enter(self, t_ns: int, what: str, more: str = "") -> None:
         """Enter something that happened: opened, closed, unplug, replug, heard, rate, clock."""
         self.events.append((t_ns, what, more))
 
@@ -147,13 +147,13 @@ class Ledger:
 
         folder.mkdir(parents=True, exist_ok=True)
         pq.write_table(self.table(), folder / f"{self.name}.parquet")
-        told = {
+        content = {
             "counts": self.counts,
             "clock": [_clock(source) for source in self.sources],
             "events": [{"t_ns": t_ns, "what": what, "more": more} for t_ns, what, more in self.events],
             "harmed": {str(row): data.hex() for row, data in self.harmed.items()},
         }
-        (folder / f"{self.name}.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        (folder / f"{self.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def taken(samples: Samples, rows: NDArray[np.int64]) -> Samples:

@@ -47,7 +47,7 @@ def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.rand
     """Return the column (time,) of each field, in its own type, of what the world shows (time, field), SI."""
     full = FULL.get(quantity, 1.0)
     if quantity in SHARED:  # a device with many taxels is made for less on each
-        full *= pad.peak_share(max(1, sum(axis_of(field) in (None, "z") for field in fields)))
+        full *= pad.peak_fraction(max(1, sum(axis_of(field) in (None, "z") for field in fields)))
     noise = 0.0 if quantity in SILENT else NOISE * full
     noisy = values + noise * rng.standard_normal(values.shape) if noise else values
     return [_column(field, column, full, quantity) for field, column in zip(fields, noisy.T, strict=True)]

@@ -63,7 +63,7 @@ class Connection:
             return None
 
 
-class Telling(Connection):
+class Registration(Connection):
     """A host that is connected, and told the device a UDP port to send frames to: replies go over the connection."""
 
     def __init__(self, made: socket.socket, sensor: Sensor) -> None:
@@ -166,4 +166,4 @@ class TcpUdp(Tcp):
     """A TCP server for control, frames by UDP."""
 
     scheme = "tcp+udp"
-    kind = Telling
+    kind = Registration

@@ -120,7 +120,7 @@ def test_recordings_whose_objects_nobody_named_are_neither_known_nor_unseen() ->
 def test_told_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:
     results = [result("raw", seed, ratio=ratio) for seed, ratio in enumerate((0.5, 0.25, 0.375))]
     results += [result("PCA-20", seed, ratio=2.0) for seed in range(2)]
-    told = over(*results).told_apart()
+    told = over(*results).representative_runs()
     assert [(run.config["codec"]["name"], run.config["params"]["seed"]) for run in told] == [("raw", 2), ("PCA-20", 0)]
 
 
