@@ -145,7 +145,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
 
 
 def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Seal what earlier processes of this user left behind; what cannot be sealed is told and stays.
+    """Seal what earlier processes of this user left behind; what cannot be sealed is reported and stays.
 
     It keeps nobody from recording. ``output`` is the dataset that this command was given.
     """
@@ -177,7 +177,7 @@ def _report_others(store: Store) -> None:
     """Print whose the spools are that another user recorded, in a store that is shared."""
     from tacpipe.recording import spool
 
-    with contextlib.suppress(OSError):  # of a disk that failed, which was said already
+    with contextlib.suppress(OSError):  # of a disk that failed, which was stated already
         others = spool.owners(store.root)
         ours = spool.users(store.root / spool.FOLDER, others.values())
         for folder in [folder for folder, owner in others.items() if owner not in ours]:

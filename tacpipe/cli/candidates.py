@@ -127,7 +127,7 @@ def _touch_model(path: Path) -> Any:
     task = model_files.tree(files, model_files.CONFIG).get("task") if model_files.CONFIG in files else None
     if task is not None and task != "touch":
         raise UsageError(
-            f"{path} is a model of task {plain(str(task))}; what a grasp would feel is foretold by one of task touch. "
+            f"{path} is a model of task {plain(str(task))}; what a grasp would measure is predicted by one of task touch. "
             f"`tacpipe train touch` makes one."
         )
     return tacpipe.load(path)
@@ -153,7 +153,7 @@ def _row(rank: int, candidate: Candidate) -> Row:
 
 
 def _touch(touch: Any) -> Row:
-    """Return the 50 values that a model foretells, device counts by column."""
+    """Return the 50 values that a model predicts, device counts by column."""
     values: Row = {}
     for finger in ("th", "mf"):
         values[f"pdc_{finger}_counts"] = round(float(getattr(touch, f"pdc_{finger}")), 1)
@@ -182,7 +182,7 @@ def _require_names(output: Path | None, picture: Path | None) -> None:
             raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
         replacing.refuse_foreign(output, HEADER.encode())
     if picture is not None and picture.suffix.lower() not in PICTURES:
-        raise UsageError(f"{picture} is no name for a picture; it must end in one of {', '.join(PICTURES)}.")
+        raise UsageError(f"{picture} is not a name for a picture; it must end in one of {', '.join(PICTURES)}.")
 
 
 def _write(path: Path, text: str) -> None:

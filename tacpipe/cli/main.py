@@ -73,7 +73,7 @@ def app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line of this process, which ends within a second of Ctrl-C; exit with the documented codes."""
+    """Run the command line of this process, which exits within a second of Ctrl-C; exit with the documented codes."""
     code = INTERRUPTED
     try:
         terminal.prepare()
@@ -82,7 +82,7 @@ def main() -> None:
         code = _printed(answer(sys.argv[1:]))
     except KeyboardInterrupt:  # as it began, or after it was done
         termination.report()
-    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be told apart
+    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be distinguished
         short = memory.shortage(error)
         if short is None:
             raise
@@ -117,7 +117,7 @@ def answer(arguments: Sequence[str]) -> int:
         code, sentence = INTERRUPTED, ""
     except BrokenPipeError:
         return DONE
-    except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
+    except OSError as error:  # of a disk or of permissions, where nobody closer by could state more
         code, sentence = FAILED, str(memory.shortage(error) or describe(error))
         _complain(sentence)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What a model is and what a result says: read from JSON and the headers of weights, so that nothing heavy is imported."""
+"""What a model is and what a result states: read from JSON and the headers of weights, so that nothing heavy is imported."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return task, architecture, what was trained on, and what else a configuration says in few words."""
+    """Return task, architecture, what was trained on, and what else a configuration states in few words."""
     trained = config.get("trained_on")
     return {
         **{name: config.get(name) for name in ("task", "architecture")},
@@ -143,7 +143,7 @@ def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _short(value: Any) -> str | None:
-    """Return an entry of a configuration in few words; None for one that is empty, or large and says nothing so."""
+    """Return an entry of a configuration in few words; None for one that is empty, or large and states nothing so."""
     if isinstance(value, Mapping):
         if all(not isinstance(one, Mapping | list) for one in value.values()) and len(value) <= SHOWN:
             return flat(value) if value else None

@@ -101,7 +101,7 @@ def _poses(path: Path) -> NDArray[np.float64]:
     if (error > ORTHONORMAL_TOLERANCE).any():
         row = int((error > ORTHONORMAL_TOLERANCE).argmax())
         raise TacpipeError(
-            f"{path}, row {file_row(path, row)}: ee_T is no rigid transform; it is off by {error[row]:.3g}, "
+            f"{path}, row {file_row(path, row)}: ee_T is not a rigid transform; it is off by {error[row]:.3g}, "
             f"{ORTHONORMAL_TOLERANCE} is allowed. Check that ee_T_03, ee_T_13 and ee_T_23 hold the position."
         )
     return np.column_stack([moved, continuous(quaternions_of(turned))])

@@ -1,4 +1,4 @@
-"""How much memory is left for this process, so that what a file claims is refused before it is taken."""
+"""How much memory is left for this process, so that what a file declares is refused before it is taken."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
 GROUP = Path("/sys/fs/cgroup")  # of a container: its limit, and what is used of it
 AT_HAND = 1 << 26  # bytes that are not worth asking the system about
-KEPT = 0.9  # share of what is left that one file may claim
+KEPT = 0.9  # fraction of what is left that one file may declare
 SCARCE = 1 << 29  # bytes: a request that fails although so much is left was for more than a sound file needs
 LIBRARIES = {  # bytes of address space that loading each takes, and its threads; measured with 2 cores
     "numpy": 140 << 20,
@@ -53,12 +53,12 @@ def limited() -> bool:
 
 
 def scarce() -> bool:
-    """Return whether so little is left that a request which fails says nothing of what asked for it."""
+    """Return whether so little is left that a request which fails states nothing of what asked for it."""
     return available() < SCARCE
 
 
 def shortage(error: BaseException) -> ShortageError | None:
-    """Return in words that memory or threads ran out, where ``error`` or what it came from says so; else None."""
+    """Return in words that memory or threads ran out, where ``error`` or what it came from states it; else None."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, ShortageError):
@@ -124,7 +124,7 @@ def require_library(name: str) -> None:
 
 @contextlib.contextmanager
 def raising_shortage() -> Iterator[None]:
-    """Raise what says that memory ran out as `ShortageError`."""
+    """Raise what states that memory ran out as `ShortageError`."""
     try:
         yield
     except Exception as error:

@@ -24,7 +24,7 @@ def wanted() -> bool:
 
 
 def report(sentence: str) -> None:
-    """Tell on stderr what a user should know while it happens, unless quiet was asked for."""
+    """Report on stderr what a user should know while it happens, unless quiet was asked for."""
     if not _quiet:
         terminal.note(f"tacpipe: {sentence}")
 

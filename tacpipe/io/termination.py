@@ -1,4 +1,5 @@
-"""A wish to end, by Ctrl-C, SIGTERM or SIGHUP: a command ends within a second, whatever it is doing, and says one sentence.
+"""A termination request, by Ctrl-C, SIGTERM or SIGHUP: a command exits within a second, whatever it is doing, and
+states one sentence.
 
 Python hears of a signal between two of its own steps, and a long call in C has none. So a thread hears of it too, and ends
 the process where `KeyboardInterrupt` has not. That is safe at any point: nothing in a store is ever half written.
@@ -25,19 +26,19 @@ from tacpipe.errors import INTERRUPTED
 from tacpipe.io import terminal
 
 GRACE_S = 0.7  # to end in good order
-TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a wish is the same one
+TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a request is the same one
 SENTENCE = "tacpipe: interrupted; what was finished is kept."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class _Requests:
-    """Tells wishes apart from their echoes."""
+    """Distinguishes requests apart from their echoes."""
 
     def __init__(self) -> None:
         self._last_s = -TWICE_S
 
     def another(self) -> bool:
-        """Return whether the signal that has just come is a wish of its own."""
+        """Return whether the signal that has just come is a request of its own."""
         now_s = time.monotonic()
         if now_s - self._last_s <= TWICE_S:
             return False
@@ -46,7 +47,7 @@ class _Requests:
 
 
 class _Program:
-    """What this process knows of wishes to end; there is one."""
+    """What this process knows of termination requests; there is one."""
 
     def __init__(self) -> None:
         self.by_main_thread = _Requests()  # by the main thread
@@ -54,14 +55,14 @@ class _Program:
         self.ending = False
         self.installed = False  # it is a command's own process
         self.deferred = False  # `KeyboardInterrupt` waits
-        self.own_way = False  # the next wish is the command's own business
+        self.own_way = False  # the next request is the command's own business
         self.sentence = SENTENCE
         self.reported = False
         self.code: int | None = None  # of a command that is done
         self.restore: Callable[[], None] = lambda: None  # what was done to the terminal
 
     def ask(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt` for the first wish, end at once for the second: the handler of all signals."""
+        """Raise `KeyboardInterrupt` for the first request, end at once for the second: the handler of all signals."""
         hung_up = number == signal.SIGHUP
         if hung_up:
             drop_closed_streams()
@@ -74,7 +75,7 @@ class _Program:
             raise KeyboardInterrupt
 
     def listen(self, wakeups: int) -> None:
-        """See to it that the process ends soon after a wish: run by a thread that hears of signals from C."""
+        """See to it that the process ends soon after a request: run by a thread that hears of signals from C."""
         expected = asked = False
         while True:
             (number,) = os.read(wakeups, 1)
@@ -107,7 +108,7 @@ _program = _Program()
 
 
 def install_handlers() -> None:
-    """Heed wishes to end from now on: `KeyboardInterrupt` first, the end of the process soon after.
+    """Handle termination requests from now on: `KeyboardInterrupt` first, the end of the process soon after.
 
     A signal that this process was started to ignore, as by ``nohup``, is ignored further.
     """
@@ -125,19 +126,19 @@ def install_handlers() -> None:
 
 
 def requested() -> bool:
-    """Return whether the process is about to end because somebody wished it: errors then say nothing of the command."""
+    """Return whether the process is about to end because somebody requested it: errors then state nothing of the command."""
     return _program.installed and _program.ending
 
 
 def report() -> None:
-    """Tell that the command was interrupted, and what is kept."""
+    """Report that the command was interrupted, and what is kept."""
     sentence, _program.sentence, _program.reported = _program.sentence, SENTENCE, True
     if sentence:
         terminal.note(sentence)
 
 
 def done(code: int) -> int:
-    """Return the exit code of a command that is done: whoever wishes it to end from now on gets this code.
+    """Return the exit code of a command that is done: whoever requests it to end from now on gets this code.
 
     An interrupted process ends here: taking down torch and the like would need another second.
     """
@@ -151,12 +152,12 @@ def done(code: int) -> int:
 
 @contextlib.contextmanager
 def reporting(sentence: str) -> Iterator[None]:
-    """Have an interrupt in the block told in this sentence, which knows what is kept."""
+    """Have an interrupt in the block stated in this sentence, which knows what is kept."""
     before, _program.sentence = _program.sentence, sentence
     try:
         yield
     except KeyboardInterrupt:
-        raise  # it is told further out
+        raise  # it is reported further out
     except BaseException:
         _program.sentence = before
         raise
@@ -176,7 +177,7 @@ def deferred() -> Iterator[None]:
 
 
 class Ended:
-    """Whether somebody asked to end: the first wish ends what runs in its own way and keeps it, the second interrupts.
+    """Whether somebody asked to end: the first request ends what runs in its own way and keeps it, the second interrupts.
 
     ``number`` is the signal that asked, None before.
     """

@@ -1,4 +1,4 @@
-"""When something arrived: stamps of the wall clock, which kernels and files carry, told on the monotonic one."""
+"""When something arrived: stamps of the wall clock, which kernels and files carry, stated on the monotonic one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LOOKS = 3  # at both clocks, of which the quickest counts: another program may r
 class Arrivals:
     """Maps wall-clock stamps of arrivals to the monotonic clock; what is given out never goes back.
 
-    How far apart two stamps are stays as it was told, because the distance of the clocks is changed only when it must be.
+    How far apart two stamps are stays as it was given, because the distance of the clocks is changed only when it must be.
     """
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from tacpipe.links.opened import Arrived, Opened
 from tacpipe.sensors.sensor import Sensor
 
 LONGEST_WAIT_S = 0.03  # the kernel keeps 63 reports, 63 ms of the fastest device, and then drops the newest
-CHOICES = ("interface", "usage_page", "serial")  # what an address may say behind its ?
+CHOICES = ("interface", "usage_page", "serial")  # what an address may state behind its ?
 
 
 def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
@@ -125,7 +125,7 @@ class HidLink(Opened):
 
 
 def _descriptor(device: Any) -> bytes:
-    """Return the report descriptor, nothing where hidapi is older than 0.14 or the system does not tell."""
+    """Return the report descriptor, nothing where hidapi is older than 0.14 or the system does not state."""
     try:
         return bytes(device.get_report_descriptor())
     except (AttributeError, OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Which serial ports and HID devices this computer has now, and what they say of themselves."""
+"""Which serial ports and HID devices this computer has now, and what they state of themselves."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Port:
     """A port with something behind it."""
 
     address: str  # as a rig file names it
-    usb_id: str = ""  # "16d0:14cc", empty for what is no USB device
+    usb_id: str = ""  # "16d0:14cc", empty for what is not a USB device
     what: str = ""  # what the device calls itself
     lasting: str = ""  # a name of the same port that stays when cables are swapped
 

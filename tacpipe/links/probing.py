@@ -107,7 +107,7 @@ def _asked(address: Address, usb_id: str, progress: Progress) -> Report:
 
 
 def _ask(link: Link, sensor: Sensor) -> Arrived:
-    """Return what a device says after a sensor's opening and requests; it is told to stop at the end."""
+    """Return what a device states after a sensor's opening and requests; it is asked to stop at the end."""
     try:
         came = hold(link, _hasty(sensor.opening(link.local)), "probe")
         request = sensor.request()

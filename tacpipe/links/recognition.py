@@ -1,4 +1,4 @@
-"""Which sensor speaks: each driver's framer tries the bytes, and the same bytes shuffled tell what it takes by chance."""
+"""Which sensor speaks: each driver's framer tries the bytes, and the same bytes shuffled state what it takes by chance."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ PACKETS = (
     "can",
     "folder",
     "camera",
-)  # kinds of links whose chunks have a size that tells
+)  # kinds of links whose chunks have a size that states
 MOST = 1 << 18  # bytes that are looked at
-CERTAIN = 0.8  # share of the bytes beyond chance from which on there is no doubt
+CERTAIN = 0.8  # fraction of the bytes beyond chance from which on there is no doubt
 POSSIBLE = 0.2  # below it, nothing speaks for a driver
 FEWEST = 3  # frames
 
@@ -48,10 +48,10 @@ class Finding:
 
     candidate: Candidate
     frames: int
-    rate_hz: float  # of frames, 0 where fewer than two arrivals tell it
+    rate_hz: float  # of frames, 0 where fewer than two arrivals state it
     bytes: int  # that were looked at
-    explained: float  # share of them that is in frames
-    chance: float  # share of the same bytes in random order that would be
+    explained: float  # fraction of them that is in frames
+    chance: float  # fraction of the same bytes in random order that would be
 
     @property
     def name(self) -> str:
@@ -123,7 +123,7 @@ def _rank(finding: Finding) -> tuple[float, float, float, int]:
 
 
 def _tried(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
-    """Return how many frames a sensor finds, the share of the bytes in them, and their rate in hertz."""
+    """Return how many frames a sensor finds, the fraction of the bytes in them, and their rate in hertz."""
     framer = sensor.framer()
     runs = [*framer.feed(data)[0], *framer.flush()[0]]
     stamps = [run.t_ns for run in runs if len(run.t_ns)]

@@ -81,7 +81,7 @@ def bound(host: str, port: int, name: str) -> socket.socket:
             raise DeviceError(f"{name}: UDP port {port} is held by {held}; end it, or take another port.") from error
         if error.errno == errno.EADDRNOTAVAIL:
             raise DeviceError(
-                f"{name}: {host} is no address of this computer; listen on one of its own, or on all with udp::{port}."
+                f"{name}: {host} is not an address of this computer; listen on one of its own, or on all with udp::{port}."
             ) from error
         raise network.failed(error, host, port, name) from error
     return made
@@ -116,7 +116,7 @@ class UdpLink(Descriptor):
         self._sender: Any = None  # of the last datagram
         self._declared = sender  # the only host whose datagrams count, `FIRST` until it is known; empty: any
         self._foreign = 0
-        self._failed: LinkLostError | None = None  # why the link is lost, until that is told
+        self._failed: LinkLostError | None = None  # why the link is lost, until that is reported
 
     @property
     def local(self) -> Mapping[str, Any]:
@@ -167,7 +167,7 @@ class UdpLink(Descriptor):
             except OSError as error:
                 if self._failed is not None:
                     return found
-                self._failed = self._refused(error)  # which the kernel tells once, before what waits
+                self._failed = self._refused(error)  # which the kernel states once, before what waits
                 continue
             arrival_ns = self._arrival(ancillary)
             if self._counts(sender):
@@ -191,7 +191,7 @@ class UdpLink(Descriptor):
         return self.lost(error.strerror or str(error))
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> int:
-        """Return the arrival that the ancillary messages of a datagram tell, and take note of drops."""
+        """Return the arrival that the ancillary messages of a datagram state, and take note of drops."""
         wall_ns = None
         for level, kind, data in ancillary:
             if level == socket.SOL_SOCKET and kind == STAMPS:

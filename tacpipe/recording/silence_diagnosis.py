@@ -16,7 +16,7 @@ UNTOLD = ("rate_hz", "baud")  # options that make no difference to what a frame 
 def sentence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, reply: bool = False) -> str:
     """Return which device, what is wrong and what to do, for a stream on which ``awaited`` did not come.
 
-    ``heard`` is what came instead; with ``reply`` a reply was awaited, so that frames of the sensor itself say something.
+    ``heard`` is what came instead; with ``reply`` a reply was awaited, so that frames of the sensor itself state something.
     """
     joined = Chunks.joined(list(heard))
     about = f"Stream {stream.name} ({stream.address}): {awaited}"

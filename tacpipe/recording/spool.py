@@ -80,7 +80,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a spool that are no block: at its end what a crash tore off, elsewhere what a disk did."""
+    """Bytes of a spool that are not a block: at its end what a crash tore off, elsewhere what a disk did."""
 
     offset: int
     bytes: int
@@ -124,7 +124,7 @@ class Spool:
             for folder in (self.folder, self.folder.parent):
                 sync_folder(str(folder))
         self._waiting: list[bytes] = []
-        self.failed: OSError | None = None  # what the disk said to a sync: it says so once
+        self.failed: OSError | None = None  # what the disk stated to a sync: it states it once
 
     def tally(self, stream: int, chunks: int, size: int, last_ns: int) -> None:
         """Note how much a stream has received in all, before it is appended."""
@@ -160,7 +160,7 @@ class Spool:
             ) from error
 
     def sync(self) -> None:
-        """Have what was written outlast a loss of power; a disk that fails is told by the next `write`."""
+        """Have what was written outlast a loss of power; a disk that fails is reported by the next `write`."""
         try:
             os.fdatasync(self._file)
         except OSError as error:
@@ -218,7 +218,7 @@ class Spooled:
     def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | Note]]:
         """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
 
-        What is no block is passed over, and noted in ``damage``. Notes on the recording are read along, see `ended`.
+        What is not a block is passed over, and noted in ``damage``. Notes on the recording are read along, see `ended`.
         """
         wanted = None if stream is None else self.streams.index(stream)
         self.damage, self._notes = [], []
@@ -264,7 +264,7 @@ class Spooled:
             with self._opened("tally") as file:
                 content = file.read(len(self.streams) * TALLY.size)
             return {name: Tallied(*TALLY.unpack_from(content, n * TALLY.size)) for n, name in enumerate(self.streams)}
-        except (FileNotFoundError, struct.error):  # one that cannot be read now is no reason to forget what was lost
+        except (FileNotFoundError, struct.error):  # one that cannot be read now is not a reason to forget what was lost
             return {}
 
     def utc_ns(self, t_ns: Any) -> Any:
@@ -289,7 +289,7 @@ class Spooled:
         return kept / self.folder.name
 
     def _opened(self, name: str) -> io.FileIO:
-        """Return one of its files, opened. Raises `TacpipeError` for one that is no regular file, or another user's."""
+        """Return one of its files, opened. Raises `TacpipeError` for one that is not a regular file, or another user's."""
         path = self.folder / name
         try:
             file = io.FileIO(path, opener=lambda name, _: os.open(name, READ))
@@ -368,7 +368,7 @@ def abandoned(store: Path) -> list[Path]:
             continue
         except OSError as error:
             if error.errno != errno.ENOTEMPTY:
-                found.append((0.0, folder))  # who tries to seal it tells what is wrong with it
+                found.append((0.0, folder))  # who tries to seal it states what is wrong with it
     return [folder for _, folder in sorted(found)]
 
 
@@ -442,7 +442,7 @@ def _next(handle: int, content: mmap.mmap, place: int) -> int:
     except OSError as error:
         if error.errno == errno.ENXIO:  # nothing follows but a hole
             return len(content)
-        stop = len(content)  # a file system that does not tell
+        stop = len(content)  # a file system that does not state
     found = content.find(MARK, place + 1, stop)
     return stop if found < 0 else found
 

@@ -150,7 +150,7 @@ def _record(
         try:
             return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig), lost
         except TacpipeError as error:
-            raise type(error)(f"{error} {kept} once that is mended.") from error
+            raise type(error)(f"{error} {kept} once that is fixed.") from error
         except Exception as error:
             error.add_note(f"{kept}.")
             raise
@@ -172,7 +172,7 @@ def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
 def _triggers(
     recorder: Recorder, plan: Plan, pressed: triggers.Keys, tap: triggers.Tap | None
 ) -> tuple[triggers.Trigger, triggers.Trigger]:
-    """Return what starts the next trial, and what stops it beside its duration."""
+    """Return what starts the next trial, and what stops it next to its duration."""
     contact = None
     if "contact" in (plan.start, plan.stop):
         contact = triggers.Contact(recorder.watches, plan.contact_count)

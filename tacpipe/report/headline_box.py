@@ -1,4 +1,5 @@
-"""What came out, first on the page: sentences whose colour says no more than their intervals, and the table behind them."""
+"""What came out, first on the page: sentences whose colour states no more than their intervals, and the table behind
+them."""
 
 from __future__ import annotations
 

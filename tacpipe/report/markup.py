@@ -103,7 +103,7 @@ def sure(mean: float, low: float, high: float) -> Markup:
     if math.isnan(mean):
         return Markup("not defined")
     described = [decimals(value) for value in (mean, low, high)]
-    spread = low < high and described[1] != described[2]  # neither NaN nor persistence beside itself
+    spread = low < high and described[1] != described[2]  # neither NaN nor persistence next to itself
     return Markup(described[0] + (f"<br><small>{described[1]} to {described[2]}</small>" if spread else ""))
 
 

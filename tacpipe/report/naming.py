@@ -1,4 +1,4 @@
-"""What tells a method from others that would have the same name: the settings in which they differ."""
+"""What distinguishes a method from others that would have the same name: the settings in which they differ."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def distinct_names(
 ) -> list[tuple[str, tuple[str, ...]]]:
     """Return a name for each method, given a first name and all its settings, and the settings that were added to it.
 
-    Settings are told where methods of the same first name differ in them, but for empty ones and those in ``usual``.
+    Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``.
 
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', ('deep',)), ('net · no deep', ('no deep',)), ('tree', ())]

@@ -1,4 +1,4 @@
-"""One page of results: each task's package tells of its own."""
+"""One page of results: each task's package reports on its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tacpipe.report import contents, markup, plain
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-TASKS = {  # the package whose functions ``report`` and ``reads`` tell of a task's results, by the task's name
+TASKS = {  # the package whose functions ``report`` and ``reads`` report on a task's results, by the task's name
     "forward": "tacpipe.report.forward",
     "material": "tacpipe.report.material",
     "touch": "tacpipe.report.touch",
@@ -25,7 +25,7 @@ def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> byt
     """Return the page for results of ``tacpipe evaluate``, as UTF-8; the same results give the same bytes.
 
     Without a ``title``, it is made of what the tasks on the page predict.
-    Results are told by task, in the order in which tasks first come, and datasets that are no results beside those whose
+    Results are given by task, in the order in which tasks first come, and datasets that are not results next to those whose
     task can use them. Raises `TacpipeError` where none can, and without any result.
     """
     with model_files.believed("the results"):
@@ -66,10 +66,10 @@ def _title(tasks: Iterable[str], packages: dict[str, Any]) -> str:
 
 
 def _task(result: Dataset) -> str:
-    """Return the task of a result, empty where it does not say."""
+    """Return the task of a result, empty where it does not state."""
     return str(contents.tree(result, "config.json").get("task", ""))
 
 
 def _users(dataset: Dataset, packages: dict[str, Any]) -> list[str]:
-    """Return the tasks whose part of the page can use a dataset that is no result."""
+    """Return the tasks whose part of the page can use a dataset that is not a result."""
     return [name for name, package in packages.items() if package.reads(dataset)]

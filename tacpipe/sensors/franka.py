@@ -168,7 +168,8 @@ class Franka(Sensor):
 
 
 class _Arm(Device):
-    """The arm's side of a connection: it sends its state to ``port`` once that was told; other commands are not answered."""
+    """The arm's side of a connection: it sends its state to ``port`` once that was given; other commands are not
+    answered."""
 
     port: int | None = None
 

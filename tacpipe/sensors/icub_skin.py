@@ -2,7 +2,7 @@
 
 A board sends each triangle in two CAN frames, in the order of their numbers: identifier class << 8 | board << 4 |
 triangle, the first byte ``40`` before taxels 1 to 7, ``C0`` before 8 to 12 and two bytes of diagnostics. The class is
-4, of boards with the older configuration 3. Taxels 7 and 11 are thermal pads, which feel no pressure. A taxel rests at
+4, of boards with the older configuration 3. Taxels 7 and 11 are thermal pads, which measure no pressure. A taxel rests at
 240 and falls when it is pressed.
 Diagnostics, big-endian: bit 0 the triangle does not answer, bits 4 to 15 one of its 12 taxels is stuck.
 Source: canBusSkin of icub-main, for messages and identifiers. Which taxels are thermal and the order of the bytes of
@@ -145,14 +145,14 @@ class IcubSkin(Sensor):
         yield self._command(TRANSMIT, 0)
 
     def closing(self) -> bytes:
-        """Have the board send no more; one with the older configuration cannot be told so."""
+        """Have the board send no more; one with the older configuration cannot be determined so."""
         return b"" if self.old else self._command(TRANSMIT, 1).send
 
     def _command(self, *data: int, pause_s: float = 0.0) -> Ask:
         return Ask(can_frame(POLLING << 8 | self.board, bytes(data)), pause_s=pause_s)
 
     def device(self) -> Device:
-        """Return a board that waits to be told to send."""
+        """Return a board that waits to be asked to send."""
         return _Board(self)
 
 

@@ -63,7 +63,7 @@ class ModbusTactile(Sensor):
         return bytes([self.address, PRESSURES]) + (2 * self.points).to_bytes(2, "little")
 
     def framer(self) -> Framer:
-        """Return a framer of replies with all taxels; other replies, with their own sums, are no frames."""
+        """Return a framer of replies with all taxels; other replies, with their own sums, are not frames."""
         return ByteFramer(Framing(marker=self.header, size=HEADER + 2 * self.points + 2, check=_crc_is_right))
 
     def decode(self, frames: Bytes) -> Samples:
@@ -119,7 +119,7 @@ class ModbusTactile(Sensor):
 
 @dataclass
 class _Module(Device):
-    """The module's side: counts what it is asked for, reads and writes registers, tells what it is."""
+    """The module's side: counts what it is asked for, reads and writes registers, states what it is."""
 
     registers: dict[int, int] = field(default_factory=dict)
     asked: int = 0

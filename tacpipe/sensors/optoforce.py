@@ -114,7 +114,7 @@ class OptoForce(Sensor):
 
 
 class _Daq(Device):
-    """The DAQ's side: streams at the rate that it was last told, not at all after a stop."""
+    """The DAQ's side: streams at the rate that it was last stated, not at all after a stop."""
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data

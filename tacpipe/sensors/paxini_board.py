@@ -68,7 +68,7 @@ class Board(Device):
     memory: dict[int, bytes] = field(default_factory=dict)
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to what was written; what is no message is passed over."""
+        """Return the replies to what was written; what is not a message is passed over."""
         self.heard += data
         replies = []
         while (start := self.heard.find(REQUEST)) >= 0 and len(self.heard) >= start + REPLY_HEADER:

@@ -1,7 +1,7 @@
 """A tap: what a lab's own programs know, sent to the recording as lines of JSON by UDP.
 
-A line is one record, ``{"width_m": 0.031, "phase": "lift"}``; a packet holds one or several. The rig file tells which keys
-become columns of numbers; the whole record is kept as text beside them, so nothing that was sent is lost. Keys with a
+A line is one record, ``{"width_m": 0.031, "phase": "lift"}``; a packet holds one or several. The rig file states which keys
+become columns of numbers; the whole record is kept as text next to them, so nothing that was sent is lost. Keys with a
 meaning: ``seq`` and ``t_ns`` where the options promise them, ``event`` (start, stop, label, or another word), and ``grasp``,
 ``{"g1": [x, y, z], "g2": [x, y, z], "R": [[…], […], […]]}`` in metres, whose columns of R are the wrist's axes.
 """
@@ -36,7 +36,7 @@ LARGEST = 1 << 62  # of counters and times
 
 @dataclass(frozen=True)
 class Tap(Sensor):
-    """Records of a program. A key that a record lacks is NaN in its column; text where a number was told is refused."""
+    """Records of a program. A key that a record lacks is NaN in its column; text where a number was given is refused."""
 
     summary: ClassVar[str] = "Records of your own programs, sent as lines of JSON by UDP."
     links: ClassVar[tuple[str, ...]] = ("udp",)
@@ -127,9 +127,9 @@ class Tap(Sensor):
             return False
 
     def _holds(self, record: Any) -> bool:
-        """Return whether a line is a record, numbers are where numbers were told, and what is promised is there.
+        """Return whether a line is a record, numbers are where numbers were given, and what is promised is there.
 
-        Raises `ValueError` for an event that is no text in UTF-8.
+        Raises `ValueError` for an event that is not text in UTF-8.
         """
         if not isinstance(record, dict) or not isinstance(record.get("event", ""), str):
             return False

@@ -1,8 +1,8 @@
 """Universal Robots arms by RTDE, the real-time data exchange of their controllers, protocol version 2.
 
-Packages over TCP, big-endian: u16 size with this header, u8 type, payload. The host says which version it speaks, how often
-it wants which outputs (a recipe), and starts; a data package is then the recipe's number and the outputs one by one. Reading
-takes no right to move the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
+Packages over TCP, big-endian: u16 size with this header, u8 type, payload. The host states which version it speaks, how
+often it wants which outputs (a recipe), and starts; a data package is then the recipe's number and the outputs one by
+one. Reading takes no right to move the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class UrRtde(Sensor):
         return [field for name in self.outputs for field in fields_of(name)]
 
     def framer(self) -> Framer:
-        """Return a framer of packages; one of data must be as long as the recipe says, and have another behind it.
+        """Return a framer of packages; one of data must be as long as the recipe states, and have another behind it.
 
         There is no sum; a package that was cut would take its missing bytes from the next.
         """
@@ -129,7 +129,7 @@ class UrRtde(Sensor):
         for name, kind in zip(names, kinds, strict=False):
             if kind != type_of(name):
                 raise DeviceError(
-                    f"The controller says {kind} to the output {name}, which should be {type_of(name)}. Leave it out of "
+                    f"The controller states {kind} to the output {name}, which should be {type_of(name)}. Leave it out of "
                     f"the option outputs, or update the controller."
                 )
         if len(kinds) != len(names) or recipe in (b"", b"\0"):
@@ -208,7 +208,7 @@ def _ask(kind: int, payload: bytes) -> Ask:
             size, found = HEADER.unpack_from(data, place)
             if found not in KINDS or size < HEADER.size:
                 raise DeviceError(
-                    f"Bytes {data[place : place + 8].hex(' ')} came, which are no RTDE. Is the port 30004?"
+                    f"Bytes {data[place : place + 8].hex(' ')} came, which are not RTDE. Is the port 30004?"
                 )
             if found == kind:
                 return (place, place + size) if len(data) >= place + size else 0

@@ -1,9 +1,9 @@
 """Weiss Robotics WTS tactile sensors: a matrix of pressure cells over USB.
 
-Every message, both ways, is ``AA AA AA``, a number, the size of what it says (uint16), that, and a check sum (uint16), all
+Every message, both ways, is ``AA AA AA``, a number, the size of what it states (uint16), that, and a check sum (uint16), all
 little-endian. The sum is taken over the whole message with `crc16_wts`, which no standard knows. Frames are messages of
 number 0: the time (uint32, 10 µs), flags, and the cells row by row, uint16 each. With flag bit 0 the cells are run-length
-coded: of each word the upper 4 bits say how many cells in a row have the value of the lower 12. A reply has the number of
+coded: of each word the upper 4 bits state how many cells in a row have the value of the lower 12. A reply has the number of
 the command and begins with an error code (uint16, 0: done).
 
 Source: wts_driver (GPL-3) for messages, numbers and sum; its example ``AA AA AA 06 01 00 FF 2A 87`` is checked in the
@@ -57,7 +57,7 @@ class WeissWts(Sensor):
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
             raise UsageError(
-                f"weiss-wts: {self.rows} rows of {self.columns} columns are no matrix; both must be 1 or more."
+                f"weiss-wts: {self.rows} rows of {self.columns} columns are not a matrix; both must be 1 or more."
             )
         if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - self.delay_ms) > 0.01:
             raise UsageError(
@@ -137,7 +137,7 @@ class WeissWts(Sensor):
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
         """Stop what still streams, compare the matrix with the options, start frames.
 
-        Raises `DeviceError` where the sensor has another matrix, or says no.
+        Raises `DeviceError` where the sensor has another matrix, or states no.
         """
         yield Ask(message(STOP), until=_reply(STOP, refusable=True), what="the reply to stop")
         found = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
@@ -145,7 +145,7 @@ class WeissWts(Sensor):
         columns, rows = (int.from_bytes(payload[start : start + 2], "little") for start in (2, 4))
         if (rows, columns) != (self.rows, self.columns):
             raise DeviceError(
-                f"The WTS has {rows} rows of {columns} columns and the options say {self.rows} of {self.columns}; "
+                f"The WTS has {rows} rows of {columns} columns and the options state {self.rows} of {self.columns}; "
                 f"set rows = {rows} and columns = {columns}."
             )
         start = bytes([RUN_LENGTH if self.compress else 0]) + self.delay_ms.to_bytes(2, "little")

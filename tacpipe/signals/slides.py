@@ -23,7 +23,7 @@ class Protocol:
     """What each slide of an experiment should be like."""
 
     speed_m_s: float
-    speed_tolerance: float  # share of it
+    speed_tolerance: float  # fraction of it
     min_s: float
     pressure_low: float  # counts
     pressure_high: float

@@ -16,7 +16,7 @@ TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in its median a
 
 
 def hampel(values: NDArray[Any], rows: int, deviations: float, floor: float) -> tuple[NDArray[np.bool_], NDArray[Any]]:
-    """Return which of ``values`` (time, channel) are spikes (time, channel), and the values with these mended.
+    """Return which of ``values`` (time, channel) are spikes (time, channel), and the values with these repaired.
 
     A spike is further than ``deviations`` scaled median absolute deviations, and than ``floor``, from the median of the
     ``rows`` (odd) around it, which takes its place; with one row there are none. Signals are

@@ -1,10 +1,10 @@
-"""Grasps of the simulated table: a camera sees an object, two fingers pinch it, and their sensors read what they feel.
+"""Grasps of the simulated table: a camera sees an object, two fingers pinch it, and their sensors read what they measure.
 
 Trial i is of object i mod n. What happens in one:
 
 1. an object comes to rest on the table in a random pose, and `tacpipe.simulation.depth_camera` sees it;
 2. `tacpipe.simulation.antipodal` plans where two fingers take it;
-3. the fingers, a little off, press as `tacpipe.simulation.pinch` tells;
+3. the fingers, a little off, press as `tacpipe.simulation.pinch` states;
 4. `tacpipe.simulation.fingertip_sp` reads that.
 
 Grasps of an object follow one another in sessions, over which the sensors drift.
@@ -129,6 +129,6 @@ def _check(rig: Rig) -> None:
         if getattr(rig, name) < 0:
             raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 0 or more.")
     if not 0 <= rig.shift <= 1:
-        raise TacpipeError(f"shift is {rig.shift}; it is a share of half the cloud's length, 0 to 1.")
+        raise TacpipeError(f"shift is {rig.shift}; it is a fraction of half the cloud's length, 0 to 1.")
     if rig.raw and rig.spheres:
         raise TacpipeError("raw and spheres are both set; spheres of all sizes have no table. Leave one of them out.")

@@ -3,8 +3,8 @@
 What happens, in order:
 
 1. the fingers close (0.6 to 1.2 s), then the grip force ramps up (0.4 s);
-2. the hand lifts the bottle and moves it, as `tacpipe.simulation.trajectory` tells;
-3. the bottle sticks, slips or is dropped, as `tacpipe.simulation.mechanics` tells;
+2. the hand lifts the bottle and moves it, as `tacpipe.simulation.trajectory` states;
+3. the bottle sticks, slips or is dropped, as `tacpipe.simulation.mechanics` states;
 4. what the fingers bring up shows on `tacpipe.simulation.taxels`, slip on `tacpipe.simulation.proximity` as well;
 5. each device logs it on its own clock, with the faults of `tacpipe.simulation.faults`.
 

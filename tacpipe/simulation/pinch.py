@@ -1,6 +1,6 @@
 """A pinch: how hard two fingers press on what lies between them, and where and how widely each touches it.
 
-What a camera and a planned grasp tell is the `Situation`; what they do not is `Unseen`. Each finger presses as hard as
+What a camera and a planned grasp state is the `Situation`; what they do not is `Unseen`. Each finger presses as hard as
 the torque of its joints allows, the less the wider the hand is open, or, on soft objects, as the object resists:
 F = min(F_max, k s), with k = 2 E R of a flat punch as wide as the tip (K. L. Johnson, *Contact Mechanics*, Cambridge
 1985, section 3.8) and s by how much fingers close beyond touch. The two forces differ by what the table's friction and
@@ -26,7 +26,7 @@ SKIN_PA = 1.0e6  # modulus of its skin, an assumption
 FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # that the joints hold at the least and at the widest opening, by finger
 OPENING_M = (0.02, 0.12)
 SQUEEZE_M = (0.008, 0.012)  # by which fingers close beyond touch
-COMMON = 0.8  # share of the logarithm of the effort that both fingers have in common
+COMMON = 0.8  # fraction of the logarithm of the effort that both fingers have in common
 CENTRE_M = (
     (0.0038, 0.0),
     (-0.0013, 0.0),
@@ -38,7 +38,7 @@ SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's po
 
 @dataclass(frozen=True)
 class Situation:
-    """What geometry tells of a grasp; fingers are middle finger and thumb, axes along and around the finger."""
+    """What geometry reports on a grasp; fingers are middle finger and thumb, axes along and around the finger."""
 
     opening_m: float
     curvatures_1_m: Floats  # (finger, 2), principal ones of the object at the contact
@@ -69,7 +69,7 @@ class Touch:
 
 
 def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation:
-    """Return what geometry tells of a grasp whose wrist is known; the middle finger is at ``g1``, the thumb at ``g2``."""
+    """Return what geometry reports on a grasp whose wrist is known; the middle finger is at ``g1``, the thumb at ``g2``."""
     assert grasp.wrist is not None
     at_m = np.stack([grasp.g1_m, grasp.g2_m])
     normal, bending = placed.normal(at_m), placed.bending(at_m)

@@ -1,4 +1,4 @@
-"""How a pinch goes on: fingers move freely, close until the force is reached, hold it, and let go."""
+"""How a pinch continues: fingers move freely, close until the force is reached, hold it, and let go."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the h
 
 @dataclass(frozen=True)
 class Course:
-    """When readings arrive (time,), and which share of the full force fingers press with then (time,)."""
+    """When readings arrive (time,), and which fraction of the full force fingers press with then (time,)."""
 
     t_ns: NDArray[np.int64]
     fraction: NDArray[np.float64]

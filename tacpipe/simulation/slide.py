@@ -9,10 +9,10 @@ BioTac, as on the published rig:
 
 A slide of RoboSkin is 75 frames in contact, at a speed and over triangles that are not well controlled.
 
-Both sensors feel ``gain share [F (1 + mu d) + texture(x + xi) + offset]`` in each channel: xi is where the channel lies,
-``texture`` is what `tacpipe.simulation.texture` tells of the surface, and the offset is nuisance. It is in part one of
+Both sensors measure ``gain share [F (1 + mu d) + texture(x + xi) + offset]`` in each channel: xi is where the channel lies,
+``texture`` is what `tacpipe.simulation.texture` reports on the surface, and the offset is nuisance. It is in part one of
 the session, common to all trials of a material in it and drifting from trial to trial, as is a gain: where each
-material has one session, as in the published recordings, such a fingerprint tells the material without any texture.
+material has one session, as in the published recordings, such a fingerprint states the material without any texture.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SENSORS = ("biotac", "roboskin")
 SPECTRA = ("shared", "independent")
 START_NS = 1_581_000_000_000_000_000  # UTC stamp of the first trial's start
 TRIAL_NS = 60_000_000_000
-FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a share of it
+FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a fraction of it
 HOVER_S = (0.2, 0.4)  # before the finger touches
 APPROACH_M_S = 0.0005
 SLIDE_S, SHORT_SLIDE_S, SHORT_MATERIAL = 8.0, 6.0, 1  # one published material was recorded for less time
@@ -48,7 +48,7 @@ SESSION_GAIN, SESSION_N = 0.08, 0.07  # standard deviation between sessions: gai
 DRIFT_N, DRIFT_TRIALS = 0.04, 50  # by which an offset moves, over so many trials of a session
 TRIAL_N = 0.10  # standard deviation of each channel's offset from trial to trial
 ARM_HZ = 150.0
-ARM_GAP = 0.12  # share of the arm's readings after which the link is silent
+ARM_GAP = 0.12  # fraction of the arm's readings after which the link is silent
 ARM_GAP_S = 0.04
 SPEED_NOISE_M_S, SPIKE_M_S, SPIKES = 0.0006, 0.02, 0.01
 FORCE_NOISE_N, TORQUE_NOISE_NM = 0.15, 0.02
@@ -57,10 +57,11 @@ MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
 
 @dataclass(frozen=True)
 class Rig:
-    """Which materials are slid over, and how well the sensors tell; the fields are those of the stage's params.
+    """Which materials are slid over, and how well the sensors state; the fields are those of the stage's params.
 
-    Controls: with ``identical_materials`` nothing but the session tells one class from another, with ``session_scale=0``
-    nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in common.
+    Controls: with ``identical_materials`` nothing but the session distinguishes one class from another, with
+    ``session_scale=0`` nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in
+    common.
     """
 
     materials: int = 20
@@ -89,7 +90,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Scene:
-    """What truly happens in a trial when the sensor takes its samples; arrays are (time,) unless told otherwise."""
+    """What truly happens in a trial when the sensor takes its samples; arrays are (time,) unless stated otherwise."""
 
     place: Place
     of: texture.Material
@@ -112,7 +113,7 @@ def place(index: int, rig: Rig) -> Place:
 
 
 def material(seed: int, sensor: str, number: int, rig: Rig = Rig()) -> texture.Material:
-    """Return material ``number`` as ``sensor`` feels it: the same for both sensors where they share their spectra."""
+    """Return material ``number`` as ``sensor`` measures it: the same for both sensors where they share their spectra."""
     source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
     known = 0 if rig.identical_materials else number
     return texture.material(np.random.default_rng([seed, MATERIAL, source, known]))
@@ -156,7 +157,7 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
 
 
 def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
-    """Return what each channel feels in a trial (time, channel), counts without noise."""
+    """Return what each channel measures in a trial (time, channel), counts without noise."""
     gain, lean, along_m, aperture_m = sensitivity(scene)
     contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
     factor, offset_n = nuisance(seed, index, gain.shape[1], rig)

@@ -76,7 +76,7 @@ def test_time_that_runs_backwards_is_named_with_its_row(psc_trial: Trial) -> Non
 def test_what_is_no_rigid_transform_is_named_with_its_row(psc_trial: Trial, column: str, cell: str) -> None:
     folder = psc_trial()
     set_cell(folder / "robot_state.csv", 4, column, cell)
-    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 4: ee_T is no rigid transform"):
+    with pytest.raises(TacpipeError, match=r"robot_state\.csv, row 4: ee_T is not a rigid transform"):
         read(folder)
 
 

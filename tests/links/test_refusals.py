@@ -83,7 +83,7 @@ def test_what_the_network_answers_becomes_a_sentence(
 
 def test_what_is_no_websocket_is_told(rude_port: int) -> None:
     with pytest.raises(
-        DeviceError, match=rf"what answers at 127\.0\.0\.1 port {rude_port} is no websocket .+; check the port"
+        DeviceError, match=rf"what answers at 127\.0\.0\.1 port {rude_port} is not a websocket .+; check the port"
     ):
         made(f"ws:127.0.0.1:{rude_port}", Quiet())
 
@@ -122,10 +122,10 @@ def test_a_missing_adapter_of_slcan_is_told_as_any_serial_port() -> None:
 
 @pytest.mark.parametrize("address", ["can:can0", "can:socketcan:", "can:slcan:/dev/ttyACM0@fast", "can:pcan:1"])
 def test_a_can_address_that_is_none_is_refused(address: str) -> None:
-    with pytest.raises(UsageError, match="is no CAN bus; it should read can:KIND:CHANNEL"):
+    with pytest.raises(UsageError, match="is not a CAN bus; it should read can:KIND:CHANNEL"):
         made(address, Quiet())
 
 
 def test_an_unknown_kind_of_address_lists_all() -> None:
-    with pytest.raises(UsageError, match=r"'bluetooth:1' is no address of a device; .+ serial:/dev/ttyACM0"):
+    with pytest.raises(UsageError, match=r"'bluetooth:1' is not an address of a device; .+ serial:/dev/ttyACM0"):
         parse("bluetooth:1")

@@ -160,7 +160,7 @@ def test_a_port_without_the_right_to_it_says_how_to_get_it(terminal: tuple[int, 
 
 def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("none")
-    with pytest.raises(DeviceError, match=r"notes\.txt is no serial port; there "):
+    with pytest.raises(DeviceError, match=r"notes\.txt is not a serial port; there "):
         made(f"serial:{tmp_path / 'notes.txt'}", Quiet())
 
 

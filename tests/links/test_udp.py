@@ -112,7 +112,7 @@ def test_a_port_that_is_taken_names_its_holder(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_an_address_of_another_computer_cannot_be_listened_on() -> None:
-    with pytest.raises(DeviceError, match=r"192\.0\.2\.7 is no address of this computer; .+ udp::4010"):
+    with pytest.raises(DeviceError, match=r"192\.0\.2\.7 is not an address of this computer; .+ udp::4010"):
         made("udp:192.0.2.7:4010", Listened())
 
 

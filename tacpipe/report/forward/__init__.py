@@ -1,4 +1,4 @@
-"""The part of the page that tells of forecasts: how all compare, then single results in full."""
+"""The part of the page that reports on forecasts: how all compare, then single results in full."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from tacpipe.report.forward.overview import Overview
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-IN_FULL = 2  # results that are told in full where there are no more
+IN_FULL = 2  # results that are given in full where there are no more
 
 TITLE = "forecasts of tactile signals"
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset that is no result helps to tell of forecasts: those of ``tacpipe compress`` do."""
+    """Return whether a dataset that is not a result helps to report on forecasts: those of ``tacpipe compress`` do."""
     return sweep.FILE in dataset.files
 
 
 def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> str:
-    """Return what ``results`` of this task tell, with ``traces`` recordings of each drawn that is told in full.
+    """Return what ``results`` of this task state, with ``traces`` recordings of each drawn that is given in full.
 
-    Several results that can be compared are, and of more than two only a few are told in full. ``others`` are datasets
-    that `reads` takes: they tell of their codecs.
+    Several results that can be compared are, and of more than two only a few are given in full. ``others`` are datasets
+    that `reads` takes: they report on their codecs.
     """
     read = [methods.Run.read(one) for one in results if methods.comparable(one)]
     runs = [run for run in read if run.errors.recordings]  # others have nothing to compare

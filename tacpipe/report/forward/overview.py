@@ -1,4 +1,4 @@
-"""Many results beside each other: the part of the page that comes before single ones."""
+"""Many results next to each other: the part of the page that comes before single ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAPERS_SETS = ("xela-flat",)  # whose paper's tables and figures stand next to o
 
 
 class Overview:
-    """What the results of one page have in common, sorted for telling."""
+    """What the results of one page have in common, sorted for reporting."""
 
     def __init__(self, runs: Sequence[Run]) -> None:
         self.methods = by_method.grouped(runs)
@@ -150,7 +150,7 @@ def _basis(overview: Overview, simulated: bool) -> str:
         "The best of several methods was picked on these very recordings, which flatters it a little."
         if len(overview.methods) > 1
         else "",
-        "The recorded motion stands for the plan: errors of methods that read it hold for an arm that follows its plan "
+        "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows its plan "
         "perfectly."
         if any(method.actions == "planned" for method in overview.methods)
         else "",
@@ -167,7 +167,7 @@ def _representations(overview: Overview) -> str:
     text = (
         "Each row is in its own representation's space, scaled to ±1 on the training recordings. Rows of different spaces "
         "cannot be compared: a space that leaves out what is hard to predict has the lower error. Persistence in the same "
-        "space says what a row is worth: below 1 in the column beside it, the model is better."
+        "space states what a row is worth: below 1 in the column next to it, the model is better."
     )
     if overview.published:
         text += " The paper's own recordings are not public; its numbers are given as printed."
@@ -273,7 +273,7 @@ def _ablations(overview: Overview) -> str:
         tables.timelines(overview.methods, overview.steps, overview.parts),
     ]
     described = (
-        "Differences are paired: each resample draws the same recordings for both. An interval above 0 says that the "
+        "Differences are paired: each resample draws the same recordings for both. An interval above 0 states that the "
         "plan helps."
     )
     return f"<h3>Ablations</h3>{markup.note(described)}{''.join(found)}" if any(found) else ""

@@ -28,11 +28,11 @@ EXPLAINED = {
     "persistence": "nothing changes: the last frame is held",
     "codec_persistence": "the last frame is held after going through the codec",
     "codec": "the true future through the codec, which is what compression alone costs",
-    "model_anchored": "the model's forecast, moved so that it goes on from the last frame",
-    "codec_anchored": "the true future through the codec, moved so that it goes on from the last frame",
+    "model_anchored": "the model's forecast, moved so that it continues from the last frame",
+    "codec_anchored": "the true future through the codec, moved so that it continues from the last frame",
     "context_mean": "the mean of the frames the model reads",
     "train_mean": "the mean of the training recordings",
-    "damped_trend": "the last frames' trend goes on and fades",
+    "damped_trend": "the last frames' trend continues and fades",
     "last_value_linear": "a linear map of the frames the model reads, the last frame taken off them",
     "ridge": "ridge regression of the changes to come on those of the frames the model reads",
     "ridge_actions": "the same with the planned motion",
@@ -220,7 +220,7 @@ def _error_tables(metrics: Tree) -> str:
 
 
 def _objects(metrics: Tree) -> str:
-    """Return errors and skill on objects that the model was trained on beside those on others, where it is told."""
+    """Return errors and skill on objects that the model was trained on next to those on others, where it is given."""
     parts = {name: metrics[name] for name in ("known", "unseen") if "skill" in metrics.get(name, {})}
     if not parts:
         return ""

@@ -46,7 +46,7 @@ def series(codec: Tree) -> str:
 
 
 def losses(codecs: Sequence[Tree]) -> list[Loss]:
-    """Return what codecs lose by series and width, on held-out recordings if all tell of these, or else on the fit's."""
+    """Return what codecs lose by series and width, on held-out recordings if all report on these, or else on the fit's."""
     part = "val" if all("val" in one["reconstruction"] for one in codecs if one.get("reconstruction")) else "train"
     found: dict[tuple[str, int], list[Tree]] = {}
     for codec in codecs:

@@ -1,4 +1,4 @@
-"""The tables in which methods stand beside each other."""
+"""The tables in which methods are next to each other."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def channel_groups(chosen: Sequence[Row], steps: Sequence[int], known: bool | No
 
 
 def actions(methods: Sequence[Method], steps: Sequence[int], parts: Sequence[bool | None]) -> str:
-    """Return what the plan is worth: models that were told it, none, and a wrong one; empty where none was left out."""
+    """Return what the plan is worth: models that were given it, none, and a wrong one; empty where none was left out."""
     rows = []
     for family in _families(methods, "actions"):
         planned = next((one for one in family if one.actions == "planned"), None)
@@ -179,7 +179,7 @@ def timelines(methods: Sequence[Method], steps: Sequence[int], parts: Sequence[b
 
 
 def anticipation(methods: Sequence[Method]) -> str:
-    """Return how often and how early a method sees a change come; empty where no result tells."""
+    """Return how often and how early a method sees a change come; empty where no result states."""
     source = by_method.reference(methods)
     described = [(one.name, comparison.anticipation(one, MODEL)) for one in methods]
     names = sorted({name for run in source.runs for name in run.metrics.get("anticipation", {}) if name != MODEL})

@@ -1,7 +1,7 @@
 """How many slides a method names right, and how sure that is.
 
-Runs of a method are pooled. Where several runs, of other seeds or folds, were judged on the same slide, that slide counts
-once for the interval, with the share of runs that named it right: more runs do not make more slides.
+Runs of a method are pooled. Where several runs, of other seeds or folds, were evaluated on the same slide, that slide counts
+once for the interval, with the fraction of runs that named it right: more runs do not make more slides.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Floats = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Accuracy:
-    """The share of slides named right, pooled over runs."""
+    """The fraction of slides named right, pooled over runs."""
 
     correct: int  # verdicts of all runs added
     evaluated: int
@@ -37,14 +37,14 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Verdicts:
-    """The share of runs that named each slide right."""
+    """The fraction of runs that named each slide right."""
 
     recordings: tuple[str, ...]
     fraction: Floats  # (slide,)
 
 
 def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accuracy | None:
-    """Return how many slides of a sensor a predictor of these runs names right; None where none says anything."""
+    """Return how many slides of a sensor a predictor of these runs names right; None where none states anything."""
     each = [right for run in runs if (right := named_right(run, sensor, predictor))]
     if not each:
         return None
@@ -59,14 +59,14 @@ def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accura
 
 
 def verdicts(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Verdicts:
-    """Return the share of runs that named each slide of a sensor right, in the order of names."""
+    """Return the fraction of runs that named each slide of a sensor right, in the order of names."""
     return _pooled([right for run in runs if (right := named_right(run, sensor, predictor))])
 
 
 def skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> float:
     """Return 1 - errors / errors of the mean level, of runs that hold both; NaN where the mean level never errs.
 
-    1 is perfect, 0 no better than what the time-averaged channels tell.
+    1 is perfect, 0 no better than what the time-averaged channels state.
     """
     held = [run for run in runs if LEVEL in run.predictions.predicted and predictor in run.predictions.predicted]
     found, level = (accuracy(held, sensor, name) for name in (predictor, LEVEL))

@@ -14,7 +14,7 @@ from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import MODEL, NOTHING
 
 MOST_PAIRS = 3  # pairs of materials in words
-NOTE = "Blue: named right; orange: wrong, with how often. The stronger, the larger the share of a material's slides."
+NOTE = "Blue: named right; orange: wrong, with how often. The stronger, the larger the fraction of a material's slides."
 
 
 def section(methods: Sequence[Method]) -> str:

@@ -42,7 +42,7 @@ def convergence(methods: Sequence[Method]) -> str:
 
 
 def alignment(methods: Sequence[Method]) -> str:
-    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; empty where none is told."""
+    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; empty where none is given."""
     chosen = [one for one in methods if (one.plain or comparison.control(one)) and one.settings["joint"]]
     curves = {one.name: [curve for run in one.runs if (curve := aligned(run))] for one in chosen}
     held = {name: found for name, found in curves.items() if found}
@@ -57,7 +57,7 @@ def alignment(methods: Sequence[Method]) -> str:
 
 
 def aligned(run: Run) -> list[float]:
-    """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not tell it."""
+    """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not state it."""
     described = [line.get("alignment") for line in run.history]
     return (
         [float("nan") if one is None else float(one) for one in described]
@@ -98,7 +98,7 @@ def few_slides(methods: Sequence[Method]) -> str:
 
 
 def _add(points: dict[str, _Points], line: str, method: Method, sensor: str) -> None:
-    """Add what a method says to a line."""
+    """Add what a method states to a line."""
     found = accuracy(method.of(sensor), sensor)
     if found is None:
         return
@@ -108,7 +108,7 @@ def _add(points: dict[str, _Points], line: str, method: Method, sensor: str) -> 
 
 
 def _validation(run: Run, sensor: str) -> list[float]:
-    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is told."""
+    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is given."""
     described = [line.get("val", {}).get(sensor, {}).get("accuracy") for line in run.history]
     return (
         [float("nan") if one is None else 100 * one for one in described]

@@ -76,7 +76,7 @@ def confusion(counts: Integers, materials: Sequence[int], title: str) -> str:
             if not count:
                 continue
             right = row == column
-            # the square root shows a single mistake beside many right ones
+            # the square root shows a single mistake next to many right ones
             strength = round(float(np.sqrt(count / totals[row])) * (0.75 if right else 0.85), 2)
             colour = COLOURS["model" if right else "persistence"]
             place = (column - 0.5, row - 0.5)

@@ -32,7 +32,7 @@ def headlines(methods: Sequence[Method]) -> list[Headline]:
 
 
 def sentences(methods: Sequence[Method]) -> list[tuple[str, str]]:
-    """Return the best method of each sensor with its verdict, what joint learning does, and what controls say.
+    """Return the best method of each sensor with its verdict, what joint learning does, and what controls state.
 
     Only the first are about baselines, so the others have no verdict.
     """
@@ -51,16 +51,14 @@ def sentences(methods: Sequence[Method]) -> list[tuple[str, str]]:
 
 
 def control(joint: Method, controls: Sequence[Method]) -> str:
-    """Return what training on pairs of permuted materials says of the alignment of real ones, as far as there is one."""
+    """Return what training on pairs of permuted materials states of the alignment of real ones, as far as there is one."""
     permuted = comparison.nearest(joint, controls)
     if permuted is None:
         return NO_CONTROL
     apart = [_last_alignment(one) for one in (joint, permuted)]
     swaps = [_swapped(one) for one in (joint, permuted)]
     if any(math.isnan(one) for one in apart) or not swaps[0] or set(swaps[0]) - set(swaps[1]):
-        return (
-            "A run with permuted materials is there, but no latent difference or exchanged classifier to judge it by."
-        )
+        return "A run with permuted materials is there, but no latent difference or exchanged classifier to evaluate it by."
     costs = [
         {
             name: found.fraction - swaps[at][name].fraction

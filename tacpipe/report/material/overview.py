@@ -1,4 +1,4 @@
-"""All results of the task beside each other, in the order in which they are told."""
+"""All results of the task next to each other, in the order in which they are given."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 PAIRED = (
-    "A slide that several runs judged counts as the share of runs that named it right; the interval is from drawing slides "
-    "anew. McNemar's test takes a slide for right where at least half of the runs are; the t test pairs accuracies of the "
-    "same fold. "
+    "A slide that several runs evaluated counts as the fraction of runs that named it right; the interval is from "
+    "drawing slides anew. McNemar's test takes a slide for right where at least half of the runs are; the t test "
+    "pairs accuracies of the same fold. "
 )
 
 
 def render(methods: Sequence[Method], slides: Sequence[Dataset]) -> str:
-    """Return the part of the page that tells of the task ``material``."""
+    """Return the part of the page that reports on the task ``material``."""
     plain = [one for one in methods if one.plain]
     simulated = any(one.simulated for one in methods)
     badge = ' <span class="badge">simulated</span>' if simulated else ""
@@ -77,7 +77,7 @@ def _pooled(methods: Sequence[Method]) -> str:
     described = [
         "Accuracy ± standard deviation over runs; in small print, slides named right of all that runs of the method were "
         "evaluated on, then the 95 % interval (Wilson) over slides, each counted once however many runs named it.",
-        "Networks have the weights that did best in validation, unless the name says otherwise."
+        "Networks have the weights that did best in validation, unless the name states otherwise."
         if any(run.history for run in runs)
         else "",
         f"Last epoch is what the weights of the last one do{', which the paper’s code reports' if published else ''}."

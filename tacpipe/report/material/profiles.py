@@ -20,7 +20,7 @@ SLIDE, PROFILE = "slide", "profile"
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset holds slides."""
+    """Return whether a dataset holds slides."""
     return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.shards.values())
 
 

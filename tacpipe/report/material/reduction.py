@@ -19,7 +19,7 @@ JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 def tables(methods: Sequence[Method]) -> str:
     """Return a table a reduced sensor, in the paper's form; empty where no sensor was reduced or other data are shown.
 
-    A sensor is reduced where it learns from a share of the batches, as in the paper, or where a split gave it fewer
+    A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
     """
     chosen = [one for one in methods if one.differs_only("reduce", "few")]
@@ -61,6 +61,6 @@ def _cell(methods: Sequence[Method], sensor: str) -> str:
 
 
 def _as_many(method: Method, slides: int, sensor: str) -> bool:
-    """Say whether a method learned from about so many slides of a sensor."""
+    """Return whether a method learned from about so many slides of a sensor."""
     described = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
     return bool(described) and SAME < max(described) / slides < 1 / SAME

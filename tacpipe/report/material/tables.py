@@ -1,4 +1,4 @@
-"""The tables in which methods stand beside each other."""
+"""The tables in which methods are next to each other."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def every_run(methods: Sequence[Method]) -> str:
 
 
 def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
-    """Return the sensors that any of some methods was judged on."""
+    """Return the sensors that any of some methods was evaluated on."""
     return ordered({sensor for method in methods for sensor in method.sensors})
 
 
@@ -171,7 +171,7 @@ def leader(methods: Sequence[Method], sensor: str) -> Method | None:
 
 
 def reference(methods: Sequence[Method]) -> Method:
-    """Return the method whose runs tell of the baselines, which are nearly the same for all of a split.
+    """Return the method whose runs report on the baselines, which are nearly the same for all of a split.
 
     It has most baselines, and if it can be it is the one whose shuffled labels went through the strongest readout.
     """
@@ -184,7 +184,7 @@ def reference(methods: Sequence[Method]) -> Method:
 
 
 def _row(method: Method, sensors: Sequence[str], kind: str, parts: Sequence[str]) -> list[str]:
-    """Return what the table of accuracies says of a method, a cell a sensor and part."""
+    """Return what the table of accuracies states of a method, a cell a sensor and part."""
     cells = []
     for sensor in sensors:
         runs = method.of(sensor)

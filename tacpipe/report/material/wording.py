@@ -1,4 +1,4 @@
-"""How numbers of this task are written: percentages, points, p values, and what must be said beside an accuracy."""
+"""How numbers of this task are written: percentages, points, p values, and what must be stated next to an accuracy."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from tacpipe.report.material.accuracy import Accuracy
 from tacpipe.report.material.methods import Method
 
 SESSIONS = (
-    "Each material was recorded in one session, so texture cannot be told apart from session in these data: a model that "
+    "Each material was recorded in one session, so texture cannot be distinguished from session in these data: a model that "
     "recognises a session by its drift or its mean level is right as well."
 )
 SIMULATED = "These slides were simulated: nothing here is evidence about a real sensor."
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these slides cannot show, beside every table of accuracies; empty where nothing is known against them."""
+    """Return what these slides cannot show, next to every table of accuracies; empty where nothing is known against them."""
     if any(one.simulated for one in methods):
         return SIMULATED
     runs = [run for one in methods for run in one.runs]

@@ -30,7 +30,7 @@ class Untold:
     kind: str
     main: bool  # whether nothing else sets them apart
     sensor: str
-    trees: tuple[Tree, ...]  # what metrics tell of the held-out materials, one a run
+    trees: tuple[Tree, ...]  # what metrics report on the held-out materials, one a run
     materials: int  # that a run held out
 
 
@@ -59,7 +59,7 @@ def sentences(methods: Sequence[Method]) -> list[str]:
         if not evaluated or not one.main:
             continue
         chance = _at(one.trees[0], "chance", one.sensor)
-        unsure = "which cannot be told from chance"
+        unsure = "which cannot be distinguished from chance"
         word = "above chance" if low > chance else "below chance" if high < chance else unsure
         described.append(
             f"Of {shown(one.sensor)} slides of materials that it never learned, the other sensor's classifier names "
@@ -111,7 +111,7 @@ def _held_out(method: Method, sensor: str) -> int:
 
 
 def _cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str]:
-    """Return what runs say of the held-out materials of one sensor."""
+    """Return what runs state of the held-out materials of one sensor."""
     correct, evaluated, low, high = _counts(trees, sensor, materials)
     if not evaluated:
         return [NONE, NONE, str(len(trees))]
@@ -124,6 +124,6 @@ def _cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str]:
 
 
 def _at(tree: Tree, name: str, sensor: str) -> float:
-    """Return a number of a result, told for all sensors or by sensor."""
+    """Return a number of a result, stated for all sensors or by sensor."""
     value = tree.get(name, float("nan"))
     return float(value[sensor] if isinstance(value, Mapping) else value)

@@ -1,4 +1,4 @@
-"""Clouds with the grasps made on them, drawn where a dataset of grasps is given beside results."""
+"""Clouds with the grasps made on them, drawn where a dataset of grasps is given next to results."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SHOWN = 3
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset holds clouds with grasps."""
+    """Return whether a dataset holds clouds with grasps."""
     return any(_whole(shard) for shard in dataset.shards.values())
 
 
 def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
-    """Return the clouds of ``chosen`` grasps, told with the words beside their names; empty without any dataset.
+    """Return the clouds of ``chosen`` grasps, stated with the words next to their names; empty without any dataset.
 
     Where none of them is there, the first grasps are drawn.
     """

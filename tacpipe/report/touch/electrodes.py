@@ -1,4 +1,4 @@
-"""Which electrodes are foretold, and how true readings lie beside predicted ones on the fingertips."""
+"""Which electrodes are predicted, and how true readings lie next to predicted ones on the fingertips."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Chosen:
     place: str
     row: int  # among the grasps that were chosen from
     recording: str
-    error: float  # RMSE over the electrodes of both fingers, share of the range
+    error: float  # RMSE over the electrodes of both fingers, fraction of the range
 
 
 def section(method: Method) -> str:
-    """Return the electrodes' R² and some grasps; empty where the method foretells no electrodes."""
+    """Return the electrodes' R² and some grasps; empty where the method predicts no electrodes."""
     fingers = [target for target in FINGERS if target in method.targets]
     if not fingers:
         return ""
@@ -83,7 +83,7 @@ def _explained(method: Method, fingers: Sequence[str], known: bool) -> str:
 
 
 def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> str:
-    """Return true beside predicted electrodes of one grasp."""
+    """Return true next to predicted electrodes of one grasp."""
     tips, errors = [], []
     for target in fingers:
         finger = wording.FINGERS[target]
@@ -100,4 +100,4 @@ def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> str:
         f"{one.place.capitalize()} by error: {one.recording}, {rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of "
         f"the range; {', '.join(errors)}."
     )
-    return markup.figure(fingertip.draw(tips, f"True beside predicted electrodes of {one.recording}"), caption)
+    return markup.figure(fingertip.draw(tips, f"True next to predicted electrodes of {one.recording}"), caption)

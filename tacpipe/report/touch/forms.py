@@ -51,7 +51,7 @@ FORMS = (
     ),
     Form(
         "Figure 9",
-        "what the network is told",
+        "what the network is given",
         "inputs",
         {
             "xyz": "XYZ",
@@ -87,7 +87,7 @@ ORDER = (
 
 ESTIMATED = (
     "How the wrist was turned was not recorded: where it is read here, it is estimated from the two contacts and the "
-    "line of sight, and tells nothing that these do not."
+    "line of sight, and states nothing that these do not."
 )
 
 
@@ -101,7 +101,7 @@ def section(methods: Sequence[Method]) -> str:
 def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
     """Return the methods of a table by their setting: of the paper's network, alike but for it.
 
-    Of several such families the one with most rows is told, then that with most runs.
+    Of several such families the one with most rows is given, then that with most runs.
     """
     alike: dict[str, dict[object, Method]] = {}
     for method in methods:
@@ -155,5 +155,5 @@ def _printed(form: Form, value: object) -> list[str]:
 def _figure(form: Form, described: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> str:
     errors = {form.names[value]: one.each for value, one in described.items() if one}
     levels = {name: one.each.mean for name, one in baselines.items() if one}
-    svg = figures.settings(errors, levels, "Error by what the network is told")
+    svg = figures.settings(errors, levels, "Error by what the network is given")
     return markup.figure(svg, "Mean and standard deviation over runs; lines are baselines on the same grasps.")

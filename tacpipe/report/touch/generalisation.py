@@ -1,4 +1,4 @@
-"""Figures 10 and 11 of the paper: errors on known objects beside those on novel ones, of each target."""
+"""Figures 10 and 11 of the paper: errors on known objects next to those on novel ones, of each target."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PARTS = ("RMSE over runs", "R²", "skill")
 
 
 def section(methods: Sequence[Method]) -> str:
-    """Return the table of the paper's network and that of the default method, where they foretold two targets or more."""
+    """Return the table of the paper's network and that of the default method, where they predicted two targets or more."""
     described = []
     for architecture in (PAPERS, DEFAULT):
         pairs = _pairs([one for one in methods if one.architecture == architecture])
@@ -24,7 +24,7 @@ def section(methods: Sequence[Method]) -> str:
 
 
 def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
-    """Return pairs of methods, one judged on known objects and one on novel ones, that are the same or differ in split.
+    """Return pairs of methods, one evaluated on known objects and one on novel ones, that are the same or differ in split.
 
     The paper trains anew, on all grasps of known objects, for novel ones.
     """
@@ -33,7 +33,7 @@ def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
 
 
 def _weight(pair: tuple[Method, Method]) -> tuple[int, int, bool]:
-    """Return how much a pair tells: targets, then runs; of two that tell as much, one method on both."""
+    """Return how much a pair states: targets, then runs; of two that state as much, one method on both."""
     known, novel = pair
     common = set(_targets(known, True)) & set(_targets(novel, False))
     return len(common), len(known.runs) + len(novel.runs), known is novel

@@ -1,4 +1,5 @@
-"""All that the page tells of touch: what came out, tables by split, the paper's forms, then what single grasps look like."""
+"""All that the page reports on touch: what came out, tables by split, the paper's forms, then what single grasps look
+like."""
 
 from __future__ import annotations
 
@@ -16,18 +17,19 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 BADGE = ' <span class="badge">simulated</span>'
-MIXED = " What is marked simulated is no evidence about a real sensor."
+MIXED = " What is marked simulated is not evidence about a real sensor."
 POOLED = (
     "PDC is the pressure of the fluid in a fingertip. RMSE is global, over all grasps and electrodes of all runs of a "
-    "method, as a share of the target's fixed range and in device counts; over runs it is mean ± standard deviation; batch "
-    "mean is the mean RMSE of batches of 10. Skill is 1 − RMSE / RMSE of the constant on the same grasps, with "
-    "the 95 % interval from drawing grasps anew (known objects) or objects (novel ones). R² is about the mean of the judged "
-    "grasps, so a constant lies at 0 or below. A novel object has no mean of its own: the constant stands for it. "
+    "method, as a fraction of the target's fixed range and in device counts; over runs it is mean ± standard "
+    "deviation; batch mean is the mean RMSE of batches of 10. Skill is 1 − RMSE / RMSE of the constant on the same "
+    "grasps, with the 95 % interval from drawing grasps anew (known objects) or objects (novel ones). R² is about the "
+    "mean of the evaluated grasps, so a constant lies at 0 or below. A novel object has no mean of its own: the "
+    "constant represents it. "
 )
 
 
 def render(methods: Sequence[Method], grasps: Sequence[Dataset]) -> str:
-    """Return the part of the page that tells of the task ``touch``."""
+    """Return the part of the page that reports on the task ``touch``."""
     parted = by_method.groups(methods)
     simulated = all(one.simulated for one in methods)
     badge = BADGE if simulated else ""

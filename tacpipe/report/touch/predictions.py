@@ -1,4 +1,4 @@
-"""What a result's model and baselines foretold of each grasp that the model has not seen."""
+"""What a result's model and baselines predicted of each grasp that the model has not seen."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
 
-UNNAMED = "unnamed"  # an object of which no recording tells the name
+UNNAMED = "unnamed"  # an object of which no recording states the name
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Predictions:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What the model foretells, in the order of tables."""
+        """What the model predicts, in the order of tables."""
         return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
     def of(self, known: bool | None) -> Predictions:
@@ -52,7 +52,7 @@ class Predictions:
         return self if known is None else self.rows(self.known == known)
 
     def rows(self, chosen: NDArray[Any]) -> Predictions:
-        """Return some rows, told by a mask (grasp,) or by their numbers."""
+        """Return some rows, stated by a mask (grasp,) or by their numbers."""
         predicted = {
             name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.predicted.items()
         }
@@ -62,7 +62,7 @@ class Predictions:
 
 
 def read(shard: Recording) -> Predictions:
-    """Return what the recording ``predictions`` of a result says of grasps that its model has not seen."""
+    """Return what the recording ``predictions`` of a result states of grasps that its model has not seen."""
     grasps = shard.table(GRASPS)
     others = {name: _touch(shard.table(name)) for name in shard.streams if name != GRASPS}
     found = Predictions(

@@ -15,7 +15,7 @@ SHOWN = 800  # grasps of a figure
 
 
 def section(method: Method) -> str:
-    """Return a figure a finger, of the first run; empty where the method foretells no pressure."""
+    """Return a figure a finger, of the first run; empty where the method predicts no pressure."""
     drawn = [_figure(method, target) for target in PRESSURES if target in method.runs[0].predictions.targets]
     return f'<div class="pair">{"".join(drawn)}</div>' if drawn else ""
 

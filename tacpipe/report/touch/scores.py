@@ -23,7 +23,7 @@ Floats = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Score:
-    """What one predictor does on one target; errors are shares of the target's range (`biotac_sp.RANGES`)."""
+    """What one predictor does on one target; errors are fractions of the target's range (`biotac_sp.RANGES`)."""
 
     target: str
     rmse: float  # global, over the grasps of all runs
@@ -43,7 +43,7 @@ class Score:
 
 
 def in_counts(target: str, fraction: float) -> float:
-    """Return a share of a target's range in device counts.
+    """Return a fraction of a target's range in device counts.
 
     >>> in_counts("pdc_th", 0.1)
     90.0
@@ -53,7 +53,7 @@ def in_counts(target: str, fraction: float) -> float:
 
 
 class _Rows(NamedTuple):
-    """What a run tells of a target."""
+    """What a run reports on a target."""
 
     true: Floats  # (grasp, value), normalised
     predicted: Floats  # (grasp, value)
@@ -63,9 +63,9 @@ class _Rows(NamedTuple):
 
 
 def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str = MODEL) -> Score | None:
-    """Return how a predictor of some runs does on known or on novel objects, or on all; None where it says nothing.
+    """Return how a predictor of some runs does on known or on novel objects, or on all; None where it states nothing.
 
-    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs said of each,
+    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs stated of each,
     where objects are known, and else from drawing objects: what is asked then is how the next object would fare.
     """
     parts = _rows(runs, target, known, predictor)
@@ -87,7 +87,7 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
 
 
 def headline(method: Method, target: str, known: bool | None) -> Headline | None:
-    """Return how a method compares with its baselines on a target; None where it says nothing of it."""
+    """Return how a method compares with its baselines on a target; None where it states nothing of it."""
     errors: dict[str, dict[tuple[object, str], tuple[float, int]]] = {}
     objects: dict[str, str] = {}
     for run in method.runs:
@@ -105,13 +105,13 @@ def headline(method: Method, target: str, known: bool | None) -> Headline | None
 
 
 def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:
-    """Return the method whose runs tell of a baseline: that with most runs which hold it; None where none does."""
+    """Return the method whose runs report on a baseline: that with most runs which hold it; None where none does."""
     held = [one for one in methods if any(target in run.predictions.predicted.get(predictor, ()) for run in one.runs)]
     return max(held, key=lambda one: len(one.runs), default=None)
 
 
 def baselines(methods: Sequence[Method]) -> list[str]:
-    """Return the predictors that are no model's own, in the order of their names."""
+    """Return the predictors that are not a model's own, in the order of their names."""
     return sorted({name for one in methods for run in one.runs for name in run.predictions.predicted if name != MODEL})
 
 
@@ -122,19 +122,19 @@ def best(methods: Sequence[Method], target: str, known: bool | None) -> Method |
 
 
 def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> Floats | None:
-    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is said of the target."""
+    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
     parts = _rows(runs, target, known, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
 
 
 def of_object(runs: Sequence[Run], name: str) -> list[Run]:
-    """Return runs as if they had been judged on the grasps of one object alone."""
+    """Return runs as if they had been evaluated on the grasps of one object alone."""
     described = [(run, run.predictions) for run in runs]
     return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in described]
 
 
 def _rows(runs: Sequence[Run], target: str, known: bool | None, predictor: str) -> list[_Rows]:
-    """Return what each run tells that holds the target, the predictor and such objects."""
+    """Return what each run states that holds the target, the predictor and such objects."""
     found = []
     for rows in (run.predictions.of(known) for run in runs):
         predicted = rows.predicted.get(predictor, {})

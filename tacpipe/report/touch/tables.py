@@ -1,4 +1,4 @@
-"""The tables in which methods and baselines stand beside each other, of one way to part grasps."""
+"""The tables in which methods and baselines are next to each other, of one way to part grasps."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # of a ta
 
 
 def errors(group: Group, known: bool) -> str:
-    """Return a table a target with every method and baseline on known or on novel objects; empty where none was judged."""
+    """Return a table a target with every method and baseline on known or on novel objects; empty where none was
+    evaluated."""
     return "".join(_errors(group, target, known) for target in wording.TARGETS)
 
 
 def by_object(group: Group) -> str:
-    """Return errors and skill by object of one method an architecture; empty where no object was judged."""
+    """Return errors and skill by object of one method an architecture; empty where no object was evaluated."""
     return "".join(_by_object(group, method) for method in group.main)
 
 
@@ -51,14 +52,14 @@ def every_run(methods: Sequence[Method]) -> str:
                 cells = [cell for one in described for cell in _short(one)]
                 rows.append([*about, wording.OBJECTS[known], f"{counted:,}", *cells, str(len(run.history) or NONE)])
     parts = [f"{name} {part}" for name in wording.TARGETS.values() for part in ("RMSE", "R²")]
-    heads = ["", "split", "seed", "trained on", "judged on", "grasps", *parts, "epochs"]
+    heads = ["", "split", "seed", "trained on", "evaluated on", "grasps", *parts, "epochs"]
     runs = sum(len(one.runs) for one in methods)
     runs_text = f"All {runs} runs" if runs > 1 else "The run"
     return f"<details><summary>{runs_text}</summary>{markup.table('Each run', heads, rows)}</details>"
 
 
 def cells(found: Score | None) -> list[str]:
-    """Return what a table in the paper's form says of a score, as `ROWS` names it."""
+    """Return what a table in the paper's form states of a score, as `ROWS` names it."""
     if found is None:
         return [NONE] * len(ROWS)
     error = markup.with_sd(found.each.mean, found.each.sd)

@@ -1,4 +1,4 @@
-"""How numbers and names of this task are written, and what must be said beside an error."""
+"""How numbers and names of this task are written, and what must be stated next to an error."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
 SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor."
 RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
-    "were recorded as well: the mean of the grasps nearest in time, whatever their object, says how much."
+    "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
 )
 IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by turns
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these grasps cannot show, beside every table of errors; empty where nothing is known against them."""
+    """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
     if methods and all(one.simulated for one in methods):
         return SIMULATED
     found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.runs]
@@ -53,7 +53,7 @@ def form(what: str, text: str, published: bool) -> str:
 
 
 def baseline(predictor: str) -> str:
-    """Return what a table calls a predictor that is no model's own.
+    """Return what a table calls a predictor that is not a model's own.
 
     >>> baseline("object_mean"), baseline("nearest_neighbours")
     ('mean of the object', 'nearest neighbours')
@@ -77,7 +77,7 @@ def skill_within(found: Score) -> str:
 
 
 def percentage(value: float) -> str:
-    """Return an error as a share of a range.
+    """Return an error as a fraction of a range.
 
     >>> percentage(0.05496), percentage(float("nan"))
     ('0.0550', '–')
@@ -106,7 +106,7 @@ def signed_short(value: float) -> str:
 
 
 def split(described: str) -> str:
-    """Return how grasps were parted, where somebody said so."""
+    """Return how grasps were parted, where somebody stated so."""
     return described.replace("-", " ").replace("_", " ") or "one split"
 
 

@@ -57,7 +57,7 @@ class Faults:
 
 
 def parse(text: str) -> Faults:
-    """Return the faults that a command line names. Raises `UsageError` for an unknown one and for what is no number.
+    """Return the faults that a command line names. Raises `UsageError` for an unknown one and for what is not a number.
 
     >>> parse("noise=0.5,drop=0.01").drop
     0.01
@@ -68,7 +68,7 @@ def parse(text: str) -> Faults:
         try:
             values[name.strip()] = float(value)
         except ValueError:
-            raise UsageError(f"--faults: {part!r} is no fault; each reads like noise=0.5, with a number.") from None
+            raise UsageError(f"--faults: {part!r} is not a fault; each reads like noise=0.5, with a number.") from None
     found: Faults = params.filled(Faults, values, "--faults", "fault")
     return found
 
@@ -84,7 +84,7 @@ class Item(NamedTuple):
 
 
 class Harm:
-    """Does to the frames of one stream what its faults say."""
+    """Does to the frames of one stream what its faults state."""
 
     def __init__(self, faults: Faults, sensor: Sensor, seed: Sequence[int], *, packets: bool) -> None:
         self.faults, self.sensor, self.packets = faults, sensor, packets

@@ -2,7 +2,7 @@
 
 Hosts run as ``UMOCKDEV_DIR=… umockdev-wrapper PROGRAM``; the folder stands in FOLDER/hid/root. All devices of an emulator
 are in one folder. A report is written at once, but two that a slow host left lying come as one, and an unplugged device
-falls silent without its host being told: the mock has neither the kernel's queue nor its hang-up.
+falls silent without its host being informed: the mock has neither the kernel's queue nor its hang-up.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SIX_AXES = (  # six 16-bit axes in report 1, three in report 2, 32 buttons in re
     "0501 0908 a101 a100 8501 16a2fe 265e01 7510 9506 0930 0931 0932 0933 0934 0935 8102 c0 "
     "a100 8502 16a2fe 265e01 7510 9503 0933 0934 0935 8102 c0 a102 8503 0509 1901 2920 1500 2501 7501 9520 8102 c0 c0"
 )
-DESCRIPTORS = {"256f:c635": SIX_AXES}  # of devices that are no raw HID
+DESCRIPTORS = {"256f:c635": SIX_AXES}  # of devices that are not a raw HID
 _servers: dict[Path, Server] = {}
 
 
@@ -56,7 +56,7 @@ class Server:
         self._pending = b""
 
     def line(self) -> bytes:
-        """Return the next line that the server says, waiting for it."""
+        """Return the next line that the server states, waiting for it."""
         assert self.process.stdout is not None
         found = b""
         while not found.endswith(b"\n"):
@@ -91,7 +91,7 @@ class Server:
 
 
 class Host:
-    """Whoever has the device open; the mock does not tell."""
+    """Whoever has the device open; the mock does not state."""
 
     fault = byte_faults.SOUND
 
@@ -126,7 +126,7 @@ class Hid:
         self.peers = [Host(self)]
 
     def descriptors(self) -> list[int]:
-        """Return where the server tells what hosts wrote, of the first device alone."""
+        """Return where the server states what hosts wrote, of the first device alone."""
         assert self.server.process.stdout is not None
         return [self.server.process.stdout.fileno()] if self.number == 0 else []
 

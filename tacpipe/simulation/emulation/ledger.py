@@ -35,7 +35,7 @@ class Entry:
     size: int  # bytes that went out
     cause: str
     invisible: bool  # harmed, and still takes the protocol's own test for a frame
-    source: int  # number of the source: a device that is told another rate begins a new one
+    source: int  # number of the source: a device that is given another rate begins a new one
 
 
 class Ledger:
@@ -104,7 +104,7 @@ class Ledger:
     def samples(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> Samples:
         """Return what a perfect link would give of entries, made once more from the source; by default of all `whole` ones.
 
-        Values are those that were encoded, as far as the protocol can hold them; ``rows`` tells of which entry each is.
+        Values are those that were encoded, as far as the protocol can hold them; ``rows`` reports on which entry each is.
         """
         rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
         sensor = self.sources[-1].sensor

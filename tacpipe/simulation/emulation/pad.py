@@ -1,4 +1,4 @@
-"""What a pad of taxels feels that is no uSkin: the contact's force, shared out over a grid of any number of taxels."""
+"""What a pad of taxels measures that is not a uSkin: the contact's force, shared out over a grid of any number of taxels."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def pressed(world: World, finger: int, t_ns: Times, taxels: int) -> Floats:
 
 
 def peak_fraction(taxels: int) -> float:
-    """Return the share of the force that the taxel under its centre bears, of so many."""
+    """Return the fraction of the force that the taxel under its centre bears, of so many."""
     distance2 = (places(taxels) ** 2).sum(axis=1)
     weight = np.exp((distance2.min() - distance2) / (2 * SIGMA_M**2))
     return float(weight.max() / weight.sum())

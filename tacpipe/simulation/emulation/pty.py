@@ -22,7 +22,7 @@ from tacpipe.simulation.emulation import byte_faults, uart
 from tacpipe.simulation.emulation.endpoint import stretched
 
 TERMIOS2, SPEED_AT = 44, 40  # bytes of struct termios2 of <asm-generic/termbits.h>, and where its output speed stands
-TCGETS2 = 0x802C542A  # likewise; tells speeds that have no name, too
+TCGETS2 = 0x802C542A  # likewise; states speeds that have no name, too
 MOST_READ = 4096
 
 
@@ -68,7 +68,7 @@ class Pty:
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         name = os.ttyname(slave)
-        os.close(slave)  # from now on the master tells whether anybody has it open
+        os.close(slave)  # from now on the master states whether anybody has it open
         draft.unlink(missing_ok=True)
         draft.symlink_to(name)
         draft.replace(self.link)
@@ -139,7 +139,7 @@ class Pty:
         return piece
 
     def understood(self, data: bytes) -> list[bytes]:
-        """Return what the host's bytes tell the device."""
+        """Return what the host's bytes state the device."""
         return [data]
 
 

@@ -39,7 +39,7 @@ FULL = {  # what a device of counts is made for, SI
     "deflection": 10.0, "external_torque": 90.0,
 }  # fmt: skip
 SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities of one taxel among others
-NOISE = 0.002  # standard deviation as a share of what a device is made for
+NOISE = 0.002  # standard deviation as a fraction of what a device is made for
 SILENT = ("time", "status", "sequence", "label", "mask", "orientation", "mass", "friction")  # quantities without noise
 
 

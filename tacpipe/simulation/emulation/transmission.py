@@ -1,4 +1,5 @@
-"""One stream of an emulated rig as it goes out: samples planned ahead, harmed as the faults say, sent when they are due."""
+"""One stream of an emulated rig as it goes out: samples planned ahead, harmed as the faults state, sent when they are
+due."""
 
 from __future__ import annotations
 

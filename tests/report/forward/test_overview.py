@@ -197,6 +197,6 @@ def test_without_unseen_objects_only_known_ones_are_told() -> None:
 
 def test_figures_5_and_6_are_drawn_from_the_papers_representations() -> None:
     html = overview.render(over(result("PCA-20"), result("AE-C1-8"), result("raw")), [], simulated=False)
-    assert html.count("Predictions beside the truth") == 2
+    assert html.count("Predictions next to the truth") == 2
     figure_6 = html[html.index("Figure 5 in the paper") :]
     assert ">z01<" in figure_6 and ">z03<" in figure_6 and ">z00<" not in figure_6
