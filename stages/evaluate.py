@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to choose: how a model is judged is not up to who trained it."""
+    """Nothing to choose: how a model is evaluated is not up to who trained it."""
 
 
 @stage(version=3, headline=headline.FILE)

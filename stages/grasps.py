@@ -19,7 +19,7 @@ FINISHED = ("cloud", "grasp")
 
 @dataclass(frozen=True)
 class Params:
-    """What counts as the grasped object in a view of a camera, and as contact in what two BioTac SP felt.
+    """What counts as the grasped object in a view of a camera, and as contact in what two BioTac SP measured.
 
     Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
     """
@@ -34,7 +34,7 @@ class Params:
     object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
     # millimetres that the object may be from the line between the fingers, or from its sight
     near_mm: PositiveFloat = 20.0
-    outlier_neighbours: PositiveInt = 20  # points whose mean distance tells a stray one at the object's rim
+    outlier_neighbours: PositiveInt = 20  # points whose mean distance marks a stray one at the object's rim
     # standard deviations of that distance above its mean, beyond which it is stray
     outlier_deviations: PositiveFloat = 5.0
     rest_s: PositiveFloat = 0.5  # seconds at the start whose median is each finger's pressure without load
@@ -94,7 +94,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the row that the fingers felt when they had closed, and when both first touched."""
+    """Return the row that the fingers measured when they had closed, and when both first touched."""
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema

@@ -22,7 +22,7 @@ STEPS = CommaList(PositiveInt, least=1)
 
 @dataclass(frozen=True)
 class Params:
-    """What is told."""
+    """What is given."""
 
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
 

@@ -44,7 +44,7 @@ class Params:
     # device counts by which a finger's taxels leave rest on average, where contact starts
     on_count: PositiveFloat = 120.0
     off_count: NonNegativeFloat = 80.0  # device counts below which it ends
-    merge_s: NonNegativeFloat = 0.5  # seconds; contacts that are no further apart are one
+    merge_s: NonNegativeFloat = 0.5  # seconds; contacts no further apart are one
     min_s: NonNegativeFloat = 0.3  # seconds; shorter contacts are left out
     pad_s: NonNegativeFloat = 0.5  # seconds before and after each contact that belong to it
     # as on_count, of streams in other units, in theirs; None: from noise at rest
@@ -135,7 +135,7 @@ class SlipParams:
     level_count: PositiveFloat = 0.75  # counts; readings that have moved no further have not left their level yet
     patch_mm: PositiveFloat = 25.0  # millimetres; an object that has slipped further is lost
     count_per_mm: PositiveFloat = 8.0  # of the sensor
-    # counts; a reading of this or less is no distance any more, the object is lost
+    # counts; a reading of this or less is not a distance any more, the object is lost
     saturated_count: NonNegativeFloat = 544.0
 
     def check(self) -> None:
@@ -204,7 +204,7 @@ class SlideParams:
     """
 
     pressure_trigger: NonNegativeFloat = 40.0  # device counts of static pressure whose first crossing starts the slide
-    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; told only where the arm was recorded
+    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; stated only where the arm was recorded
     steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
     # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
@@ -334,7 +334,7 @@ def _given(params: Params, found: Thresholds) -> Thresholds:
 
 
 def _thresholds_told(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
-    """Return the attributes that say by which thresholds a stream in another unit than counts was segmented."""
+    """Return the attributes that state by which thresholds a stream in another unit than counts was segmented."""
     told: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if unit != COUNT and math.isfinite(on):
@@ -392,7 +392,7 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
         return channel
     if len(found) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is told from one. "
+            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected from one. "
             f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
     return found[0]
@@ -408,7 +408,7 @@ def _rate_hz(name: str, t_ns: NDArray[np.int64]) -> float:
     mean_ns = float(steps_ns.mean())
     if not mean_ns > 0 or np.abs(steps_ns - mean_ns).max() > EVEN * mean_ns:
         raise TacpipeError(
-            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is told "
+            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is detected "
             f"on even ones. Synchronize with `--grid uniform`."
         )
     return 1e9 / mean_ns

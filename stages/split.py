@@ -32,7 +32,7 @@ class Split:
     few_of: str = ""  # attribute=value of the recordings that few is about, as sensor=roboskin; empty for all
 
     def check(self) -> None:
-        """Refuse what says nothing without few, and an attribute without a value."""
+        """Refuse what states nothing without few, and an attribute without a value."""
         if not self.few and (self.few_by or self.few_of):
             named = "few_by" if self.few_by else "few_of"
             raise UsageError(

@@ -1,6 +1,6 @@
 """Train the model of a task on recordings of the training role, stopped by those of validation.
 
-Options that belong to one architecture are refused with another; ``--architecture`` says which there are.
+Options that belong to one architecture are refused with another; ``--architecture`` states which there are.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ class Raec(Network):
     }
 
     def check(self) -> None:
-        """Refuse what says nothing without joint learning."""
+        """Refuse what states nothing without joint learning."""
         super().check()
         if not self.joint:
             given = [("known", self.known), ("pairing", self.pairing), ("agreement", self.agreement)]

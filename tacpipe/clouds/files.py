@@ -28,7 +28,7 @@ def read(path: Path | str) -> Cloud:
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise TacpipeError(f"{path} is no cloud that can be read; it must end in one of {', '.join(SUFFIXES)}.")
+        raise TacpipeError(f"{path} is not a cloud that can be read; it must end in one of {', '.join(SUFFIXES)}.")
     if not path.exists() or path.is_dir():
         raise TacpipeError(f"There is no file {path}; give the file of a cloud of points.")
     regular.require(path, path.stat().st_mode)
@@ -82,11 +82,11 @@ def _told(path: Path) -> int:
     if path.suffix.lower() != ".pts":
         return len(filled)
     if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > ply.DIGITS:
-        raise TacpipeError(f"{path} is no PTS file: its first line must be the number of points alone.")
+        raise TacpipeError(f"{path} is not a PTS file: its first line must be the number of points alone.")
     told = int(filled[0][0])
     if _rows(path) < told:  # open3d takes memory for as many as are told
         raise TacpipeError(
-            f"{path} tells of {told} points, and {_rows(path)} can be read: it was cut off. Copy it again from its source."
+            f"{path} declares {told} points, and {_rows(path)} can be read: it was cut off. Copy it again from its source."
         )
     return told
 
@@ -101,7 +101,7 @@ def _by_open3d(path: Path, told: int) -> Cloud:
     held = _rows(path) if path.suffix.lower() == ".pts" else len(points)
     if min(held, len(points)) != told or not told:
         raise TacpipeError(
-            f"{path} tells of {told} points, and {min(held, len(points))} can be read: it was cut off, or some are no "
+            f"{path} declares {told} points, and {min(held, len(points))} can be read: it was cut off, or some are not "
             f"numbers. Copy it again from its source."
         )
     _require_finite(path, points)

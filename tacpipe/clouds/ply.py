@@ -32,7 +32,7 @@ def points(path: Path) -> int:
     lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
     if end < 0 or lines[:1] != [["ply"]]:
         raise TacpipeError(
-            f"{path} is no PLY file, or was cut off: it must begin with ply and a header up to end_header."
+            f"{path} is not a PLY file, or was cut off: it must begin with ply and a header up to end_header."
         )
     body = content[content.find(b"\n", end) + 1 or len(content) :]
     form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
@@ -74,12 +74,12 @@ def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[i
 def _require(path: Path, count: int, name: str, held: int) -> None:
     if count > held:
         raise TacpipeError(
-            f"{path} was cut off: it tells of {count} rows of {name:.40}, and {held} bytes follow. Copy it again."
+            f"{path} was cut off: it declares {count} rows of {name:.40}, and {held} bytes follow. Copy it again."
         )
 
 
 def _told(path: Path, lines: list[list[str]]) -> int:
     found = [int(words[2]) for words in lines if words[:2] == ["element", "vertex"]]
     if len(found) != 1 or not found[0]:
-        raise TacpipeError(f"{path} tells of no points (element vertex). Give a cloud, or a mesh with its vertices.")
+        raise TacpipeError(f"{path} declares no points (element vertex). Give a cloud, or a mesh with its vertices.")
     return found[0]

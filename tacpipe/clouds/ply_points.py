@@ -85,7 +85,7 @@ def _header(path: Path, content: bytes) -> _Header:
     stop = content.find(b"\n", end) + 1
     lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
     if end < 0 or not stop or lines[:1] != [["ply"]]:
-        raise TacpipeError(f"{path} is no PLY file or was cut off: it must begin with ply and end its header.")
+        raise TacpipeError(f"{path} is not a PLY file or was cut off: it must begin with ply and end its header.")
     form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
     starts = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
     elements = [lines[start:end] for start, end in itertools.pairwise([*starts, len(lines)])]
@@ -144,14 +144,16 @@ def _of_text(path: Path, body: bytes, header: _Header) -> NDArray[np.void]:
         numbers: NDArray[Any] = np.array(words, dtype="S").astype(np.float64).reshape(header.points, len(names))
     except ValueError as error:
         raise TacpipeError(
-            f"{path} has a word among its points that is no number ({plain(str(error), 100)}). Copy it again."
+            f"{path} has a word among its points that is not a number ({plain(str(error), 100)}). Copy it again."
         ) from error
     for name, column in zip(names, numbers.T, strict=True):
         if name in POSITION:
             found[name] = column
         elif name in COLOUR:
             if not ((column >= 0) & (column <= 255)).all():
-                raise TacpipeError(f"{path} has a {name} that is no colour; it must be from 0 to 255. Copy it again.")
+                raise TacpipeError(
+                    f"{path} has a {name} that is not a colour; it must be from 0 to 255. Copy it again."
+                )
             found[name] = column
     return found
 
@@ -165,5 +167,5 @@ def _require(path: Path, header: _Header, held: int, width: int, unit: str) -> N
     needed = header.points * width
     if held < needed or (header.alone and held > needed):
         raise TacpipeError(
-            f"{path} tells of {header.points} points, which are {needed} {unit}, and {held} follow. Copy it again."
+            f"{path} declares {header.points} points, which are {needed} {unit}, and {held} follow. Copy it again."
         )

@@ -43,7 +43,7 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
         level = metadata(schema.field(name)).get("rest")
         if level is None:
             raise TacpipeError(
-                f"Channel {name} has no rest level, so its counts cannot be told from its load. "
+                f"Channel {name} has no rest level, so its counts cannot be distinguished from its load. "
                 "Run `tacpipe segment contacts` first: it writes the level into the column's metadata."
             )
         rest.append(float(level))
@@ -75,5 +75,5 @@ def gaps(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
 def times(table: pa.Table) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
     if "t_ns" not in table.column_names:
-        raise TacpipeError("There is no column t_ns, so it cannot be told which rows follow one another.")
+        raise TacpipeError("There is no column t_ns, so it cannot be determined which rows follow one another.")
     return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)

@@ -123,7 +123,7 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         raise TacpipeError(
             f"{path} cannot be written: {error.strerror or error}. The result is kept in the store: run the same command "
-            f"again when that is mended."
+            f"again when that is fixed."
         ) from error
 
 

@@ -130,7 +130,7 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
         ) from None
     if computed != stored:
         raise DamagedError(
-            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it says {excerpt(stored)[1:13]}. "
+            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it states {excerpt(stored)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     return manifest
@@ -161,7 +161,7 @@ def check(manifest: Manifest) -> None:
     counts = [one["bytes"] for one in contents] + [one["rows"] for one in contents[len(manifest.files) :]]
     for count in counts:
         if type(count) is not int or count < 0:
-            raise ValueError(f"{str(count)[:80]!r} is no count of rows or bytes")
+            raise ValueError(f"{str(count)[:80]!r} is not a count of rows or bytes")
     for one in contents:
         _expect_digest(one["digest"])
     _check_paths([path for path, _ in manifest.objects()])
@@ -201,7 +201,7 @@ def _expect_mapping(value: object, what: str) -> None:
 
 def _expect_digest(name: object) -> None:
     if not isinstance(name, str) or not DIGEST.fullmatch(name):
-        raise ValueError(f"{str(name)[:80]!r} is no digest")
+        raise ValueError(f"{str(name)[:80]!r} is not a digest")
 
 
 def shard_path(recording: str, stream: str) -> str:
@@ -244,7 +244,7 @@ def find(path: Path | str) -> Found:
     except (FileNotFoundError, NotADirectoryError):
         what = "is empty or not there" if not given.exists() else f"has no {NAME}"
         raise UsageError(
-            f"{given} {what}, so it is no dataset. Give the directory that a tacpipe command wrote with -o."
+            f"{given} {what}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
         ) from None
 
 

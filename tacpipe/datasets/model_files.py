@@ -65,7 +65,7 @@ def task(files: Mapping[str, bytes], where: str = "This") -> Any:
     from tacpipe.plugins import registry
 
     if CONFIG not in files:
-        raise UsageError(f"{where} is no model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
+        raise UsageError(f"{where} is not a model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
     return registry.load_task(tree(files, CONFIG, {"task": str})["task"])
 
 
@@ -77,7 +77,7 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
     try:
         found = json.loads(files[name])
     except (ValueError, RecursionError) as error:
-        raise TacpipeError(f"{name} is no JSON ({plain(str(error), 100)}). Copy the model again.") from error
+        raise TacpipeError(f"{name} is not JSON ({plain(str(error), 100)}). Copy the model again.") from error
     if not isinstance(found, dict):
         raise TacpipeError(f"{name} holds {excerpt(found)}; it must be a mapping. Copy the model again.")
     for path, kind in (needed or {}).items():
@@ -139,7 +139,7 @@ def _readable(name: str, kind: type[Exception]) -> Iterator[None]:
         yield
     except (kind, ValueError, TypeError, LookupError, OverflowError, AttributeError, RuntimeError) as error:
         raise TacpipeError(
-            f"{name} is no safetensors file that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
+            f"{name} is not a safetensors file that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
             f"from whoever made it."
         ) from error
 
@@ -148,8 +148,8 @@ def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
     wrong = next((key for key, fine in finite.items() if not fine), None)
     if wrong is not None:
         raise TacpipeError(
-            f"{name} holds values that are not finite (NaN) in {plain(wrong)}; nothing can be foretold from them. Train the "
-            f"model again, or copy it from whoever made it."
+            f"{name} holds values that are not finite (NaN) in {plain(wrong)}; nothing can be predicted from them. "
+            "Train the model again, or copy it from whoever made it."
         )
 
 

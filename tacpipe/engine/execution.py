@@ -185,7 +185,7 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
         acquired = identity["stage"] == ACQUIRE
         if acquired or stage_of(identity["stage"]).source:
             raise DamagedError(
-                f"{why} It is the recording {path}, which cannot be made again: restore it with `tacpipe store pull`"
+                f"{why} It is the recording {path}, which cannot be recomputed: restore it with `tacpipe store pull`"
                 f"{'' if acquired else ', or ingest it again'}."
             )
         stage = stage_of(identity["stage"])
@@ -213,7 +213,7 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
         other = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
     reason = other or f"nothing in the store says how {path} was made"
     raise DamagedError(
-        f"{why} It cannot be made again: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
+        f"{why} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
     )
 
 

@@ -153,7 +153,7 @@ def split_digest(split: Found) -> str:
     """Return the digest of the table of a split."""
     recordings = split.manifest.recordings
     if set(recordings) != {"split"}:
-        raise UsageError(f"{split.directory} is no split; make one with `tacpipe split`.")
+        raise UsageError(f"{split.directory} is not a split; make one with `tacpipe split`.")
     found: str = recordings["split"]["shards"][""]["digest"]
     return found
 

@@ -35,8 +35,8 @@ class Arrivals:
         A later stamp gives a later time, if only by 1 ns where the clocks' distance shrank meanwhile.
         """
         assert self._ahead_ns is not None, "look first"
-        is_believed = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
-        t_ns = wall_ns + self._ahead_ns if is_believed else self._now_ns
+        is_plausible = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
+        t_ns = wall_ns + self._ahead_ns if is_plausible else self._now_ns
         self._last_ns = max(t_ns, self._last_ns + (wall_ns > self._last_wall_ns))
         self._last_wall_ns = wall_ns
         return self._last_ns

@@ -74,7 +74,7 @@ def load(name: str) -> Stage:
         raise UsageError(f"There is no stage {name}; there are {', '.join(stages())}.")
     found = _import(name, target)
     if not isinstance(found, Stage):
-        raise TacpipeError(f"{target}, registered as stage {name}, is no stage: decorate it with @stage(version=1).")
+        raise TacpipeError(f"{target}, registered as stage {name}, is not a stage: decorate it with @stage(version=1).")
     return found
 
 

@@ -126,12 +126,12 @@ class Stage:
 
     @property
     def source(self) -> bool:
-        """Whether what the stage returns cannot be made again from the store."""
+        """Whether what the stage returns cannot be recomputed from the store."""
         return "Files" in self.arguments.values()
 
     @property
     def needs_split(self) -> bool:
-        """Whether the stage tells training recordings from others."""
+        """Whether the stage distinguishes training recordings from others."""
         return self.fit is not None or any(name in ROLES for name in self.arguments)
 
 

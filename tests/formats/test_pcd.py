@@ -92,9 +92,9 @@ LINE = "1 2 3 0\n"
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "is no PCD file or was cut off: its header ends without a line DATA"),
+        (b"", "is not a PCD file or was cut off: its header ends without a line DATA"),
         (b"ply\nformat ascii 1.0\n", "its header has the line 'ply', where one of VERSION, FIELDS"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(99), "is no PCD file: its header has the line"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(99), "is not a PCD file: its header has the line"),
         (header(50).encode()[:60], "its header ends without a line DATA"),
         (header(50, VERSION="0.6").encode() + WHOLE, "is a PCD file of version 0.6; 0.7 can be read"),
         (header(50, VERSION="").encode() + WHOLE, "has no VERSION in its header"),
@@ -103,7 +103,7 @@ LINE = "1 2 3 0\n"
         (header(50, WIDTH="5").encode() + WHOLE, "says WIDTH 5, HEIGHT 1 and POINTS 50"),
         (header(10**15).encode() + WHOLE, "tells 1000000000000000 points of 16 bytes, and 50 follow"),
         (header(50).encode() + WHOLE[:-1], "tells 50 points of 16 bytes, and 49 follow"),
-        (header(49).encode() + WHOLE, "behind them 16 bytes follow that are no padding"),
+        (header(49).encode() + WHOLE, "behind them 16 bytes follow that are not padding"),
         (header(0).encode(), r"holds no point \(POINTS 0\)"),
         (header(50, "binary_compressed").encode() + WHOLE, "holds compressed points"),
         (header(50, "packed").encode() + WHOLE, "says DATA packed; it must be ascii"),
@@ -119,16 +119,16 @@ LINE = "1 2 3 0\n"
         (header(50, COUNT="1 1 1 3").encode() + WHOLE, "it must be one number of four bytes"),
         (header(3, "ascii").encode() + 2 * LINE.encode(), "tells 3 points, and 2 lines follow"),
         (header(2, "ascii").encode() + f"{LINE}1 2 3\n".encode(), "point 1: the line has 3 numbers; it must have 4"),
-        (header(2, "ascii").encode() + f"{LINE}1 zwei 3 0\n".encode(), "point 1: 'zwei' is no number"),
+        (header(2, "ascii").encode() + f"{LINE}1 zwei 3 0\n".encode(), "point 1: 'zwei' is not a number"),
         (
             header(1, "ascii", TYPE="F F F U").encode() + b"1 2 3 -1\n",
-            "point 0: '-1' is no number of the declared type",
+            "point 0: '-1' is not a number of the declared type",
         ),
         (
             header(2, "ascii").encode() + f"{LINE}1 nan 3 0\n".encode(),
             r"holds 1 of 2 points that are not finite \(NaN\)",
         ),
-        (header(2, "ascii").encode() + b"\xff\xfe", "says DATA ascii, and bytes follow that are no text"),
+        (header(2, "ascii").encode() + b"\xff\xfe", "says DATA ascii, and bytes follow that are not text"),
     ],
 )
 def test_what_is_no_cloud_or_not_whole_is_refused_with_the_file(tmp_path: Path, content: bytes, message: str) -> None:

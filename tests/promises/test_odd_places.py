@@ -139,7 +139,7 @@ def test_recordings_that_are_lost_everywhere_are_asked_for_and_come_back_from_an
     for command in ("scale data/recordings -o data/other --factor 9 --jobs 1", "store repair"):
         failed = one.lab.call(command)
         assert failed.code == DAMAGED, failed
-        assert "b/left.parquet, which cannot be made again: restore it" in failed.err + failed.out, failed
+        assert "b/left.parquet, which cannot be recomputed: restore it" in failed.err + failed.out, failed
     assert not (one.folder / "data/other").exists()
     count("corruptions found", 2)
     one.lab.run("store pull backup data/recordings")

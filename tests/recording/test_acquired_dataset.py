@@ -87,7 +87,7 @@ def test_damage_to_a_recording_is_told_with_what_brings_it_back(acquired: Lab) -
     for command in ("show rec", "synchronize rec -o grid --rate-hz 50", "store repair"):
         told = acquired.call(command)
         sentence = (
-            "It is the recording one/force.parquet, which cannot be made again: restore it with `tacpipe store pull`."
+            "It is the recording one/force.parquet, which cannot be recomputed: restore it with `tacpipe store pull`."
         )
         assert told.code == 4 and sentence in told.out + told.err, command
     acquired.run(f"store pull {remote} rec")

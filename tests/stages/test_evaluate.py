@@ -48,5 +48,5 @@ def test_latents_of_another_codec_are_refused(model: Any) -> None:
 
 
 def test_what_is_no_model_is_refused() -> None:
-    with pytest.raises(TacpipeError, match="This is no model"):
+    with pytest.raises(TacpipeError, match="This is not a model"):
         EVALUATE(EVALUATE.params(), dataset(), dataset())

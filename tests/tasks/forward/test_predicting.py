@@ -61,5 +61,5 @@ def test_the_stage_reads_steps_as_a_list(model: dict[str, bytes]) -> None:
     stage = registry.load("predict")
     found = stage(stage.params(steps="1, 3"), dataset(files=model), dataset(TEST))
     assert f"{CHANNELS[-1]}_t3" in found.recordings[TEST.name].streams[""].column_names
-    with pytest.raises(TacpipeError, match="This is no model"):
+    with pytest.raises(TacpipeError, match="This is not a model"):
         stage(stage.params(), dataset(), dataset(TEST))
