@@ -220,7 +220,7 @@ def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
     if any(content[header.length + needed :]):
         raise TacpipeError(
             f"{path} declares {header.points} points of {size} bytes, and behind them {there - needed} bytes follow "
-            "that are no padding with zeros. Copy the file again."
+            "that are not padding with zeros. Copy the file again."
         )
     return np.frombuffer(content, header.point, header.points, header.length)
 
