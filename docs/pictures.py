@@ -22,7 +22,7 @@ TITLES = {  # of each table: what its value is, and the column that groups its r
 }
 VALUES = ("skill", "accuracy_percent")
 BLUE, GREY = "#1f6feb", "#6e7781"
-WIDTH, HEIGHT = 1180, 640  # of the first screen, pixels
+WIDTH, HEIGHT = 1100, 1010  # of the first screen, pixels
 
 
 def rows(name: str) -> list[dict[str, str]]:
