@@ -39,7 +39,7 @@ def test_help_lists_every_command(lab: Lab) -> None:
         ("ingest numbers nowhere -o x", 2, "no nowhere"),
         ("ingest numbers empty -o x", 2, "found no recording"),
         ("centre data/r -o x", 2, "--split"),
-        ("centre data/r --split data/r -o x", 2, "no split"),
+        ("centre data/r --split data/r -o x", 2, "data/r is not a split"),
         ("scale data/r -o x --block a.b", 2, "params.yaml"),
         ("label data/r nobody --set a=1", 2, "no recording nobody"),
         ("label data/r trial-000", 2, "Nothing to change"),

@@ -69,7 +69,7 @@ def test_a_file_that_was_cut_off_is_never_read_as_fewer_points(
     ("name", "content", "message"),
     [
         ("cloud.ply", b"\x00\x01 not a cloud", "is not a PLY file, or was cut off"),
-        ("cloud.ply", b"ply\nformat ascii 1.0\nend_header\n", "tells of no points"),
+        ("cloud.ply", b"ply\nformat ascii 1.0\nend_header\n", "declares no points"),
         (
             "cloud.ply",
             b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n",
@@ -77,11 +77,11 @@ def test_a_file_that_was_cut_off_is_never_read_as_fewer_points(
         ),
         ("cloud.ply", b"", "is empty"),
         ("cloud.pcd", b"\x00" * 99, "is not a PCD file"),
-        ("cloud.xyz", b"# nothing\n\n", "tells of 0 points"),
-        ("cloud.xyz", b"1 2 3\nhello\n4 5 6\n", "tells of 3 points, and 2 can be read"),
+        ("cloud.xyz", b"# nothing\n\n", "declares 0 points"),
+        ("cloud.xyz", b"1 2 3\nhello\n4 5 6\n", "declares 3 points, and 2 can be read"),
         ("cloud.xyz", b"1 2 3\nnan 1 2\n", r"holds 1 of 2 points that are not finite \(NaN\), the first being point 1"),
         ("cloud.pts", b"1 2 3\n4 5 6\n", "its first line must be the number of points"),
-        ("cloud.pts", b"3\n1 2 3\n4 5 6\n", "tells of 3 points, and 2 can be read"),
+        ("cloud.pts", b"3\n1 2 3\n4 5 6\n", "declares 3 points, and 2 can be read"),
         ("cloud.xyzrgb", b"1 2 3 255 0 0\n1 2 3 9 9 9\n", "has colours from 0 to 255; in its format they are shares"),
         ("cloud.stl", b"1 2 3\n", "is not a cloud that can be read; it must end in one of .pcd, .ply"),
         ("cloud", b"1 2 3\n", "is not a cloud that can be read"),

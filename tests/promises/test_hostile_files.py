@@ -203,7 +203,7 @@ def test_sizes_of_compressed_points_that_lie_are_refused(
     tmp_path: Path, packed: int, unpacked: int, points: int
 ) -> None:
     head = f"{PCD}WIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA binary_compressed\n".encode()
-    refused(cloud(tmp_path, "a.pcd", head + struct.pack("<II", packed, unpacked) + bytes(5)), r"a\.pcd tells")
+    refused(cloud(tmp_path, "a.pcd", head + struct.pack("<II", packed, unpacked) + bytes(5)), r"a\.pcd declares")
 
 
 @pytest.mark.parametrize("points", ["1000000000000", "-5", "1e9", "9" * 5000, ""])
