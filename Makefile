@@ -15,6 +15,7 @@ VIRTUAL_MACHINE := qemu-system-x86 busybox-static
 BLOCK_REPLAY := user-mode-linux dmsetup e2fsprogs xfsprogs btrfs-progs
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
+DATA := $(TACPIPE_SAMPLE_DATA)
 EVERY := 1
 TARGETS :=
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto
@@ -34,7 +35,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel test test-long test-rig test-ci test-loaded test-faults test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -45,13 +46,23 @@ demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with de
 wheel: $(VENV)/.python ## build a wheel into dist/, for computers without a clone
 	@$(PIP) wheel --no-deps -w dist .
 
+docs: $(VENV)/.docs ## build the documentation as a site into .cache/site
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo .cache/site/index.html
+
+pictures: demo ## draw the pictures of the documentation, that of the front page from the demo's report
+	@$(BIN)/python docs/pictures.py demo/report.html
+
+result-pages: $(VENV)/.dev ## compute the three result pages of a release from the published sets in DATA, in hours; dist/results
+	@$(BIN)/python docs/result_pages.py $(DATA)
+
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
 test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: at most 5 minutes on 2 cores
 	@$(PYTEST) -m "not faults and not long and not rig"
 
-test-long: $(VENV)/.dev ## run the tests that take long: training, kills and crowds, DVC's chains, the README's commands
+test-long: $(VENV)/.dev ## run the tests that take long: training, kills and crowds, DVC's chains, the docs' commands
 	@$(PYTEST) -m "long and not faults"
 
 test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
@@ -149,6 +160,11 @@ $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 	    ($(call debian,$(BROWSER))) || echo "Until then the tests that look at pages in a browser are skipped." >&2; \
 	fi
 	@touch $(VENV)/.learn $@
+
+$(VENV)/.docs: $(VENV)/.dev
+	@echo "Installing tacpipe[docs] into $(VENV)"
+	@$(PIP) install -c constraints.txt -e '.[docs]'
+	@touch $@
 
 $(VENV)/.fuzz: $(VENV)/.dev
 	@echo "Installing tacpipe[fuzz] into $(VENV)"

@@ -1,7 +1,7 @@
 """Compress tactile channels to a few latents, fitted on the training recordings alone.
 
 The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Channels are those whose field
-metadata says ``quantity=tactile``; their rest level is taken off before. ``codec.json`` and ``codec.safetensors`` hold
+metadata states ``quantity=tactile``; their rest level is taken off before. ``codec.json`` and ``codec.safetensors`` hold
 what is needed to go back to counts, and how much is lost on the way.
 """
 
@@ -29,7 +29,7 @@ class Params:
     """How many latents to keep, and of what."""
 
     components: PositiveInt = 20  # latents to keep, at most the number of channels; the paper kept 20
-    # keep as many latents as hold this fraction of the variance instead; 0: as many as components says
+    # keep as many latents as hold this fraction of the variance instead; 0: as many as components states
     variance: Annotated[float, Range(0, below=1)] = 0.0
     of: Representation = "levels"  # levels: counts above rest; increments: what each row adds to the one before
 
@@ -53,7 +53,7 @@ class AutoencoderParams:
     PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {"quick": {"epochs": 5}}
 
     def check(self) -> None:
-        """Refuse hidden layers beside a search, which tries its own."""
+        """Refuse hidden layers next to a search, which tries its own."""
         if self.search and self.hidden:
             raise UsageError(
                 f"hidden is {self.hidden} and search is {self.search}, which tries its own; give one of them."
@@ -96,19 +96,20 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
 
 @stage(version=2, fit=fit)
 def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
-    """Add the principal components of the tactile channels as columns ``z00``, ``z01``, ….
+    """Compress tactile channels to their principal components.
 
-    Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
+    They are added as columns ``z00``, ``z01``, …. Raises `TacpipeError` where the recording's channels are not
+    those the codec was fitted on.
     """
     return _encoded(recording, codec)
 
 
 @stage(version=1, fit=fit_autoencoder)
 def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) -> pa.Table:
-    """Add what an autoencoder makes of the tactile channels as columns ``z00``, ``z01``, ….
+    """Compress tactile channels to the latents of an autoencoder.
 
-    Of the training recordings 15 % are held out to say when its training ends. Raises `TacpipeError` where the
-    recording's channels are not those the codec was fitted on.
+    They are added as columns ``z00``, ``z01``, …. 15 % of the training recordings are held out for early stopping.
+    Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
     """
     return _encoded(recording, codec)
 

@@ -1,4 +1,4 @@
-"""Judge a model on recordings, beside its baselines, with intervals over recordings.
+"""Evaluate a model on recordings against its baselines.
 
 Prints how the model compares with the best baseline, and writes it to ``headline.json``. Writes ``metrics.json``,
 ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to choose: how a model is judged is not up to who trained it."""
+    """Nothing to choose: how a model is evaluated is not up to who trained it."""
 
 
 @stage(version=3, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Judge a model on recordings, by the measures of the task it was trained for."""
+    """Evaluate a model with the metrics of its task."""
     from tacpipe.datasets import model_files
 
     task = model_files.task(model.files)

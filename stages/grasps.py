@@ -1,4 +1,4 @@
-"""Cut grasps down to what touch is foretold from, and to what was felt: the object's points and one reading."""
+"""Cut grasps down to what touch is predicted from, and to what was measured: the object's points and one reading."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FINISHED = ("cloud", "grasp")
 
 @dataclass(frozen=True)
 class Params:
-    """What counts as the grasped object in a view of a camera, and as contact in what two BioTac SP felt.
+    """What counts as the grasped object in a view of a camera, and as contact in what two BioTac SP measured.
 
     Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
     """
@@ -34,7 +34,7 @@ class Params:
     object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
     # millimetres that the object may be from the line between the fingers, or from its sight
     near_mm: PositiveFloat = 20.0
-    outlier_neighbours: PositiveInt = 20  # points whose mean distance tells a stray one at the object's rim
+    outlier_neighbours: PositiveInt = 20  # points whose mean distance marks a stray one at the object's rim
     # standard deviations of that distance above its mean, beyond which it is stray
     outlier_deviations: PositiveFloat = 5.0
     rest_s: PositiveFloat = 0.5  # seconds at the start whose median is each finger's pressure without load
@@ -46,10 +46,10 @@ class Params:
 
 @stage(version=2)
 def grasps(params: Params, recording: Recording) -> RecordingOutput:
-    """Find the grasped object in the camera's view, and what the fingers felt once they had closed on it.
+    """Extract the grasped object and the fingers' readings.
 
     Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
-    of each channel after contact, stamped where it begins; ``contact_ns`` tells when both fingers first touched. Other
+    of each channel after contact, stamped where it begins; ``contact_ns`` is when both fingers first touched. Other
     streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
     already stays as it is; one that was not made yet has no ``biotac_sp``, and gets no ``reading``.
     """
@@ -94,7 +94,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the row that the fingers felt when they had closed, and when both first touched."""
+    """Return the row that the fingers measured when they had closed, and when both first touched."""
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema

@@ -1,4 +1,7 @@
-"""Tell what a model expects of recordings, row by row; `tacpipe evaluate` tells how well it does."""
+"""Predict the rows of recordings with a trained model.
+
+`tacpipe evaluate` measures how good the predictions are.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,17 @@ STEPS = CommaList(PositiveInt, least=1)
 
 @dataclass(frozen=True)
 class Params:
-    """What is told."""
+    """What is given."""
 
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
 
 
 @stage(version=1)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Write what a model expects of each recording, with the time at which it was known."""
+    """Predict the rows of recordings with a trained model.
+
+    Each prediction is a row with the time at which its input was known.
+    """
     from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))

@@ -1,8 +1,8 @@
-"""Put results on one page that needs nothing but a browser.
+"""Show results on one page that needs only a browser.
 
 Results of the same task are compared, seeds and folds of a method pooled. Of more than two of the task ``forward``, only
-the best method's and that of the paper are told in full; outputs of ``tacpipe compress`` may be given besides, which tell
-what codecs of other widths lose. With those of the task ``material``, slides may be given, which tell how they went.
+the best method's and that of the paper are given in full; outputs of ``tacpipe compress`` may be given besides, which state
+what codecs of other widths lose. With those of the task ``material``, slides may be given, which state how they went.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ class Params:
     """What the page shows."""
 
     title: str = ""  # heading of the page; without one, what its tasks predict
-    traces: NonNegativeInt = 2  # recordings of each forecast told in full whose predictions are drawn
+    traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn
 
 
 @stage(version=4)
 def report(params: Params, results: Datasets) -> Result:
-    """Put results on one page: headline, figures, tables, and where every number comes from."""
+    """Show results on one page that needs only a browser.
+
+    It has headline, figures, tables, and where every number comes from.
+    """
     from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 

@@ -44,7 +44,7 @@ class Params:
     # device counts by which a finger's taxels leave rest on average, where contact starts
     on_count: PositiveFloat = 120.0
     off_count: NonNegativeFloat = 80.0  # device counts below which it ends
-    merge_s: NonNegativeFloat = 0.5  # seconds; contacts that are no further apart are one
+    merge_s: NonNegativeFloat = 0.5  # seconds; contacts no further apart are one
     min_s: NonNegativeFloat = 0.3  # seconds; shorter contacts are left out
     pad_s: NonNegativeFloat = 0.5  # seconds before and after each contact that belong to it
     # as on_count, of streams in other units, in theirs; None: from noise at rest
@@ -65,13 +65,14 @@ class Params:
 
 @stage(version=2)
 def contacts(params: Params, recording: Recording) -> RecordingOutput:
-    """Mark the rows in which either finger touches something, numbered from 0 in ``contact``; -1 in all others.
+    """Mark the rows in which a finger touches something.
 
-    Each tactile channel's level without load is written into its field metadata ``rest``. Contact is told from the
-    median of the first seconds, whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and
-    ``off_count``. One in any other unit has those of ``on_level`` and ``off_level`` or of its noise at rest (see
-    `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off`` and
-    ``<stream>_contact_unit`` say which these were. A recording without a contact has a note.
+    The column ``contact`` numbers the contacts from 0, and is -1 in all other rows. Each tactile channel's level
+    without load is written into its field metadata ``rest``. Contact is found from the median of the first seconds,
+    whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and ``off_count``. One in any other unit
+    has those of ``on_level`` and ``off_level`` or of its noise at rest (see
+    `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off``
+    and ``<stream>_contact_unit`` record which these were. A recording without a contact has a note.
     """
     import numpy as np
     import pyarrow as pa
@@ -134,7 +135,7 @@ class SlipParams:
     level_count: PositiveFloat = 0.75  # counts; readings that have moved no further have not left their level yet
     patch_mm: PositiveFloat = 25.0  # millimetres; an object that has slipped further is lost
     count_per_mm: PositiveFloat = 8.0  # of the sensor
-    # counts; a reading of this or less is no distance any more, the object is lost
+    # counts; a reading of this or less is not a distance any more, the object is lost
     saturated_count: NonNegativeFloat = 544.0
 
     def check(self) -> None:
@@ -148,12 +149,12 @@ class SlipParams:
 
 @stage(version=1)
 def slips(params: SlipParams, recording: Recording) -> pa.Table:
-    """Mark where the held object slips, and from where on it is dropped, by its distance from the wrist.
+    """Mark where the held object slips or is dropped.
 
-    Adds the labels ``slip``, told with all of the recording at hand, ``slip_online``, told from the rows so far, and
-    ``dropped``. Run it behind ``segment contacts``: each contact is a grasp, and a drop lasts until the next one. Without
-    the column ``contact`` all of the recording is one. Outside of contacts, after a drop and where there is no reading
-    nothing slips.
+    Both follow from its distance to the wrist. Adds the labels ``slip``, from the whole recording, ``slip_online``,
+    from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each contact is a grasp, and a drop lasts
+    until the next one. Without the column ``contact`` all of the recording is one. Outside of contacts, after a drop
+    and where there is no reading nothing slips.
     """
     import numpy as np
     import pyarrow as pa
@@ -203,7 +204,7 @@ class SlideParams:
     """
 
     pressure_trigger: NonNegativeFloat = 40.0  # device counts of static pressure whose first crossing starts the slide
-    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; told only where the arm was recorded
+    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; stated only where the arm was recorded
     steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
     # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
@@ -238,12 +239,13 @@ class SlideParams:
 
 @stage(version=1)
 def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
-    """Cut a recording down to its slide, all of the same number of frames, with single wrong tactile readings mended.
+    """Cut each recording down to its slide.
 
-    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure goes
-    on; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``,
-    its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
-    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
+    All slides have the same number of frames; single wrong tactile readings are repaired. The slide starts where the
+    static pressure first reaches its trigger, and lasts to the end, whatever the pressure does after; where the arm was
+    recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``, its speed, force
+    and phase over the whole recording. A slide that differs from the protocol is marked ``outside_protocol`` and kept.
+    Recordings of sensors without static pressure stay whole.
     """
     from tacpipe.channels import arm
     from tacpipe.channels.finger import finger, mended
@@ -274,7 +276,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
         params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
     )
     rows = slice(first, stop)
-    told = found.told(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    told = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
     why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, told)
     attributes: dict[str, Attribute] = {**told, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
     attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})
@@ -332,7 +334,7 @@ def _given(params: Params, found: Thresholds) -> Thresholds:
 
 
 def _thresholds_told(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
-    """Return the attributes that say by which thresholds a stream in another unit than counts was segmented."""
+    """Return the attributes that state by which thresholds a stream in another unit than counts was segmented."""
     told: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if unit != COUNT and math.isfinite(on):
@@ -390,7 +392,7 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
         return channel
     if len(found) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is told from one. "
+            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected from one. "
             f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
     return found[0]
@@ -406,7 +408,7 @@ def _rate_hz(name: str, t_ns: NDArray[np.int64]) -> float:
     mean_ns = float(steps_ns.mean())
     if not mean_ns > 0 or np.abs(steps_ns - mean_ns).max() > EVEN * mean_ns:
         raise TacpipeError(
-            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is told "
+            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is detected "
             f"on even ones. Synchronize with `--grid uniform`."
         )
     return 1e9 / mean_ns

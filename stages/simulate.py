@@ -34,8 +34,8 @@ class Params:
     # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
     effort: NonNegativeFloat = 0.0
     friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
-    grip_loss_probability: Fraction = 0.0  # share of trials in which the grip gives way, unannounced
-    grip_loss: Fraction = 0.2  # share of the grip force that is lost then
+    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
+    grip_loss: Fraction = 0.2  # fraction of the grip force that is lost then
     lever_m: NonNegativeFloat = 0.0  # metres from the grasp to the centre of mass, sideways; twists the object
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep
     tactile_rate_hz: PositiveFloat = 50.0  # frames a second of each tactile sensor
@@ -54,7 +54,10 @@ class Params:
 
 @stage(version=2)
 def forward(params: Params, trial: Trial) -> RecordingOutput:
-    """Return one grasp-lift-move trial: xela1, xela2, robot, proximity and, with ground truth, truth."""
+    """Simulate trials that grasp, lift and move an object.
+
+    Returns xela1, xela2, robot, proximity and, with ground truth, truth.
+    """
     from tacpipe.simulation.pick_and_move import Rig, simulate_trial
 
     values = asdict(params)
@@ -65,7 +68,7 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class MaterialParams:
-    """What the simulated rig of two unlike sensors slides over, and how well the sensors tell."""
+    """What the simulated rig of two unlike sensors slides over, and how precise the sensors are."""
 
     # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
     trials: PositiveInt = 200
@@ -91,7 +94,10 @@ class MaterialParams:
 
 @stage(version=1)
 def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
-    """Return one slide of a BioTac or of RoboSkin over a material, and, with ground truth, truth."""
+    """Simulate slides of a BioTac or RoboSkin over materials.
+
+    Returns the sensor's stream and, with ground truth, truth.
+    """
     from tacpipe.simulation.slide import Rig, simulate_trial
 
     values = asdict(params)
@@ -102,7 +108,7 @@ def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class TouchParams:
-    """What lies on the simulated table, how it is grasped, and how well camera and fingertips tell."""
+    """What lies on the simulated table, how it is grasped, and how precise camera and fingertips are."""
 
     trials: PositiveInt = 360  # recordings, each a grasp; the objects take turns
     seed: Seed = 0  # random seed
@@ -128,7 +134,10 @@ class TouchParams:
 
 @stage(version=2)
 def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
-    """Return one grasp of an object on a table: cloud, grasp, reading and, with ground truth, truth."""
+    """Simulate grasps of objects on a table.
+
+    Returns cloud, grasp, reading and, with ground truth, truth.
+    """
     from tacpipe.simulation.grasp import simulate_trial
     from tacpipe.simulation.grasp_scene import Rig
 

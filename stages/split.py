@@ -32,7 +32,7 @@ class Split:
     few_of: str = ""  # attribute=value of the recordings that few is about, as sensor=roboskin; empty for all
 
     def check(self) -> None:
-        """Refuse what says nothing without few, and an attribute without a value."""
+        """Refuse what states nothing without few, and an attribute without a value."""
         if not self.few and (self.few_by or self.few_of):
             named = "few_by" if self.few_by else "few_of"
             raise UsageError(
@@ -107,10 +107,10 @@ Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 
 @stage(version=1)
 def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
-    """Return one table, ``split``, with a row a recording and fold: recording, fold, role.
+    """Give each recording its role: train, val or test.
 
-    Recordings that have a role in the older split ``extend`` keep it. A note names folds without validation recordings,
-    unless ``val`` is 0.
+    Returns one table, ``split``, with a row a recording and fold: recording, fold, role. Recordings that have a role in
+    the older split ``extend`` keep it. A note names folds without validation recordings, unless ``val`` is 0.
     """
     import pyarrow as pa
 

@@ -1,4 +1,4 @@
-"""Bring the streams of each recording onto one clock: one table, one row a grid point."""
+"""Bring the streams of each recording onto one clock."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
-DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device says of a sample; they stay as they are
+DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device states of a sample; they stay as they are
 UNCERTAIN = "t_uncertain_ns"  # by how much a sample may be stamped late; the recorder's, and no channel
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
 MEDIAN_NS = (
@@ -85,7 +85,10 @@ class _Stream:
 
 @stage(version=2, reads=("master",))
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
-    """Return one table on one clock, over the time that all streams cover, with masks of holds and gaps."""
+    """Bring the streams of each recording onto one clock.
+
+    Returns one table over the time that all streams cover, one row a grid point, with masks of repeats and gaps.
+    """
     import pyarrow as pa
 
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
@@ -118,7 +121,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:
-    """Return a stream with its samples on the host's clock; ``clock`` says by which stamps."""
+    """Return a stream with its samples on the host's clock; ``clock`` states by which stamps."""
     stream = _Stream(name, columns, _stamps(recording, name, columns), _held(columns))
     if clock == "arrival" or stream.truth:
         return stream
@@ -145,7 +148,7 @@ def _on_host_clock(
     if column.null_count or not pa.types.is_integer(column.type):
         raise TacpipeError(
             f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
-            f"it must be whole nanoseconds in each row. Mend it at the source, or take `--clock arrival`."
+            f"it must be whole nanoseconds in each row. Fix it at the source, or take `--clock arrival`."
         )
     device_ns = column.cast(pa.int64()).to_numpy()
     try:
@@ -182,7 +185,7 @@ def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
         row = int(back.argmax()) + 1
         raise TacpipeError(
             f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
-            f"{t_ns[row - 1]} to {t_ns[row]} ns. Mend its clock at the source, or exclude the recording."
+            f"{t_ns[row - 1]} to {t_ns[row]} ns. Fix its clock at the source, or exclude the recording."
         )
     return t_ns
 

@@ -1,6 +1,6 @@
 """Train the model of a task on recordings of the training role, stopped by those of validation.
 
-Options that belong to one architecture are refused with another; ``--architecture`` says which there are.
+Options that belong to one architecture are refused with another; ``--architecture`` states which there are.
 """
 
 from __future__ import annotations
@@ -94,9 +94,10 @@ Params = Change | Recurrent
 
 @stage(version=3)
 def forward(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
-    """Train a model that predicts future touch from past touch, past motion and the planned motion.
+    """Train a model that predicts future tactile signals.
 
-    ``init`` is a model to begin with: its weights and scalings are taken over.
+    It reads past tactile signals, past motion and the planned motion. ``init`` is a model to begin with: its weights
+    and scalings are taken over.
     """
     from dataclasses import asdict
 
@@ -214,7 +215,7 @@ class Raec(Network):
     }
 
     def check(self) -> None:
-        """Refuse what says nothing without joint learning."""
+        """Refuse what states nothing without joint learning."""
         super().check()
         if not self.joint:
             given = [("known", self.known), ("pairing", self.pairing), ("agreement", self.agreement)]
@@ -239,9 +240,10 @@ MaterialParams = Minirocket | Raec | XLSTM | Spectra
 def material(
     params: MaterialParams, train: Dataset, val: Dataset | None, workspace: Workspace, init: Model | None = None
 ) -> Result:
-    """Train a classifier of materials on slides, for each sensor alone or for unlike sensors jointly.
+    """Train a classifier of materials from slides.
 
-    ``init`` is a model whose latents of the sensor ``known`` stay while the others learn to meet them.
+    It is trained for each sensor alone or for unlike sensors jointly. ``init`` is a model whose latents of the sensor
+    ``known`` stay while the others learn to meet them.
     """
     from dataclasses import asdict
 
@@ -349,7 +351,10 @@ TouchParams = Trees | Patches | Pointnet
 
 @stage(version=1)
 def touch(params: TouchParams, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
-    """Train a model that predicts touch before a grasp, from a point cloud and two contact points."""
+    """Train a model that predicts the touch of a planned grasp.
+
+    It reads a point cloud and two contact points.
+    """
     from dataclasses import asdict
 
     from tacpipe.plugins.stage import Result

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+import yaml
 
 from tacpipe.cli import commands, main
+from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tests.conftest import Lab, tacpipe
 
 ROOT = Path(__file__).parents[1]
+DOCS = sorted(page for page in (ROOT / "docs").rglob("*.md") if page.name != "0000-template.md")
+PAGES = [ROOT / "README.md", ROOT / "data" / "README.md", *DOCS]
+RUN = [  # pages whose console and Python blocks are run, in this order, in one project
+    ROOT / "README.md",
+    *(
+        ROOT / "docs" / f"{name}.md"
+        for name in ("tutorials/simulated", "howto/stage", "tutorials/own-data", "tutorials/ci-and-dvc", "howto/python")
+    ),
+    *sorted((ROOT / "docs" / "tasks").glob("*.md")),
+    ROOT / "docs" / "rig.md",
+]
 BUILT_IN = sorted(
     name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))
 )
@@ -41,7 +58,25 @@ def section(text: str, title: str) -> str:
     return text.split(f"\n## {title}\n")[1].split("\n## ")[0]
 
 
-MORE = "…"  # in the README, for lines that a command prints besides
+@dataclass(frozen=True)
+class Block:
+    """A fenced block, the file that it is to be saved as, and why it is not run."""
+
+    language: str
+    text: str
+    title: str = ""
+    mark: str = ""
+
+
+def fenced(text: str) -> list[Block]:
+    """Return the fenced blocks of a page, with the comment ``<!-- not run: REASON -->`` above one as its mark."""
+    found = re.findall(
+        r'(?:^<!-- not run: ([^\n]+) -->\n)?^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', text, re.DOTALL | re.MULTILINE
+    )
+    return [Block(language, code, title, mark) for mark, language, title, code in found]
+
+
+MORE = "…"  # in a page, for lines that a command prints besides
 
 
 def printed(block: str) -> list[tuple[str, list[str]]]:
@@ -57,8 +92,8 @@ def printed(block: str) -> list[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_every_command_ends_in_an_example_that_parses(command: str, lab: Lab) -> None:
-    told = lab.run(f"{command} --help").out
-    example = " ".join(told.split("Example: ")[1].split("\n\n")[0].split())
+    text = lab.run(f"{command} --help").out
+    example = " ".join(text.split("Example: ")[1].split("\n\n")[0].split())
     words = shlex.split(example)
 
     assert words[0] == "tacpipe"
@@ -68,75 +103,119 @@ def test_the_help_of_every_command_ends_in_an_example_that_parses(command: str, 
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_stage_has_a_summary_that_is_a_sentence(name: str) -> None:
-    told = registry.summary(name)
+    text = registry.summary(name)
 
-    assert re.fullmatch(r"[A-Z].{8,}\.", told)
-    assert len(told) <= 120
+    assert re.fullmatch(r"[A-Z].{8,}\.", text)
+    assert len(text) < 60
 
 
 def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> None:
-    told = {**main.SUMMARIES, **commands.SUMMARIES}
+    texts = {**main.SUMMARIES, **commands.SUMMARIES}
 
     assert set(commands.NAMES) <= set(commands.SUMMARIES)
-    assert {name.partition(".")[0] for name in BUILT_IN if "." in name} <= set(told)
-    assert not [name for name, text in told.items() if not re.fullmatch(r"[A-Z].+\.", text)]
+    assert {name.partition(".")[0] for name in BUILT_IN if "." in name} <= set(texts)
+    assert not [name for name, text in texts.items() if not re.fullmatch(r"[A-Z].+\.", text)]
 
 
 @pytest.mark.long
-def test_the_commands_of_the_readme_print_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (ROOT / "README.md").read_text()
-    sixty, own = section(text, "Sixty seconds on simulated recordings"), section(text, "Your own stage")
-    (tmp_path / "own.egg-info").mkdir()
-    (entry_points,) = blocks(own, "toml")
-    points = entry_points.replace('[project.entry-points."tacpipe.stages"]', "[tacpipe.stages]").replace('"', "")
-    (tmp_path / "own.egg-info" / "entry_points.txt").write_text(points)
-    (code,) = blocks(own, "python")
-    (tmp_path / "moving_stages.py").write_text(code)
+def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_path: Path) -> None:
+    """One project folder serves all pages, so what one page computed is reused on the next."""
+    project = tmp_path / "project"
+    project.mkdir()
     environment = {"PYTHONPATH": str(tmp_path), "TACPIPE_STORE": str(tmp_path / "store"), "OMP_NUM_THREADS": "1"}
-    given = [command for block in blocks(sixty + own, "console") for command in printed(block)]
-    assert len(given) >= 12
+    before: set[str] = set()  # commands of earlier pages
 
-    for command, lines in given:
-        ran = tacpipe(tmp_path, command.removeprefix("tacpipe "), **environment)
-        assert ran.returncode == 0, f"{command}: {ran.stderr}"
-        shown = [line for line in (ran.stderr + ran.stdout).splitlines() if line]
-        seconds = re.compile(r"\d+\.\d s$")
-        wanted = [seconds.sub("", line) for line in lines]
-        found = [seconds.sub("", line) for line in shown]
-        if MORE in wanted:  # lines whose numbers are another machine's
-            at = wanted.index(MORE)
-            after = len(wanted) - at - 1
-            assert len(found) > len(wanted), command
-            found = [*found[:at], MORE, *found[len(found) - after :]]
-        assert found == wanted, command
-
-    (python,) = blocks(sixty, "python")
-    done = subprocess.run([sys.executable, "-c", python], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "trial-011" in done.stdout
-
-    for page in sorted((ROOT / "docs" / "tasks").glob("*.md")):  # whose models and datasets are those of the README
-        (python,) = blocks(page.read_text(), "python")
-        done = subprocess.run([sys.executable, "-c", python], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{page.name}: {done.stderr}"
+    for page in RUN:
+        found = [block for block in fenced(page.read_text()) if not block.mark]
+        for name, text in entry_points(found):
+            (tmp_path / f"{name}.egg-info").mkdir()
+            (tmp_path / f"{name}.egg-info" / "entry_points.txt").write_text(text)
+        here: set[str] = set()
+        for block in found:
+            if block.title:
+                (tmp_path / block.title).write_text(block.text)
+            elif block.language == "python":
+                run_python(page, block.text, project, environment)
+            elif block.language == "console":
+                for command, lines in printed(block.text):
+                    ran = tacpipe(project, command.removeprefix("tacpipe "), **environment)
+                    assert ran.returncode == 0, f"{page.name}: {command}: {ran.stderr}"
+                    shown = [line for line in (ran.stderr + ran.stdout).splitlines() if line]
+                    compare(f"{page.name}: {command}", lines, shown, again=command in before)
+                    here.add(command)
+        before |= here
 
 
-def test_the_commands_in_the_tasks_and_data_pages_exist(lab: Lab) -> None:
-    pages = [*sorted((ROOT / "docs" / "tasks").glob("*.md")), ROOT / "data" / "README.md", ROOT / "README.md"]
+def compare(name: str, lines: list[str], shown: list[str], *, again: bool) -> None:
+    """Require that a command printed the lines of its page; seconds differ, and reuse where it ran ``again``."""
+    seconds, counts = re.compile(r"\d+\.\d s$"), re.compile(r"^\d+ ran, \d+ reused, ")
+    wanted, found = ([seconds.sub("", line) for line in some] for some in (lines, shown))
+    if again:  # what the page computes was computed on an earlier page
+        wanted = ["reused" if counts.match(line) else line for line in wanted]
+        found = ["reused" if counts.match(line) and line.startswith("0 ran") else line for line in found]
+    if MORE in wanted:  # lines whose numbers are another machine's
+        at = wanted.index(MORE)
+        after = len(wanted) - at - 1
+        assert len(found) >= len(wanted), name
+        found = [*found[:at], MORE, *found[len(found) - after :]]
+    assert found == wanted, name
+
+
+def run_python(page: Path, text: str, folder: Path, environment: dict[str, str]) -> None:
+    """Require that a Python block runs."""
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        cwd=folder,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"{page.name}: {done.stderr}"
+
+
+def entry_points(found: list[Block]) -> list[tuple[str, str]]:
+    """Return name and ``entry_points.txt`` of each block of entry points."""
+    made = []
+    for block in found:
+        if block.language == "toml" and block.text.startswith("[project.entry-points"):
+            text = block.text.replace("[project.entry-points.", "[").replace('"', "")
+            made.append((text.split()[1].replace("-", "_"), text))
+    return made
+
+
+def test_every_block_of_commands_or_python_runs_or_states_why_it_does_not() -> None:
+    unmarked = [
+        f"{page.name}: {block.text[:60]}"
+        for page in PAGES
+        for block in fenced(page.read_text())
+        if block.language in ("sh", "console", "python")
+        and not block.mark
+        and (page not in RUN or block.language == "sh")
+    ]
+    reasons = [block.mark for page in PAGES for block in fenced(page.read_text()) if block.mark]
+
+    assert unmarked == []
+    assert len(reasons) >= 10 and all(len(reason) > 10 for reason in reasons)
+    assert sum(block.language == "console" for page in RUN for block in fenced(page.read_text())) >= 10
+
+
+def test_the_commands_in_all_pages_exist(lab: Lab) -> None:
     found = []
-    for page in pages:
+    for page in PAGES:
         text = page.read_text()
         lines = [line.split("#")[0] for block in blocks(text, "sh") for line in block.splitlines()]
         found += [line for line in lines if line.startswith("tacpipe ")] + re.findall(r"`(tacpipe [^`]+)`", text)
-    assert len(found) >= 20
+    known = [words for line in dict.fromkeys(found) if (words := shlex.split(re.sub(r"\.\.\.|<TAB>", "", line)))]
+    assert len(known) >= 40
 
-    for command in found:
-        words = shlex.split(command.replace("...", ""))
-        lab.run(shlex.join([*words[1:], *([] if "--help" in words else ["--help"])]))
+    for words in known:
+        if not words[1][0].isupper():  # `tacpipe COMMAND --help`
+            lab.run(shlex.join([*words[1:], *([] if {"--help", "--version"} & set(words) else ["--help"])]))
 
 
-def test_the_file_tree_of_the_readme_names_what_is_there_and_every_package() -> None:
-    (tree,) = blocks(section((ROOT / "README.md").read_text(), "What lies where"), "text")
+def test_the_file_tree_of_contributing_names_what_is_there_and_every_package() -> None:
+    (tree,) = blocks(section((ROOT / "CONTRIBUTING.md").read_text(), "What lies where"), "text")
     named = {path for line in tree.splitlines() for path in re.split(r", ", re.split(r"\s{2,}", line)[0])}
     packages = {f"tacpipe/{path.parent.name}/" for path in (ROOT / "tacpipe").glob("*/__init__.py")}
 
@@ -144,9 +223,112 @@ def test_the_file_tree_of_the_readme_names_what_is_there_and_every_package() -> 
     assert packages <= named
 
 
+def test_the_readme_is_short_and_its_picture_small() -> None:
+    text = (ROOT / "README.md").read_text()
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
+
+    assert len(text.splitlines()) < 150
+    assert len(pictures) == 1
+    for picture in (ROOT / "docs" / "images").iterdir():
+        assert picture.stat().st_size < 150_000
+    assert (ROOT / pictures[0]).exists()
+
+
+def hooks() -> ModuleType:
+    return module("hooks")
+
+
+def module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", ROOT / "docs" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)
+    return found
+
+
+def test_the_reference_has_every_command_with_the_help_that_it_prints(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = hooks()
+    named = {" ".join(words) for words in made.command_names()}
+    page = made.command_line()
+    monkeypatch.setenv("COLUMNS", "102")
+
+    assert set(COMMANDS) <= named
+    for command in ("synchronize", "store gc", "train forward", "acquire"):
+        assert lab.run(f"{command} --help").out.strip() in page
+
+
+def test_the_reference_has_every_param_of_every_stage() -> None:
+    page = hooks().params()
+
+    for name in BUILT_IN:
+        part = page.split(f"\n## {name.replace('.', ' ')}\n")[1].split("\n## ")[0]
+        for field in params_of.fields(registry.load(name)):
+            assert f"| `{field}` |" in part
+
+
+def test_the_tables_of_results_are_on_the_page_and_have_their_picture() -> None:
+    made, text = hooks(), (ROOT / "docs" / "results.md").read_text()
+    tables = sorted(path.stem for path in (ROOT / "docs" / "results").glob("*.csv"))
+    page = made.on_page_markdown(text)
+
+    assert tables == ["forward", "material", "touch"]
+    for name in tables:
+        rows = module("pictures").rows(name)
+        assert 3 <= len(rows) <= 7
+        assert all(float(row["low"]) <= module("pictures").value_of(row) <= float(row["high"]) for row in rows)
+        assert rows[0]["method"] in page and f"images/{name}.png" in page
+
+
+def test_the_params_of_the_result_pages_are_of_published_recordings(tmp_path: Path) -> None:
+    made = module("result_pages")
+    given = yaml.safe_load((ROOT / "params.yaml").read_text())
+    for name in ("bleach", "spam"):
+        (tmp_path / "vision2tactile" / name).mkdir(parents=True)
+    found = made.published(given, tmp_path)
+
+    assert "simulate" not in " ".join([found["forward"]["recordings"], found["touch"]["recordings"]])
+    assert found["forward"]["synchronize"]["grid"] == "logged" and set(found["material"]["sources"]) == {
+        "biotac",
+        "roboskin",
+    }
+    assert found["material"]["split"]["scheme"] == "authors" and "folds" not in found["material"]["split"]
+    assert found["touch"]["objects"] == [0, 1]
+    assert found["touch"]["quick"]["methods"]["pointnet"]["wrist"] == "estimated"
+    assert given["forward"]["recordings"].startswith("simulate")
+
+
+def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text()
+    generated = set(hooks().pages())
+    for page in DOCS:
+        path = page.relative_to(ROOT / "docs").as_posix()
+        assert path in navigation or path.startswith("decisions/"), path
+        for target in re.findall(r"\]\(([^)#:]+?)(?:#[^)]*)?\)", page.read_text()):
+            place = (page.parent / target).resolve()
+            assert place.exists() or place.relative_to(ROOT / "docs").as_posix() in generated, f"{path}: {target}"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "tacpipe synchronize" in (tmp_path / "site" / "reference" / "cli.html").read_text()
+    assert (tmp_path / "site" / "reference" / "python.html").read_text().count("doc-heading") > 5
+
+
 def test_the_targets_that_the_texts_name_are_in_the_makefile() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    pages = [*PAGES, ROOT / "CONTRIBUTING.md"]
     named = {name for page in pages for name in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)}
 
     assert {"demo", "test", "lint", "types", "bench"} <= named
@@ -156,10 +338,9 @@ def test_the_targets_that_the_texts_name_are_in_the_makefile() -> None:
 def test_the_install_commands_of_the_texts_work_without_a_package_index() -> None:
     about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wheel = f"./{about['name']}-{about['version']}-py3-none-any.whl"
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "data" / "README.md"]
     found = [
         words
-        for page in pages
+        for page in PAGES
         for line in re.findall(r"(?:^|`)(pip (?:install|wheel) [^`#\n]+)", page.read_text(), re.MULTILINE)
         for words in [shlex.split(line)]
     ]
@@ -174,7 +355,7 @@ def test_the_install_commands_of_the_texts_work_without_a_package_index() -> Non
         assert set(extras.split(",")) - {""} <= set(about["optional-dependencies"])
 
 
-def test_what_runs_where_is_told_as_it_is() -> None:
+def test_what_runs_where_is_as_contributing_states() -> None:
     text, make, ran = ((ROOT / name).read_text() for name in ("CONTRIBUTING.md", "Makefile", ".ci/run"))
     (targets,) = re.findall(r"^for target in (.+); do$", ran, re.MULTILINE)
     first = text.split("\n\n")[1]

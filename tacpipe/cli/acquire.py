@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 DRY_RUN_S = 3.0
 NAME = re.compile(r"[\w-][\w.-]*")
-RATE_OFF = 0.1  # share by which a rate may differ from what the rig file says before it is told
+RATE_OFF = 0.1  # fraction by which a rate may differ from the rig file's before it is reported
 
 
 def add(program: typer.Typer, summary: str) -> None:
@@ -34,38 +34,44 @@ def add(program: typer.Typer, summary: str) -> None:
         help=f"{summary}\n\nExample: tacpipe acquire rig.toml -o data/recordings --duration 30 --label material=cork",
     )
     def acquire(
-        rig: Annotated[Path | None, typer.Argument(help="The rig file; docs/rig.md tells how to write one.")] = None,
+        rig: Annotated[
+            Path | None, typer.Argument(help="Rig file, in TOML; its format is documented under Rig file.")
+        ] = None,
         output: Annotated[
             Path | None,
-            typer.Option("-o", "--output", help="Dataset to append to; --recover seals what was recorded for it too."),
+            typer.Option("-o", "--output", help="Dataset to append to."),
         ] = None,
         duration: Annotated[
-            float | None, typer.Option(help="Seconds a recording; without it until Ctrl-C or --stop.")
+            float | None, typer.Option(help="Duration of a recording, s; without it until Ctrl-C or --stop.")
         ] = None,
-        trials: Annotated[int, typer.Option(help="Recordings, one after another.")] = 1,
-        label: Annotated[list[str] | None, typer.Option(help="name=value, on every recording.")] = None,
-        note: Annotated[str | None, typer.Option(help="What the operator wants to say of it.")] = None,
+        trials: Annotated[int, typer.Option(help="Number of recordings, one after another.")] = 1,
+        label: Annotated[list[str] | None, typer.Option(help="Label of every recording, as name=value.")] = None,
+        note: Annotated[str | None, typer.Option(help="Free text, stored with every recording.")] = None,
         name: Annotated[
             str | None, typer.Option(help="Name of the recording; the time of its start by default.")
         ] = None,
-        start: Annotated[str, typer.Option(help="What starts a trial: now, key, contact or tap.")] = "now",
-        stop: Annotated[str, typer.Option(help="What stops it, beside --duration: key, contact (its end) or tap.")] = (
+        start: Annotated[str, typer.Option(help="Start of a trial: now, key, contact or tap.")] = "now",
+        stop: Annotated[str, typer.Option(help="End of a trial in addition to --duration: key, contact or tap.")] = (
             "duration"
         ),
         contact_count: Annotated[
-            float, typer.Option(help="From rest, in the sensor's unit: beyond is contact.")
+            float, typer.Option(help="Deviation from rest that counts as contact, in the sensor's unit.")
         ] = 50.0,
         tare: Annotated[
             bool | None,
-            typer.Option("--tare/--no-tare", help="Have devices tare before each trial; by default with --trials."),
+            typer.Option("--tare/--no-tare", help="Tare the devices before each trial; default with --trials."),
         ] = None,
-        dry_run: Annotated[bool, typer.Option("--dry-run", help="Open, check rates for 3 s, record nothing.")] = False,
-        recover: Annotated[bool, typer.Option("--recover", help="Seal what a crash left behind, and end.")] = False,
+        dry_run: Annotated[
+            bool, typer.Option("--dry-run", help="Open the streams and check their rates for 3 s; record nothing.")
+        ] = False,
+        recover: Annotated[
+            bool, typer.Option("--recover", help="Complete recordings that a crash cut off, and exit.")
+        ] = False,
         keep_spool: Annotated[
             bool,
-            typer.Option("--keep-spool", help="Keep the raw bytes of the links too; the spool's place is printed."),
+            typer.Option("--keep-spool", help="Keep the raw bytes of the links; the path of the spool is printed."),
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="Nothing on stderr but errors.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
         from tacpipe.recording import rig as rig_of
@@ -84,9 +90,9 @@ def add(program: typer.Typer, summary: str) -> None:
         began_s = time.monotonic()
         sealed, left = _recovered(store, output, quiet=quiet)
         if recover and not quiet:
-            _tell_others(store)
+            _report_others(store)
         if found is None or output is None or recover:
-            _tell(output, sealed, began_s, as_json=as_json)
+            _report(output, sealed, began_s, as_json=as_json)
             raise typer.Exit(FAILED if left else DONE)
         plan = trials_of.Plan(
             output,
@@ -102,7 +108,7 @@ def add(program: typer.Typer, summary: str) -> None:
         )
         recorded, lost = _record(found, store, plan, quiet=quiet)
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
-        _tell(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
+        _report(output, recorded, began_s, as_json=as_json, failed=failed if lost else None)
         if lost and as_json:  # the object on stdout holds the error already
             terminal.note(f"tacpipe: {failed}")
             raise typer.Exit(failed.exit_code)
@@ -139,7 +145,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
 
 
 def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Seal what earlier processes of this user left behind; what cannot be sealed is told and stays.
+    """Seal what earlier processes of this user left behind; what cannot be sealed is reported and stays.
 
     It keeps nobody from recording. ``output`` is the dataset that this command was given.
     """
@@ -150,7 +156,7 @@ def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[
     sealed, left = [], 0
     for folder in spool.abandoned(store.root):
         try:
-            with spool.claimed(folder) as ours:
+            with spool.locked(folder) as ours:
                 if not ours:
                     continue
                 one = trials.recover(store, folder, output)
@@ -167,11 +173,11 @@ def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[
     return sealed, left
 
 
-def _tell_others(store: Store) -> None:
+def _report_others(store: Store) -> None:
     """Print whose the spools are that another user recorded, in a store that is shared."""
     from tacpipe.recording import spool
 
-    with contextlib.suppress(OSError):  # of a disk that failed, which was said already
+    with contextlib.suppress(OSError):  # of a disk that failed, which was stated already
         others = spool.owners(store.root)
         ours = spool.users(store.root / spool.FOLDER, others.values())
         for folder in [folder for folder, owner in others.items() if owner not in ours]:
@@ -214,7 +220,7 @@ def _attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
     return {**attributes, **({"note": note} if note else {})}
 
 
-def _tell(
+def _report(
     output: Path | None,
     recorded: list[Recorded],
     began_s: float,
@@ -226,13 +232,13 @@ def _tell(
 
     if as_json:
         seconds = round(time.monotonic() - began_s, 3)
-        told = [asdict(one) for one in recorded]
+        described = [asdict(one) for one in recorded]
         where = None if output is None else str(output)
         rows = sum(sum(one.rows.values()) for one in recorded)
         value = {
             "schema_version": SCHEMA_VERSION,
             "output": where,
-            "recordings": told,
+            "recordings": described,
             "rows": rows,
             "seconds": seconds,
         }

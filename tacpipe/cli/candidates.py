@@ -1,4 +1,4 @@
-"""The command ``tacpipe candidates``: grasps that could be made on an object, and the touch a model foretells for each."""
+"""The command ``tacpipe candidates``: possible grasps on an object, and the touch that a model predicts for each."""
 
 from __future__ import annotations
 
@@ -27,28 +27,31 @@ Row = dict[str, float]
 
 def add(program: typer.Typer, summary: str) -> None:
     """Add the command ``candidates`` to ``program``."""
-    told = "\n\nOn a terminal a table is printed, elsewhere CSV; lengths are metres there, touch is in device counts."
-    program.command("candidates", help=summary + told + EXAMPLE)(candidates)
+    about = "\n\nOn a terminal a table is printed, elsewhere CSV; lengths are metres there, touch is in device counts."
+    program.command("candidates", help=summary + about + EXAMPLE)(candidates)
 
 
 def candidates(
     cloud: Annotated[
-        Path, typer.Argument(help="A file (.ply, .pcd …) with the object's points, or a dataset of grasps.")
+        Path, typer.Argument(help="File (.ply, .pcd …) with the object's points, or a dataset of grasps.")
     ],
-    recording: Annotated[str | None, typer.Option("--recording", help="Which one of a dataset.")] = None,
+    recording: Annotated[str | None, typer.Option("--recording", help="Name of the recording in a dataset.")] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="A model of task touch; tells what would be felt.")
+        Path | None, typer.Option("--model", help="Model of task touch, which predicts the touch of each grasp.")
     ] = None,
-    count: Annotated[int, typer.Option("--count", help="At most so many, spread along the object.")] = 10,
-    seed: Annotated[int, typer.Option("--seed", help="Of where the object is cut.")] = 0,
+    count: Annotated[int, typer.Option("--count", help="Maximum number of grasps, spread along the object.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the cuts through the object.")] = 0,
     shift: Annotated[
-        float, typer.Option("--shift", help="Cuts lie so far from the centroid, as a share of the object's length.")
+        float,
+        typer.Option(
+            "--shift", help="Maximum distance of cuts from the centroid, as a fraction of the object's length."
+        ),
     ] = 0.4,
     opening_mm: Annotated[
-        tuple[float, float], typer.Option("--opening-mm", help="Least and most that the fingers are apart, mm.")
+        tuple[float, float], typer.Option("--opening-mm", help="Smallest and largest opening of the fingers, mm.")
     ] = (20, 130),
     camera_m: Annotated[
-        tuple[float, float, float], typer.Option("--camera-m", help="Where the camera was in the cloud's frame, m.")
+        tuple[float, float, float], typer.Option("--camera-m", help="Position of the camera in the cloud's frame, m.")
     ] = (0, 0, 0),
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Write CSV to this file.")] = None,
     picture: Annotated[
@@ -56,16 +59,16 @@ def candidates(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Print grasps that could be made, best first."""
+    """Print possible grasps, best first."""
     _require_names(output, picture)
-    foretell = None if model is None else _touch_model(model)
+    predictor = None if model is None else _touch_model(model)
     from tacpipe.clouds.candidates import candidates as find
 
     seen = _cloud(cloud, recording)
     found = find(seen, count, seed, shift, (opening_mm[0] / 1e3, opening_mm[1] / 1e3), camera_m)
     rows = [_row(rank, candidate) for rank, candidate in enumerate(found, 1)]
-    if foretell is not None:
-        rows = [row | _touch(foretell.predict(seen, each.grasp)) for row, each in zip(rows, found, strict=True)]
+    if predictor is not None:
+        rows = [row | _touch(predictor.predict(seen, each.grasp)) for row, each in zip(rows, found, strict=True)]
     if picture is not None:
         from tacpipe.clouds.picture import draw
 
@@ -124,7 +127,7 @@ def _touch_model(path: Path) -> Any:
     task = model_files.tree(files, model_files.CONFIG).get("task") if model_files.CONFIG in files else None
     if task is not None and task != "touch":
         raise UsageError(
-            f"{path} is a model of task {plain(str(task))}; what a grasp would feel is foretold by one of task touch. "
+            f"{path} is a model of task {plain(str(task))}; what a grasp would measure is predicted by one of task touch. "
             f"`tacpipe train touch` makes one."
         )
     return tacpipe.load(path)
@@ -150,7 +153,7 @@ def _row(rank: int, candidate: Candidate) -> Row:
 
 
 def _touch(touch: Any) -> Row:
-    """Return the 50 values that a model foretells, device counts by column."""
+    """Return the 50 values that a model predicts, device counts by column."""
     values: Row = {}
     for finger in ("th", "mf"):
         values[f"pdc_{finger}_counts"] = round(float(getattr(touch, f"pdc_{finger}")), 1)
@@ -179,7 +182,7 @@ def _require_names(output: Path | None, picture: Path | None) -> None:
             raise UsageError(f"{output} must end in .csv; that is what is written. --json prints JSON instead.")
         replacing.refuse_foreign(output, HEADER.encode())
     if picture is not None and picture.suffix.lower() not in PICTURES:
-        raise UsageError(f"{picture} is no name for a picture; it must end in one of {', '.join(PICTURES)}.")
+        raise UsageError(f"{picture} is not a name for a picture; it must end in one of {', '.join(PICTURES)}.")
 
 
 def _write(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""The commands beside the stages: what looks after datasets and the store."""
+"""The commands other than stages: what manages datasets and the store."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from tacpipe.io import terminal
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
-    "acquire": "Record a rig: every stream that its rig file lists, without losing or inventing a sample.",
-    "label": "Change labels of recordings, or exclude them, without touching a shard.",
-    "show": "Show what is in a dataset: recordings and labels, a split's roles, a model, or a result's headline.",
-    "explain": "Show where a dataset comes from, down to the raw files, and what changed against the last run.",
-    "sensors": "Look after sensors: list those that are known, find out which one speaks on a port, emulate a rig.",
-    "store": "Manage the store: status, list, checkout, verify, repair, gc, link, push, pull.",
-    "candidates": "List grasps that two fingers could make on an object, and what a model says each would feel.",
-    "demo": "Run the main job on the simulated rig, small, from recordings to a report.",
+    "acquire": "Record every stream of a rig.",
+    "label": "Change the labels of recordings, or exclude recordings.",
+    "show": "Show what is in a dataset, split, model or result.",
+    "explain": "Show where a dataset comes from and what changed.",
+    "sensors": "List, probe and emulate sensors.",
+    "store": "Manage what keeps the bytes: verify, repair, push, pull.",
+    "candidates": "List grasps on an object, with the predicted touch of each.",
+    "demo": "Run a whole pipeline on simulated recordings.",
+    "version": "Show the versions of tacpipe, Python and libraries.",
 }
 
 
@@ -31,10 +32,12 @@ def _label(program: typer.Typer) -> None:
     )
     def label(
         dataset: Annotated[Path, typer.Argument(help="The recordings.")],
-        names: Annotated[list[str], typer.Argument(help="Names of recordings; * and ? stand for any letters.")],
-        set_: Annotated[list[str] | None, typer.Option("--set", help="name=value; a value of null removes it.")] = None,
-        exclude: Annotated[str | None, typer.Option("--exclude", help="Leave out of every stage, and why.")] = None,
-        include: Annotated[bool, typer.Option("--include", help="Take back an --exclude.")] = False,
+        names: Annotated[list[str], typer.Argument(help="Names of recordings; * and ? match any letters.")],
+        set_: Annotated[list[str] | None, typer.Option("--set", help="Label as name=value; null removes it.")] = None,
+        exclude: Annotated[
+            str | None, typer.Option("--exclude", help="Leave out of all stages, for this reason.")
+        ] = None,
+        include: Annotated[bool, typer.Option("--include", help="Undo --exclude.")] = False,
         as_json: AsJson = False,
     ) -> None:
         from tacpipe.datasets import labels
@@ -55,9 +58,7 @@ def _show(program: typer.Typer) -> None:
     def show(
         dataset: Annotated[Path, typer.Argument(help="A dataset.")],
         as_json: AsJson = False,
-        full: Annotated[
-            bool, typer.Option("--full", help="Every recording, not the first 20, and every label.")
-        ] = False,
+        full: Annotated[bool, typer.Option("--full", help="All recordings, not the first 20, and all labels.")] = False,
     ) -> None:
         from tacpipe.cli import show as overview
 
@@ -76,14 +77,22 @@ def _explain(program: typer.Typer) -> None:
 def _demo(program: typer.Typer) -> None:
     @program.command("demo", help=SUMMARIES["demo"] + "\n\nExample: tacpipe demo -o demo")
     def demo(
-        output: Annotated[Path, typer.Option("-o", "--output", help="Where to write.")] = Path("demo"),
+        output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")] = Path("demo"),
         rig: Annotated[
-            Path | None, typer.Option("--rig", help="Emulate this rig, record it live, and run the chain on that.")
+            Path | None, typer.Option("--rig", help="Rig file to emulate and record; the chain runs on that.")
         ] = None,
     ) -> None:
         from tacpipe.cli import demo as demonstration
 
         terminal.result(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
+
+
+def _version(program: typer.Typer) -> None:
+    @program.command("version", help=SUMMARIES["version"] + "\n\nExample: tacpipe version --json")
+    def version(as_json: AsJson = False) -> None:
+        from tacpipe.cli import versions
+
+        _print(versions.of_parts(), versions.to_text, as_json=as_json)
 
 
 def _store(program: typer.Typer) -> None:
@@ -124,4 +133,5 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "store": _store,
     "candidates": _candidates,
     "demo": _demo,
+    "version": _version,
 }

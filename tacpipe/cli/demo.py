@@ -124,7 +124,7 @@ def _run(several: list[list[str]]) -> None:
     for command in several:
         terminal.note("$ tacpipe " + " ".join(command))
         process = subprocess.Popen([sys.executable, "-m", "tacpipe", *command], stdout=subprocess.DEVNULL)
-        with termination.saying(""):  # the command says it
+        with termination.reporting(""):  # the command states it
             try:
                 code = process.wait()
             except KeyboardInterrupt:

@@ -10,11 +10,11 @@ import typer
 
 from tacpipe.io import terminal
 
-SUMMARY = "Serve the streams of a rig file without hardware, each with its own bytes at its own rate."
+SUMMARY = "Emulate the streams of a rig without hardware."
 EXAMPLE = (
-    "\n\nFOLDER/rig.toml is the rig file with the addresses that were made: give it to `tacpipe acquire`. FOLDER/ledger "
-    "tells at the end what was sent and what was harmed.\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o "
-    "emulated --faults noise=0.5,drop=0.001"
+    "\n\nEach stream sends its sensor's own bytes at its own rate. FOLDER/rig.toml is the rig file with the emulated "
+    "addresses: give it to `tacpipe acquire`. FOLDER/ledger lists at the end what was sent and which bytes were changed."
+    "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o emulated --faults noise=0.5,drop=0.001"
 )
 MARK = b"\nsimulated = true\n"  # in the rig file of an emulated rig
 SWITCH_S = 0.0005  # that the planning thread may hold up the pacing one; Python's own 5 ms would be seen at 1 kHz
@@ -26,15 +26,13 @@ def add(program: typer.Typer) -> None:
 
 
 def emulate(
-    rig: Annotated[Path, typer.Argument(help="The rig file.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for rig.toml, pseudo-terminals and the ledger.")
     ],
-    duration: Annotated[float | None, typer.Option("--duration", help="Seconds; without it, until Ctrl-C.")] = None,
-    faults: Annotated[
-        str, typer.Option("--faults", help="What goes wrong: noise=0.5,cut=0.2,flip=1,drop=0.001 …")
-    ] = "",
-    seed: Annotated[int, typer.Option("--seed", help="Of what happens in the world and goes wrong.")] = 0,
+    duration: Annotated[float | None, typer.Option("--duration", help="Duration, s; without it, until Ctrl-C.")] = None,
+    faults: Annotated[str, typer.Option("--faults", help="Faults to add: noise=0.5,cut=0.2,flip=1,drop=0.001 …")] = "",
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the simulated world and of the faults.")] = 0,
 ) -> None:
     """Serve a rig."""
     from tacpipe.datasets import replacing
@@ -57,5 +55,5 @@ def emulate(
         for ledger in emulator.ledger.values():
             ledger.write(output / "ledger")
     for name, ledger in emulator.ledger.items():
-        told = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
-        terminal.note(f"{name}: {told or 'nobody listened'}")
+        described = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
+        terminal.note(f"{name}: {described or 'nobody listened'}")

@@ -30,18 +30,18 @@ def show(headlines: Sequence[Headline]) -> None:
     from rich.table import Table
 
     heads, rows = headline.table(headlines)
-    told = Table(
+    grid = Table(
         box=box.SIMPLE_HEAD,
         caption=printable.shown(headline.caption(headlines)),
         caption_justify="left",
         pad_edge=False,
     )
     for at, head in enumerate(heads):
-        told.add_column(printable.shown(head), justify="left" if at < 2 else "right")
+        grid.add_column(printable.shown(head), justify="left" if at < 2 else "right")
     styles = {headline.BETTER: "green", headline.WORSE: "red"}
     for row, one in zip(rows, _each(headlines), strict=True):
-        told.add_row(*map(printable.shown, row), style=styles.get(one.verdict) if row[0] else "dim")
-    Console(stderr=True, highlight=False, markup=False).print(told)
+        grid.add_row(*map(printable.shown, row), style=styles.get(one.verdict) if row[0] else "dim")
+    Console(stderr=True, highlight=False, markup=False).print(grid)
 
 
 def _each(headlines: Sequence[Headline]) -> list[Headline]:

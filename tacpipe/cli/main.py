@@ -1,7 +1,7 @@
-"""The command line: one command a registered stage, and those that look after datasets and the store.
+"""The command line: one command a registered stage, and those that manage datasets and the store.
 
-Only the command that was asked for is built, and only its module imported: ``tacpipe --help`` and a hit must not wait for
-torch, pyarrow, pandas, scikit-learn or open3d. What it takes to build one comes once wishes to end are heeded.
+Only the requested command is built, and only its module imported: ``tacpipe --help``, shell completion and a hit must not
+wait for torch, pyarrow, pandas, scikit-learn or open3d. A command is built after the signal handlers are installed.
 """
 
 from __future__ import annotations
@@ -11,27 +11,27 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.cli import addresses
+from tacpipe.cli import addresses, completion
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.io import memory, terminal, termination
-from tacpipe.io.files import told
+from tacpipe.io.files import describe
 from tacpipe.plugins import extras, failures
 
 if TYPE_CHECKING:
     import typer
 
-HELP = """From a tactile sensor's cable to a table of results that can be traced back to its bytes.
+HELP = """From a tactile sensor's recordings to results that trace back to the recorded bytes.
 
-Stages read and write datasets: `tacpipe STAGE INPUT... -o OUTPUT`. What was computed before is not computed again.
+Stages read and write datasets: `tacpipe STAGE INPUT... -o OUTPUT`. Stored results are not recomputed.
 Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data, 5 device missing or lost,
 6 lock wait timed out, 130 interrupted.
 """
 SUMMARIES = {
     "ingest": "Read published recordings into a dataset.",
-    "segment": "Mark what matters in recordings.",
-    "compress": "Turn tactile channels into latents.",
-    "train": "Train a model.",
-    "simulate": "Write recordings of the simulated rig, with ground truth.",
+    "segment": "Mark contacts and slips, or cut out slides and grasps.",
+    "compress": "Compress tactile channels to a few latents.",
+    "train": "Train the model of a task.",
+    "simulate": "Simulate recordings of a rig, with ground truth.",
 }
 
 
@@ -43,15 +43,19 @@ def app(arguments: Sequence[str]) -> typer.Typer:
     from tacpipe.plugins import registry
 
     program = typer.Typer(
-        help=HELP, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+        help=HELP,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
     )
 
     @program.callback()
-    def version(show: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
+    def version(show: bool = typer.Option(False, "--version", help="Show versions and exit.")) -> None:
         if show:
-            from importlib.metadata import version as installed
+            from tacpipe.cli import versions
 
-            terminal.result(installed("tacpipe"))
+            terminal.result(versions.to_text(versions.of_parts()))
             raise typer.Exit
 
     first = next((argument for argument in arguments if not argument.startswith("-")), None)
@@ -69,16 +73,16 @@ def app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line of this process, which ends within a second of Ctrl-C; exit with the documented codes."""
+    """Run the command line of this process, which exits within a second of Ctrl-C; exit with the documented codes."""
     code = INTERRUPTED
     try:
         terminal.prepare()
         memory.guard()
-        termination.heed()
+        termination.install_handlers()
         code = _printed(answer(sys.argv[1:]))
     except KeyboardInterrupt:  # as it began, or after it was done
-        termination.tell()
-    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be told apart
+        termination.report()
+    except (MemoryError, RuntimeError) as error:  # before a command was found, or where none can be distinguished
         short = memory.shortage(error)
         if short is None:
             raise
@@ -113,17 +117,17 @@ def answer(arguments: Sequence[str]) -> int:
         code, sentence = INTERRUPTED, ""
     except BrokenPipeError:
         return DONE
-    except OSError as error:  # of a disk or of permissions, where nobody closer by could tell more
-        code, sentence = FAILED, str(memory.shortage(error) or told(error))
+    except OSError as error:  # of a disk or of permissions, where nobody closer by could state more
+        code, sentence = FAILED, str(memory.shortage(error) or describe(error))
         _complain(sentence)
     except Exception as error:
         found = str(memory.shortage(error) or "") or failures.text(error)
-        if found is None and not termination.wished():
+        if found is None and not termination.requested():
             raise
         code, sentence = FAILED, str(found)
         _complain(sentence)
-    if code == INTERRUPTED or (code != DONE and termination.wished()):
-        termination.tell()
+    if code == INTERRUPTED or (code != DONE and termination.requested()):
+        termination.report()
         code, sentence = INTERRUPTED, "The command was interrupted."
     if sentence and "--json" in arguments:
         terminal.result_json({"schema_version": 1, "error": sentence, "exit_code": code})
@@ -131,7 +135,7 @@ def answer(arguments: Sequence[str]) -> int:
 
 
 def _complain(sentence: str) -> None:
-    if not termination.wished():
+    if not termination.requested():
         terminal.note(f"tacpipe: {sentence}")
 
 
@@ -139,8 +143,11 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
     """Return the exit code of a command line, and what was wrong with how it is written."""
     import typer
 
-    program = app(arguments)
+    from tacpipe.cli import help as plain_help
+
+    program = app(arguments if (asked := completion.words()) is None else asked)
     addresses.refuse(program)
+    plain_help.apply(program)
     try:
         with extras.named("This command"):
             code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
@@ -202,4 +209,4 @@ def _first(names: dict[str, str], group: str) -> str:
 
 
 def _nothing() -> None:
-    """Stand for a command that was not asked for."""
+    """Represent a command that was not requested."""

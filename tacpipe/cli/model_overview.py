@@ -1,4 +1,4 @@
-"""What a model is and what a result says: read from JSON and the headers of weights, so that nothing heavy is imported."""
+"""What a model is and what a result states: read from JSON and the headers of weights, so that nothing heavy is imported."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
 
 def model_text(value: Mapping[str, Any]) -> list[str]:
     """Return the lines that `of_model` is shown as."""
-    told = [
+    described = [
         ("task", value["task"]),
         ("architecture", value["architecture"]),
         ("parameters", f"{value['parameters']:,}" if value["parameters"] else None),
@@ -77,7 +77,7 @@ def model_text(value: Mapping[str, Any]) -> list[str]:
         ("behind", ", then ".join(value["chain"]) or None),
         *_from(value["inputs"]),
     ]
-    return _aligned(told)
+    return _aligned(described)
 
 
 def result_text(value: Mapping[str, Any]) -> list[str]:
@@ -88,7 +88,7 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
         lines = headline.text([headline.Headline.from_json(one) for one in value["headline"]]).splitlines()
     parts = {name: flat(one) for name, one in value["by_part"].items()}
     fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
-    told = [
+    described = [
         ("task", value["task"]),
         ("architecture", value["architecture"]),
         ("evaluated on", flat(value["evaluated_on"])),
@@ -98,7 +98,7 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
         *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
         *_from(value["inputs"]),
     ]
-    return [*lines, "", *_aligned(told)]
+    return [*lines, "", *_aligned(described)]
 
 
 def flat(value: Any) -> str:
@@ -107,7 +107,7 @@ def flat(value: Any) -> str:
     >>> flat({"train": {"a": 35, "b": 33}, "val": 2, "names": []}), flat(list(range(20))), flat(None), flat(0.5)
     ('train a 35, train b 33, val 2', '20 values', '–', '0.5')
     """
-    return ", ".join(f"{name} {told}".strip() for name, told in _leaves(value)) or headline.NONE
+    return ", ".join(f"{name} {described}".strip() for name, described in _leaves(value)) or headline.NONE
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
@@ -126,7 +126,7 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return task, architecture, what was trained on, and what else a configuration says in few words."""
+    """Return task, architecture, what was trained on, and what else a configuration states in few words."""
     trained = config.get("trained_on")
     return {
         **{name: config.get(name) for name in ("task", "architecture")},
@@ -135,15 +135,15 @@ def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
             "roles": {role: one for role, one in config.get("counts", {}).items() if role in _ROLES},
         },
         "about": {
-            name.replace("_", " "): told
+            name.replace("_", " "): described
             for name, one in config.items()
-            if name not in _APART and (told := _short(one)) is not None
+            if name not in _APART and (described := _short(one)) is not None
         },
     }
 
 
 def _short(value: Any) -> str | None:
-    """Return an entry of a configuration in few words; None for one that is empty, or large and says nothing so."""
+    """Return an entry of a configuration in few words; None for one that is empty, or large and states nothing so."""
     if isinstance(value, Mapping):
         if all(not isinstance(one, Mapping | list) for one in value.values()) and len(value) <= SHOWN:
             return flat(value) if value else None
@@ -165,7 +165,9 @@ def _trained(trained: Mapping[str, Any]) -> list[str]:
 
 
 def _from(inputs: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name if not at else "", told) for name, several in inputs.items() for at, told in enumerate(several)]
+    return [
+        (name if not at else "", described) for name, several in inputs.items() for at, described in enumerate(several)
+    ]
 
 
 def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
@@ -221,8 +223,8 @@ def _parameters(opened: Dataset) -> int | None:
     return count or None
 
 
-def _aligned(told: list[tuple[str, Any]]) -> list[str]:
+def _aligned(described: list[tuple[str, Any]]) -> list[str]:
     """Return names and values in two columns; what is None is left out."""
-    shown = [(name, str(value)) for name, value in told if value is not None and value != ""]
+    shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0)
     return [f"{name:<{width}}  {value}" for name, value in shown]

@@ -36,7 +36,9 @@ def add(program: typer.Typer, summary: str) -> None:
 
 
 def list_(as_json: AsJson = False) -> None:
-    """List the sensors that a rig file may name: how they are reached, how fast they are, what they are.
+    """List the sensors that a rig file can name.
+
+    Each with its links, its rate and a description.
 
     Example: tacpipe sensors list
     """
@@ -53,15 +55,15 @@ def list_(as_json: AsJson = False) -> None:
 
 def probe(
     port: Annotated[
-        str | None, typer.Argument(help="An address such as serial:/dev/ttyACM0, or a path; all that are there.")
+        str | None, typer.Argument(help="Address such as serial:/dev/ttyACM0, or a path; without it, all ports.")
     ] = None,
-    passive: Annotated[bool, typer.Option("--passive", help="Only listen; write nothing to a device.")] = False,
+    passive: Annotated[bool, typer.Option("--passive", help="Only listen; send nothing to a device.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say which sensor speaks on a port, and what speaks for it: listen first, then ask as each driver does.
+    """Identify the sensor on each port, with the evidence.
 
-    What is asked are the questions with which a recording begins. Ports that are not USB are only listened to unless named.
-    Exits with 5 if nothing was recognised anywhere.
+    Listens first, then sends the requests with which each driver begins a recording. A port that is not USB is only
+    listened to, unless it is named. Exits with 5 if nothing was recognised.
 
     Example: tacpipe sensors probe serial:/dev/ttyACM0
     """
@@ -71,13 +73,13 @@ def probe(
     reports = []
     for address, usb_id in found:
         unasked = passive or (port is None and not usb_id)  # a machine's own port may lead anywhere, a console even
-        reports.append(probing.probe(address, usb_id, passive=unasked, tell=_tell))
+        reports.append(probing.probe(address, usb_id, passive=unasked, progress=_report))
         if not as_json:
             terminal.result(_text(reports[-1]))
     if as_json:
         terminal.result_json({"schema_version": SCHEMA_VERSION, "ports": [_json(report) for report in reports]})
     elif not found:
-        terminal.result("There is no serial port and no HID device. Plug one in, or name an address.")
+        terminal.result("No serial port and no HID device is present. Plug one in, or name an address.")
     if not any(report.findings for report in reports):
         raise typer.Exit(DEVICE)
 
@@ -88,12 +90,12 @@ def _row(name: str) -> dict[str, Any]:
     except TacpipeError as error:  # a plug-in's, which must not hide the others
         return {"name": name, "links": [], "rate_hz": None, "baud": None, "summary": str(error), "exclusive": ""}
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
-    told = {key: value for key, value in defaults.items() if value is not dataclasses.MISSING}
-    baud = told.get("baud") if "serial" in kind.links else None
+    described = {key: value for key, value in defaults.items() if value is not dataclasses.MISSING}
+    baud = described.get("baud") if "serial" in kind.links else None
     return {
         "name": name,
         "links": list(kind.links),
-        "rate_hz": told.get("rate_hz"),
+        "rate_hz": described.get("rate_hz"),
         "baud": baud,
         "summary": kind.summary,
         "exclusive": kind.exclusive,
@@ -122,7 +124,7 @@ def _usb_id(port: str) -> str:
     return next((there.usb_id for there in ports.serial_ports() if there.address == str(_address(port))), "")
 
 
-def _tell(step: str) -> None:
+def _report(step: str) -> None:
     if sys.stderr.isatty():
         terminal.note(step)
 
@@ -131,9 +133,11 @@ def _text(report: Report) -> str:
     if report.error:
         return f"{report.address}: {report.error}"
     if not report.heard and not report.findings:
-        return f"{report.address}: silent, whoever asks. Check that the device is switched on."
+        return f"{report.address}: no bytes, whichever driver asked. Check that the device is switched on."
     if not report.findings:
-        return f"{report.address}: {report.heard:,} bytes came that no driver can explain; describe it with `generic`."
+        return (
+            f"{report.address}: {report.heard:,} bytes came that match no driver; describe the sensor with `generic`."
+        )
     first, *others = report.findings
     at = f" at {report.baud:,} baud" if report.baud else ""
     when = " once asked" if report.asked else ""

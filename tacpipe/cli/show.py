@@ -120,10 +120,10 @@ def _stream(shard: Recording, stream: str) -> dict[str, Any]:
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
     """Return the overview as lines: one a stream of each recording that was read, then labels; then files and totals."""
-    told = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
-    if value["kind"] in told:
+    texts = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
+    if value["kind"] in texts:
         made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        return printable.lines([*told[value["kind"]](value), *_files(value), made])
+        return printable.lines([*texts[value["kind"]](value), *_files(value), made])
     return printable.lines(_recordings_text(value, full))
 
 

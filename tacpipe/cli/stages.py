@@ -109,16 +109,16 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
         terminal.note(f"tacpipe: left out {name}: {why}")
     if not quiet:
         terminal.note(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s")
-    told: dict[str, Any] = {}
+    extra: dict[str, Any] = {}
     if headline is not None and (as_json or not quiet):
         from tacpipe.cli import headline_table
 
         found = headline_table.of_output(outcome.output, headline)
-        told["headline"] = [one.to_json() for one in found]
+        extra["headline"] = [one.to_json() for one in found]
         if not quiet:
             headline_table.show(found)
     if as_json:
-        terminal.result_json({"schema_version": 1, **outcome.to_json(), **told})
+        terminal.result_json({"schema_version": 1, **outcome.to_json(), **extra})
     else:
         terminal.result(outcome.output)
     if outcome.differs:
@@ -205,7 +205,7 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
         ),
         ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
-        ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Go on without recordings that cannot be read.")),
+        ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),
         ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
         (
             "compare",
@@ -234,12 +234,12 @@ def _parsed(given: Any, wanted: Any) -> Any:
 def _about(stage: AnyStage, name: str, comment: str) -> str:
     """Return the help of an option: its comment, what it may be, which choices have it, and its default."""
     wanted = params_of.fields(stage)[name]
-    told = [comment] if comment else []
+    parts = [comment] if comment else []
     if fields_of.constraints(wanted):
-        told.append(fields_of.describe(wanted))
+        parts.append(fields_of.describe(wanted))
     if owners := params_of.having(stage, name):
-        told.append(f"only with {params_of.tag(stage)} {', '.join(owners)}")
-    return f"{'; '.join(told)} [{' or '.join(map(str, params_of.defaults(stage, name)))}]".strip()
+        parts.append(f"only with {params_of.tag(stage)} {', '.join(owners)}")
+    return f"{'; '.join(parts)} [{' or '.join(map(str, params_of.defaults(stage, name)))}]".strip()
 
 
 def _metavar(wanted: Any) -> str:

@@ -18,9 +18,9 @@ from tacpipe.store.store import Store, locate
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
 Remote = Annotated[Path, typer.Argument(help="The other store, a directory.")]
-OtherStore = Annotated[Path | None, typer.Option("--store", help="Another store than the project's, as one pushed to.")]
+OtherStore = Annotated[Path | None, typer.Option("--store", help="Store to read instead of the project's own.")]
 Replace = Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")]
-Ancestors = Annotated[bool, typer.Option("--ancestors", help="With the shards of all that the datasets descend from.")]
+Ancestors = Annotated[bool, typer.Option("--ancestors", help="Include the shards of all ancestors.")]
 
 
 def add(program: typer.Typer, summary: str) -> None:
@@ -32,7 +32,7 @@ def add(program: typer.Typer, summary: str) -> None:
 
 
 def status(as_json: AsJson = False) -> None:
-    """Show where the store is, how much lies in it, and which paths hold which manifest.
+    """Show the place, size and roots of the store.
 
     Example: tacpipe store status
     """
@@ -43,7 +43,9 @@ def status(as_json: AsJson = False) -> None:
 
 
 def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
-    """List the datasets that the store knows: stage, time, recordings, labels, last path. Replaced ones are among them.
+    """List the datasets in the store, replaced ones included.
+
+    Each with stage, time, number of recordings and labels, and last path.
 
     Example: tacpipe store list
     """
@@ -63,7 +65,7 @@ def checkout(
     replace: Replace = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a dataset that the store knows to a directory, with the labels that were set by hand.
+    """Write a stored dataset, with its labels, to a directory.
 
     Example: tacpipe store checkout 3f2a91c0d4e5 -o data/recordings
     """
@@ -77,7 +79,9 @@ def checkout(
 
 
 def verify(as_json: AsJson = False) -> None:
-    """Read every object and record; exit with 4 if one is damaged or missing. Damaged ones are quarantined.
+    """Check every stored object and record for damage.
+
+    Damaged ones are quarantined. Exits with 4 if one is damaged or missing.
 
     Example: tacpipe store verify
     """
@@ -90,7 +94,9 @@ def verify(as_json: AsJson = False) -> None:
 
 
 def repair(as_json: AsJson = False) -> None:
-    """Make again what is damaged or missing; exit with 4 if something cannot be made again.
+    """Recompute stored objects that are damaged or missing.
+
+    Exits with 4 if one cannot be recomputed.
 
     Example: tacpipe store repair
     """
@@ -103,19 +109,19 @@ def repair(as_json: AsJson = False) -> None:
 
 
 def gc(
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be removed.")] = False,
-    recordings: Annotated[
-        bool, typer.Option("--recordings", help="Also recordings that nothing names any more.")
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be removed.")] = False,
+    recordings: Annotated[bool, typer.Option("--recordings", help="Include recordings that no dataset names.")] = False,
     grace_days: Annotated[
-        float, typer.Option("--grace-days", help="How long a dataset counts whose path cannot be reached.")
+        float, typer.Option("--grace-days", help="Days for which a dataset at an unreachable path is kept.")
     ] = garbage.GRACE_DAYS,
     forget: Annotated[
-        list[str] | None, typer.Option("--forget", help="A dataset, pushed or gone, that need not be kept any longer.")
+        list[str] | None, typer.Option("--forget", help="Dataset, pushed or deleted, to keep no longer.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Remove what no dataset, nothing that one descends from, and no running process needs.
+    """Remove stored objects that nothing needs.
+
+    Needed are those of datasets, of their ancestors and of running processes.
 
     Example: tacpipe store gc --dry-run
     """
@@ -145,7 +151,9 @@ def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
 
 
 def link(datasets: Paths) -> None:
-    """Link shards beside their manifest anew, for programs that read the files directly.
+    """Link the shards of datasets next to their manifests.
+
+    This restores the files for programs that read them directly.
 
     Example: tacpipe store link data/synced
     """
@@ -153,7 +161,7 @@ def link(datasets: Paths) -> None:
 
     for path in datasets:
         count = upkeep.link(path)
-        terminal.result(f"{path}: {count} linked anew")
+        terminal.result(f"{path}: {count} linked again")
 
 
 def push(
@@ -161,18 +169,20 @@ def push(
     datasets: Paths,
     ancestors: Ancestors = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Also read what is there already, not only its size.")
+        bool, typer.Option("--verify", help="Check the content of what is there already, not only its size.")
     ] = False,
     replace: Annotated[
         bool,
-        typer.Option("--replace", help="Push although another computer pushed there since; that stays in the history."),
+        typer.Option("--replace", help="Push over what another computer pushed there; that stays in the history."),
     ] = False,
     project: Annotated[
         str, typer.Option("--project", metavar="NAME", help="Push as this project of the other store, now and later.")
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Copy what datasets need to another store, as snapshots of this project. Those before stay there.
+    """Copy datasets to another store as snapshots.
+
+    The snapshots belong to this project; earlier ones stay there.
 
     Example: tacpipe store push /mnt/lab/store models/forward data/latents data/split
     """
@@ -189,7 +199,9 @@ def pull(
     replace: Replace = False,
     as_json: AsJson = False,
 ) -> None:
-    """Copy what datasets need from another store: those whose manifest is here, else what was pushed from that path.
+    """Copy datasets from another store.
+
+    A dataset whose manifest is here is completed; of any other, what was pushed from that path is written.
 
     Example: tacpipe store pull /mnt/lab/store models/forward data/latents data/split
     """

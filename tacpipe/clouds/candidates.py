@@ -24,15 +24,15 @@ from tacpipe.errors import TacpipeError, UsageError
 Floats = NDArray[np.float64]
 
 COUNT = 10
-SHIFT = 0.4  # share of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
+SHIFT = 0.4  # fraction of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
 OPENING_M = (0.020, 0.130)  # of the published grasps 0.026 to 0.121
-FEWEST = 50  # points of a cloud that tells a shape; published ones have 814 and more
+FEWEST = 50  # points of a cloud that states a shape; published ones have 814 and more
 MOST = 20_000  # points that are looked at: more add time and no shape
 FEWEST_CUT = 6  # points of a cut
 FLAT_M = 0.003  # thickness below which a cloud is a plane with noise; the thinnest published one has 0.026
 HALF_CUT_M = 0.007  # half the thickness of a cut, as in GeoGrasp
-TRIM = 0.02  # share of a cut's points at either end that may be stray
-EDGE = 0.2  # share of a cut's width that is an edge
+TRIM = 0.02  # fraction of a cut's points at either end that may be stray
+EDGE = 0.2  # fraction of a cut's width that is an edge
 TRIES = 3  # cuts for each candidate, of which the best stays
 UPRIGHT = 0.9  # cosine to the view above which the object stands towards the camera and its axis is of no use
 OFF_PLANE = 0.4  # weight of the mean distance to the plane, against 1 for each cosine; chosen on the published grasps
@@ -84,8 +84,8 @@ def candidates(
     bounds = np.linspace(-shift, shift, count + 1) * frame.length_m
     draws = np.random.default_rng(seed).uniform(size=(count, TRIES))
     found = []
-    for low, high, shares in zip(bounds[:-1], bounds[1:], draws, strict=True):
-        tried = [cuts.best(low + share * (high - low)) for share in (shares if shift else shares[:1])]
+    for low, high, fractions in zip(bounds[:-1], bounds[1:], draws, strict=True):
+        tried = [cuts.best(low + fraction * (high - low)) for fraction in (fractions if shift else fractions[:1])]
         held = [candidate for candidate in tried if candidate is not None]
         if held:
             found.append(max(held, key=lambda candidate: candidate.score))
@@ -115,7 +115,7 @@ def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
     if not widths_m:
         return (
             f"No cut through the cloud has {FEWEST_CUT} points within {HALF_CUT_M * 1e3:g} mm; the cloud is too sparse to "
-            f"tell where its edges are. Take one with more points."
+            f"state where its edges are. Take one with more points."
         )
     return (
         f"The object is {min(widths_m) * 1e3:.0f} to {max(widths_m) * 1e3:.0f} mm wide where it was cut, and the fingers "
@@ -126,7 +126,7 @@ def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
 def _thinned(cloud: Cloud, seed: int) -> Cloud:
     if len(cloud) < FEWEST:
         raise TacpipeError(
-            f"The cloud has {len(cloud)} points; to tell a shape it takes {FEWEST} or more. Is it the object's cloud?"
+            f"The cloud has {len(cloud)} points; to state a shape it takes {FEWEST} or more. Is it the object's cloud?"
         )
     if len(cloud) <= MOST:
         return cloud
@@ -191,7 +191,7 @@ class _Cuts:
         rights = cut[(position >= high - EDGE * width) & (position <= high)]
         if not len(lefts) or not len(rights):
             return None
-        scores, cosines = self._judged(lefts, rights, shift_m)
+        scores, cosines = self._scored(lefts, rights, shift_m)
         left, right = np.unravel_index(int(np.argmax(scores)), scores.shape)
         if not np.isfinite(scores[left, right]):
             return None
@@ -200,7 +200,7 @@ class _Cuts:
         score = float(scores[left, right] - OFF_CENTRE * abs(shift_m) / self._frame.length_m)
         return Candidate(grasp, score, off_deg, float(shift_m))
 
-    def _judged(self, lefts: NDArray[np.intp], rights: NDArray[np.intp], shift_m: float) -> tuple[Floats, Floats]:
+    def _scored(self, lefts: NDArray[np.intp], rights: NDArray[np.intp], shift_m: float) -> tuple[Floats, Floats]:
         """Return the scores (left, right) of all pairs, and the cosine of the closing axis to the worse normal."""
         apart = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
         opening = np.linalg.norm(apart, axis=2)

@@ -26,7 +26,7 @@ class Cloud:
     colours: NDArray[np.uint8] | None = None  # (point, rgb), 0 to 255
 
     def __post_init__(self) -> None:
-        """Refuse what is no cloud."""
+        """Refuse what is not a cloud."""
         if self.points_m.ndim != 2 or self.points_m.shape[1] != 3:
             raise TacpipeError(f"Points have the shape {self.points_m.shape}; a cloud's are (point, xyz).")
         if self.colours is not None and self.colours.shape != self.points_m.shape:
@@ -75,7 +75,7 @@ class Cloud:
 
 
 def require_columns(table: pa.Table, names: Sequence[str]) -> None:
-    """Raise `TacpipeError` naming the first of ``names`` that is no column of the table."""
+    """Raise `TacpipeError` naming the first of ``names`` that is not a column of the table."""
     there = set(table.column_names)  # which the table lists anew each time that it is asked
     missing = [name for name in names if name not in there]
     if missing:

@@ -48,7 +48,7 @@ class DepthFrame:
     def of_bytes(cls, content: bytes) -> DepthFrame:
         """Return the frame that `to_bytes` gave. Raises `TacpipeError` where it is none or was cut off."""
         if len(content) < HEADER.size or not content.startswith(MAGIC):
-            raise TacpipeError(f"{len(content)} bytes are no depth frame; it must begin with {MAGIC.decode()}.")
+            raise TacpipeError(f"{len(content)} bytes are not a depth frame; it must begin with {MAGIC.decode()}.")
         _, width, height, coloured, *optics = HEADER.unpack_from(content)
         pixels = width * height
         if len(content) != HEADER.size + pixels * (5 if coloured else 2):

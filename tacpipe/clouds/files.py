@@ -27,7 +27,7 @@ def read(path: Path | str) -> Cloud:
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise TacpipeError(f"{path} is no cloud that can be read; it must end in one of {', '.join(SUFFIXES)}.")
+        raise TacpipeError(f"{path} is not a cloud that can be read; it must end in one of {', '.join(SUFFIXES)}.")
     if not path.exists() or path.is_dir():
         raise TacpipeError(f"There is no file {path}; give the file of a cloud of points.")
     regular.require(path, path.stat().st_mode)
@@ -86,7 +86,7 @@ def _told(path: Path) -> int:
     told = int(filled[0][0])
     if _rows(path) < told:  # open3d takes memory for as many as are told
         raise TacpipeError(
-            f"{path} tells of {told} points, and {_rows(path)} can be read: it was cut off. Copy it again from its source."
+            f"{path} declares {told} points, and {_rows(path)} can be read: it was cut off. Copy it again from its source."
         )
     return told
 
@@ -101,7 +101,7 @@ def _by_open3d(path: Path, told: int) -> Cloud:
     held = _rows(path) if path.suffix.lower() == ".pts" else len(points)
     if min(held, len(points)) != told or not told:
         raise TacpipeError(
-            f"{path} tells of {told} points, and {min(held, len(points))} can be read: it was cut off, or some are no "
+            f"{path} declares {told} points, and {min(held, len(points))} can be read: it was cut off, or some are not "
             f"numbers. Copy it again from its source."
         )
     _require_finite(path, points)

@@ -1,4 +1,4 @@
-"""Axes in which a grasp looks the same however the object lies: those of the wrist, or what can be told of them."""
+"""Axes in which a grasp looks the same however the object lies: those of the wrist, or what can be determined of them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ STEEPEST = 0.999  # cosine between closing axis and line of sight beyond which a
 
 
 def estimated_wrist(grasp: Grasp) -> Floats:
-    """Return axes for a wrist that is not told (component, axis): approach along the line of sight, closing, and third.
+    """Return axes for a wrist that is not stated (component, axis): approach along the line of sight, closing, and third.
 
     The camera, at the origin, looks down on the object as the hand comes down on it; the approach axis is the line of sight
     to the middle of the grasp less its share along the closing axis. Where nothing is left, because the fingers close
-    along the line of sight or about the camera itself, the frame's axis that is most square to closing stands for it.
+    along the line of sight or about the camera itself, the frame's axis that is most square to closing represents it.
     """
     sight = grasp.middle_m / max(float(np.linalg.norm(grasp.middle_m)), 1e-12)
     if not sight.any() or abs(sight @ grasp.closing) > STEEPEST:
@@ -36,7 +36,7 @@ def axes(approach: Floats, closing: Floats) -> Floats:
 
 
 def wrist_of(grasp: Grasp) -> Floats:
-    """Return the axes of a grasp (component, axis): approach, closing, third; the approach is the wrist's where it is told.
+    """Return the axes of a grasp (component, axis): approach, closing, third; the approach is the wrist's where it is given.
 
     The closing axis is that from g1 to g2, whatever a wrist's second axis is; a wrist that approaches along it gives its
     second axis for the first, so that the axes still turn with it.

@@ -21,11 +21,11 @@ from tacpipe.clouds.grasp import Grasp
 Floats = NDArray[np.float64]
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
-RADII_M = (0.015, 0.025, 0.04)  # of the patches about each contact: a fingertip's pad, and what lies beside it
+RADII_M = (0.015, 0.025, 0.04)  # of the patches about each contact: a fingertip's pad, and what lies next to it
 SLICE_M = 0.01  # half the thickness of the slice that the fingers close in
 BINS = 10  # of that slice, from finger to finger
 NEAREST = 50  # points whose mean colour is that of a contact
-FEWEST = 6  # points of a patch below which its shape is not told
+FEWEST = 6  # points of a patch below which its shape is not stated
 NEAR_M = 0.05  # about a contact, within which a quadric is fitted
 FEWEST_FITTED = 30  # points below which none is
 AXES = ("approach", "closing", "third")
@@ -97,7 +97,7 @@ def _extent(points: Floats) -> dict[str, float]:
 def _principal_axes(points: Floats) -> dict[str, float]:
     """Return the object's principal sizes, how its axes lie to the grasp, and where along the longest the grasp is.
 
-    An axis has two ends and no sign, so that products of its components are told.
+    An axis has two ends and no sign, so that products of its components are given.
     """
     centre = points.mean(axis=0)
     variances, directions = np.linalg.eigh(np.cov(points.T))
@@ -159,8 +159,12 @@ def _outwards(normal: Floats, place_m: float) -> Floats:
 
 def _colours(colours: Floats) -> dict[str, float]:
     """Return mean, spread and quantiles of the colours, and of their shares, which shade leaves as they are."""
-    shares = colours / (colours.sum(axis=1, keepdims=True) + 1)
+    proportions = colours / (colours.sum(axis=1, keepdims=True) + 1)
     found = _named("colour_mean", colours.mean(axis=0), "rgb") | _named("colour_spread", colours.std(axis=0), "rgb")
     for share, values in zip((10, 50, 90), np.quantile(colours, (0.1, 0.5, 0.9), axis=0), strict=True):
         found |= _named(f"colour_quantile{share}", values, "rgb")
-    return found | _named("share_mean", shares.mean(axis=0), "rgb") | _named("share_spread", shares.std(axis=0), "rgb")
+    return (
+        found
+        | _named("share_mean", proportions.mean(axis=0), "rgb")
+        | _named("share_spread", proportions.std(axis=0), "rgb")
+    )

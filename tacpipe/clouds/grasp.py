@@ -25,7 +25,7 @@ ORTHONORMAL = 1e-3  # by which a wrist's rotation may miss being one: what files
 class Grasp:
     """Two contact points in the frame of their cloud and, where it is known, the wrist's rotation.
 
-    Raises `TacpipeError` for values that are not finite, two points that are one, and a wrist that is no rotation.
+    Raises `TacpipeError` for values that are not finite, two points that are one, and a wrist that is not a rotation.
     """
 
     g1_m: Floats  # (xyz), metres

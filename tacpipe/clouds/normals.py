@@ -20,7 +20,7 @@ def normals(cloud: Cloud, radius_m: float = RADIUS_M, camera_m: Sequence[float] 
     """Return the unit normals (point, xyz) of the surface that a cloud was seen on, each turned towards the camera.
 
     A normal is the direction in which the neighbours within ``radius_m`` spread least; where there are fewer than two, it
-    says nothing. Raises `TacpipeError` if open3d is not installed.
+    states nothing. Raises `TacpipeError` if open3d is not installed.
     """
     camera = np.asarray(camera_m, np.float64)
     with open3d() as library:

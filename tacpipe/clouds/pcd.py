@@ -102,12 +102,12 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
         width, height = (_whole(path, keyword, lines[keyword]) for keyword in ("WIDTH", "HEIGHT"))
         if width * height != points:
             raise TacpipeError(
-                f"{path} says WIDTH {width}, HEIGHT {height} and POINTS {points}; points must be width times height. "
+                f"{path} states WIDTH {width}, HEIGHT {height} and POINTS {points}; points must be width times height. "
                 f"Copy the file again."
             )
     data = " ".join(lines["DATA"])
     if data not in ("ascii", "binary", "binary_compressed"):
-        raise TacpipeError(f"{path} says DATA {plain(data)}; it must be ascii, binary or binary_compressed.")
+        raise TacpipeError(f"{path} states DATA {plain(data)}; it must be ascii, binary or binary_compressed.")
     return Header(_point(path, lines), points, data, length)
 
 
@@ -120,8 +120,9 @@ def require_compressed(path: Path, content: bytes, header: Header) -> None:
     size, told = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
     if there < size or told != needed or needed > size * LZF_MOST:
         raise TacpipeError(
-            f"{path} tells {header.points} points of {header.point.itemsize} bytes, and {max(there, 0)} bytes follow that "
-            f"say they are {size}, and {told} once unpacked: it was cut off or its header is wrong. Copy the file again."
+            f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(there, 0)} bytes "
+            f"follow that declare {size}, and {told} once unpacked: it was cut off or its header is wrong. Copy the "
+            "file again."
         )
 
 
@@ -142,7 +143,7 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
         end = content.find(b"\n", place, LONGEST_HEADER)
         if end < 0:
             raise TacpipeError(
-                f"{path} is no PCD file or was cut off: its header ends without a line DATA. Give a PCD file of version "
+                f"{path} is not a PCD file or was cut off: its header ends without a line DATA. Give a PCD file of version "
                 f"0.7, or copy it again."
             )
         words = content[place:end].decode("latin-1").split()
@@ -151,7 +152,7 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
             continue
         if words[0] not in KEYWORDS or words[0] in lines:
             raise TacpipeError(
-                f"{path} is no PCD file: its header has the line {' '.join(words)[:60]!r}, where one of "
+                f"{path} is not a PCD file: its header has the line {' '.join(words)[:60]!r}, where one of "
                 f"{', '.join(KEYWORDS)} must begin each line, once. Give a PCD file of version 0.7."
             )
         lines[words[0]] = words[1:]
@@ -161,7 +162,7 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
 def _whole(path: Path, keyword: str, words: list[str]) -> int:
     if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()) or len(words[0]) > DIGITS:
         raise TacpipeError(
-            f"{path} says {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
+            f"{path} states {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
             f"Copy the file again."
         )
     return int(words[0])
@@ -213,13 +214,13 @@ def _of_bytes(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
     there, needed = len(content) - header.length, header.points * size
     if there < needed:
         raise TacpipeError(
-            f"{path} was cut off or its header is wrong: it tells {header.points} points of {size} bytes, and "
+            f"{path} was cut off or its header is wrong: it declares {header.points} points of {size} bytes, and "
             f"{there // size} follow. Copy the file again."
         )
     if any(content[header.length + needed :]):
         raise TacpipeError(
-            f"{path} tells {header.points} points of {size} bytes, and behind them {there - needed} bytes follow that are "
-            f"no padding with zeros. Copy the file again."
+            f"{path} declares {header.points} points of {size} bytes, and behind them {there - needed} bytes follow "
+            "that are not padding with zeros. Copy the file again."
         )
     return np.frombuffer(content, header.point, header.points, header.length)
 

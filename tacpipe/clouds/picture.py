@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-G1, G2 = "#d55e00", "#0072b2"  # told apart by eyes that do not tell red from green
+G1, G2 = "#d55e00", "#0072b2"  # distinguished by eyes that do not distinguish red from green
 GREY, GROUND = "#707070", "#ececec"  # of points without colours; behind all points, so that white ones are seen
 
 
 def draw(cloud: Cloud, found: Sequence[Candidate], path: Path) -> None:
-    """Write a picture to ``path``: the cloud in its colours from two sides, each grasp a line, its rank beside g1.
+    """Write a picture to ``path``: the cloud in its colours from two sides, each grasp a line, its rank next to g1.
 
-    The ending tells the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the file
+    The ending states the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the file
     cannot be written.
     """
     with extras.named("A picture"):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-UNIT_M = 0.05  # length in which coefficients are told, so that they are of one order
-SMALLEST = 1e-9  # added to the mean squared gradient, for points that tell nothing of a coefficient
+UNIT_M = 0.05  # length in which coefficients are given, so that they are of one order
+SMALLEST = 1e-9  # added to the mean squared gradient, for points that state nothing of a coefficient
 
 
 @dataclass(frozen=True)

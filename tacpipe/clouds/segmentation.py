@@ -1,4 +1,4 @@
-"""The object of a grasp, told from its table and the things beside it in a view of the camera.
+"""The object of a grasp, derived from its table and the things next to it in a view of the camera.
 
 What lies in front of the table's plane falls into clusters, and the object is the one that is nearest to the grasp. The
 plane is found by random samples (Fischler and Bolles, "Random Sample Consensus", 1981), clusters by density (Ester et al.,
@@ -25,7 +25,7 @@ PLANES = 4  # the largest ones, among which the table is looked for: a floor, wa
 LONGEST_M = 0.4  # that an object may be along any axis; the published ones are 0.28 m at most
 DEEPEST_M = 0.1  # that an object can be above the middle of a grasp: 20 cm are more than a hand can lift so
 NOISES = 3.0  # standard deviations of the table's points about its plane, beyond which a point lies in front of it
-SAMPLED = 10_000  # points that tell a plane as well as all of a view do
+SAMPLED = 10_000  # points that state a plane as well as all of a view do
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Limits:
     cluster_points: int  # that a point must have so near, itself included, to be inside of a thing
     object_points: int  # that a thing must have
     near_m: float  # that the object may be from the grasp
-    outlier_neighbours: int  # whose mean distance tells a stray point
+    outlier_neighbours: int  # whose mean distance states a stray point
     outlier_deviations: float  # standard deviations of that distance above its mean, beyond which a point is stray
 
 
@@ -72,7 +72,7 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Ro
     if length_m > LONGEST_M:
         raise TacpipeError(
             f"What is near the grasp is {1e3 * length_m:.0f} mm long, and what a hand lifts {1e3 * LONGEST_M:g} mm at most: "
-            f"it has grown together with the table, or with things beside it. Raise --plane-mm or lower --cluster-mm."
+            f"it has grown together with the table, or with things next to it. Raise --plane-mm or lower --cluster-mm."
         )
     found: Rows = rows[_inliers(points_m[rows], limits)]
     return found
@@ -81,28 +81,28 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Ro
 def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -> Floats:
     """Return the table's plane (normal and offset, 4): of the large ones behind the middle of the grasp the nearest.
 
-    The normal has length 1 and points to the camera's side, where the grasp lies. Sides of the object are no table: the
+    The normal has length 1 and points to the camera's side, where the grasp lies. Sides of the object are not a table: the
     grasp lies within it, behind what the camera sees. Raises `TacpipeError` if there is no such plane that holds
     ``plane_share`` of the points (point, xyz).
     """
     left = np.arange(len(points_m))
     found: list[tuple[float, Floats]] = []
-    shares: list[float] = []
-    while len(shares) < PLANES and len(left) >= max(3.0, limits.plane_share * len(points_m)):
+    fractions: list[float] = []
+    while len(fractions) < PLANES and len(left) >= max(3.0, limits.plane_share * len(points_m)):
         plane = _largest_plane(points_m[left], limits, seed)
         within = np.abs(heights_m(points_m[left], plane)) <= limits.plane_m
-        shares.append(np.count_nonzero(within) / len(points_m))
+        fractions.append(np.count_nonzero(within) / len(points_m))
         height_m = float(heights_m(grasp.middle_m[None], plane)[0])
-        if shares[-1] >= limits.plane_share and height_m > limits.plane_m:
+        if fractions[-1] >= limits.plane_share and height_m > limits.plane_m:
             found.append((height_m, plane))
         left = left[~within]
     if found:
         return min(found, key=lambda item: item[0])[1]
-    told = ", ".join(f"{100 * share:.0f}" for share in shares) or "0"
+    percentages = ", ".join(f"{100 * fraction:.0f}" for fraction in fractions) or "0"
     raise TacpipeError(
-        f"No table is found: the largest planes hold {told} % of {len(points_m)} points, and one with the grasp in front of "
-        f"it must hold {100 * limits.plane_share:g} %. Give the view with its table, or the object's points as the stream "
-        f"`cloud`."
+        f"No table is found: the largest planes hold {percentages} % of {len(points_m)} points, and one with the grasp in "
+        f"front of it must hold {100 * limits.plane_share:g} %. Give the view with its table, or the object's points as "
+        f"the stream `cloud`."
     )
 
 
@@ -135,7 +135,7 @@ def _cloud(library: Any, points_m: Floats) -> Any:
 
 
 def _largest_plane(points_m: Floats, limits: Limits, seed: int) -> Floats:
-    """Return the plane (4,) that the most points (point, xyz) lie in, told from `SAMPLED` of them."""
+    """Return the plane (4,) that the most points (point, xyz) lie in, derived from `SAMPLED` of them."""
     sampled = points_m
     if len(points_m) > SAMPLED:
         sampled = np.random.default_rng(seed).choice(points_m, SAMPLED, replace=False)
@@ -161,7 +161,7 @@ def _clusters(points_m: Floats, limits: Limits) -> NDArray[np.int64]:
 
 
 def _inliers(points_m: Floats, limits: Limits) -> Rows:
-    """Return which points (point, xyz) are no stray ones."""
+    """Return which points (point, xyz) are not a stray ones."""
     with open3d() as library:
         _, kept = _cloud(library, points_m).remove_statistical_outlier(
             limits.outlier_neighbours, limits.outlier_deviations

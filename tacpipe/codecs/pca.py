@@ -62,11 +62,11 @@ class PCA:
         return encode_finite(self.project, frame_stacking.inputs(values, begins, self.of, 1), len(self.components))
 
     def project(self, inputs: Floats) -> Floats:
-        """Return the latents (row, latent) of finite rows (row, channel), levels or increments as ``of`` says."""
+        """Return the latents (row, latent) of finite rows (row, channel), levels or increments as ``of`` states."""
         return ((inputs - self.mean_count) / self.scale_count) @ self.components.T
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts that latents stand for as float64, (…, latent) to (…, channel)."""
+        """Return the counts that latents represent as float64, (…, latent) to (…, channel)."""
         return (latents @ self.components) * self.scale_count + self.mean_count
 
     def to_files(self) -> dict[str, bytes]:

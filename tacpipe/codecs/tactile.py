@@ -45,7 +45,7 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
         level = metadata(schema.field(name)).get("rest")
         if level is None:
             raise TacpipeError(
-                f"Channel {name} has no rest level, so its counts cannot be told from its load. "
+                f"Channel {name} has no rest level, so its counts cannot be distinguished from its load. "
                 "Run `tacpipe segment contacts` first: it writes the level into the column's metadata."
             )
         rest.append(float(level))

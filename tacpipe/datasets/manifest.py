@@ -130,7 +130,7 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
         ) from None
     if computed != stored:
         raise DamagedError(
-            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it says {excerpt(stored)[1:13]}. "
+            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it states {excerpt(stored)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     return manifest

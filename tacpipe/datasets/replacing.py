@@ -93,7 +93,7 @@ def occupant(store: Store, output: Path) -> Manifest | None:
         if known is None:
             raise DamagedError(
                 f"{error} Labels that were set by hand may be in it, and would be lost: bring it back with git, or remove "
-                f"it to go on without them."
+                f"it to continue without them."
             ) from None
         return known
 

@@ -28,8 +28,8 @@ class Scheme:
     """How recordings are dealt out."""
 
     name: str = "random"
-    val: float = 0.15  # share of the recordings, or of those left for training where the scheme picks the test ones
-    test: float = 0.15  # share of the recordings; of no effect where the scheme picks them
+    val: float = 0.15  # fraction of the recordings, or of those left for training where the scheme picks the test ones
+    test: float = 0.15  # fraction of the recordings; of no effect where the scheme picks them
     seed: int = 0
     folds: int = 5  # of kfold
     by: str = "object"  # attribute whose values leave-one-out leaves out one by one

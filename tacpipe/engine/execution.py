@@ -96,7 +96,7 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments:
         try:
-            with memory.told(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
+            with memory.raising_shortage(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
                 returned = stage(params, **arguments)
         except Exception as error:
             failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))

@@ -78,7 +78,8 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
         ours, theirs = context.Pipe()
         alive, life = context.Pipe(duplex=False)
         workers[ours] = life
-        with termination.held(), _death_told(), _without_main():  # who hears half of what it is to do would say so
+        # a worker that received half of its task would report that
+        with termination.deferred(), _death_told(), _without_main():
             context.Process(target=_work, args=(theirs, alive)).start()
         theirs.close()
         alive.close()
@@ -132,7 +133,7 @@ def _work(tasks: Connection, alive: Connection) -> None:
 
 def _computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
     try:
-        with memory.told():
+        with memory.raising_shortage():
             return [compute(task) for task in chunk]
     except Exception as error:  # a mistake in a stage, which is raised again where the stage was asked for
         import pickle

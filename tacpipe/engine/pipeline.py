@@ -173,7 +173,7 @@ class _Run:
         if "split" in inputs.named:
             return keys.of_dataset(given, reads, inputs.in_role(given, self.request.role or "test"))
         if self.request.role is not None:
-            raise UsageError(f"--role {self.request.role} says nothing without --split.")
+            raise UsageError(f"--role {self.request.role} has no effect without --split.")
         return keys.of_dataset(given, reads, given.included)
 
     def _whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:

@@ -38,7 +38,9 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     no folder, holds no slide, or holds one twice.
     """
     if not source.is_dir():
-        raise TacpipeError(f"{source} is no folder; give the folder that holds the slides, mat1_1_bio.csv and so on.")
+        raise TacpipeError(
+            f"{source} is not a folder; give the folder that holds the slides, mat1_1_bio.csv and so on."
+        )
     found: dict[str, dict[str, Path]] = {}
     for place, _, names in walk(source):
         for name in names:
@@ -47,7 +49,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
                 continue
             files = found.setdefault(recording_name(int(match[1]), int(match[2])), {})
             same = next((path for other, path in files.items() if other.endswith(f"_{match[3]}.csv")), None)
-            if same is not None:  # mat3_7_bio.csv in two folders, or beside mat03_7_bio.csv
+            if same is not None:  # mat3_7_bio.csv in two folders, or next to mat03_7_bio.csv
                 raise UsageError(
                     f"{same} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
                 )
@@ -75,7 +77,10 @@ def recording_name(material: int, trial: int) -> str:
 
 @stage(version=2, discover=discover)
 def biotac_slide(params: Params, files: Files) -> RecordingOutput:
-    """Return the stream biotac of a slide, and those of the arm that are there; angular velocity that is NaN stays so."""
+    """Read published slides of a BioTac over materials.
+
+    Returns the stream biotac, and those of the arm that are there; angular velocity that is NaN stays so.
+    """
     from tacpipe.formats import published, xela
 
     streams: dict[str, pa.Table] = {}
@@ -91,7 +96,7 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
             streams[stream] = _arm(path, stream, columns)
     begin = next(iter(streams.values()))["t_ns"]
     marked = published.mark("biotac-slide", begin[0].as_py() if len(begin) else 0)
-    # all published slides of a material were recorded in a row; of others nobody says so
+    # all published slides of a material were recorded in a row; of others nobody states it
     session = {"session": f"biotac-m{material:02d}"} if marked else {}
     return RecordingOutput(
         streams,

@@ -48,7 +48,7 @@ def read_csv(
     in a comma, whether the header does or not. ``seconds`` names a column of unix seconds with nine decimals at most,
     which then stands first in the table, as ``t_ns``: exact nanoseconds, int64. Blank lines hold no row. Raises
     `TacpipeError`, naming file and row, for: an empty file, one without rows, a missing or doubled column, a row of
-    another width, a cell that is no number, NaN unless ``allow_nan``, infinity, seconds that are no such time, and, with
+    another width, a cell that is not a number, NaN unless ``allow_nan``, infinity, seconds that are not such time, and, with
     ``integers``, a fraction or a value out of the type's range.
     """
     names = read_header(path)
@@ -69,7 +69,7 @@ def read_csv(
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         fault = _first_fault(path, names, trailing_comma, seconds)
-        raise TacpipeError(fault or f"{path} is no CSV file: {plain(str(error), 200)}.") from error
+        raise TacpipeError(fault or f"{path} is not a CSV file: {plain(str(error), 200)}.") from error
     if not table.num_rows:
         raise TacpipeError(f"{path} has a header and no rows; the recording is empty. Delete it or record it again.")
     if tail and any(cell != "" for cell in table.column(len(names)).unique().to_pylist()):
@@ -116,7 +116,7 @@ def read_record(path: Path) -> dict[str, str]:
     elif surplus > 0:
         raise TacpipeError(
             f"{path}, row {line} has {len(cells)} fields under a header of {len(names)}; "
-            f"which of them is too much cannot be told. Put quotes around text with commas."
+            f"which of them is too much cannot be determined. Put quotes around text with commas."
         )
     return {name: cell.strip() for name, cell in zip(names, cells, strict=False)}
 
@@ -159,7 +159,7 @@ def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> N
 
 
 def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds: str = "") -> str | None:
-    """Return a sentence about the first row that is no row of numbers, or None."""
+    """Return a sentence about the first row that is not a row of numbers, or None."""
     rows = _rows(path)
     next(rows)
     for line, cells in rows:
@@ -172,8 +172,8 @@ def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds
             return f"{path}, row {line} has {len(cells)} fields instead of {len(names)}; {cause}. Copy the file again."
         for name, cell in zip(names, cells, strict=True):
             if not _NUMBER.fullmatch(cell):
-                told = f"column {plain(name)} holds {excerpt(cell)}"
-                return f"{path}, row {line}, {told}, which is no number. Put the cell right."
+                described = f"column {plain(name)} holds {excerpt(cell)}"
+                return f"{path}, row {line}, {described}, which is not a number. Correct the cell."
             if name == seconds and not _STAMP.fullmatch(cell):
                 return (
                     f"{path}, row {line}, column {name} holds {plain(cell)}; it must be seconds since 1970 with "

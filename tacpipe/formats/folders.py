@@ -29,10 +29,13 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
 
     A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
     recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
-    Raises `TacpipeError` if ``source`` is no folder or holds no trial, `UsageError` where two trials share a name even so.
+    Raises `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` where two trials share a name
+    even so.
     """
     if not source.is_dir():
-        raise TacpipeError(f"{source} is no folder; give the folder that holds the trials, each a folder of CSV files.")
+        raise TacpipeError(
+            f"{source} is not a folder; give the folder that holds the trials, each a folder of CSV files."
+        )
     wanted = set(names)
     holds: dict[Path, set[str]] = {}  # which of the wanted files each trial has
     for place, _, files in walk(source):
@@ -70,7 +73,7 @@ def require(files: Files, names: Sequence[str]) -> str:
 
 
 def text(name: str) -> str:
-    """Return a name of the file system as text: bytes in it that are no UTF-8 become U+FFFD."""
+    """Return a name of the file system as text: bytes in it that are not a UTF-8 become U+FFFD."""
     return os.fsencode(name).decode(errors="replace")
 
 

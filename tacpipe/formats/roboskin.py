@@ -2,7 +2,7 @@
 
 Published within dexrob/BioTac_slide_20_50 as arrays (slide, triangle, taxel, time) of 200 slides, a file a fold, with a
 file of labels each. Their axes went through a wrong reshape before (`tacpipe.signals.scrambling`); which arrangement a file
-has is told from its values. The rate is not published.
+has is derived from its values. The rate is not published.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
 class Params:
     """How slides are read."""
 
-    rate_hz: Rate = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
+    rate_hz: Rate = 50.0  # frames a second that stamps are made from; nominal, the set does not state
     # time: frames in order of time; authors: in the order in which they were published, to compare with
     layout: Literal["time", "authors"] = "time"
 
@@ -57,11 +57,11 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
     A block is ``icub_fold_0.npy`` (or ``icub_val_0.npy``, as it is published) or ``icub_test.npy``, its labels
     ``labels_fold_0.npy`` and so on in the same folder. Folders below one that holds blocks are not searched. Raises
-    `TacpipeError` if ``source`` is no folder, holds no block, or one twice, or where labels are missing or the block is no
-    array of slides.
+    `TacpipeError` if ``source`` is not a folder, holds no block, or one twice, or where labels are missing or the block
+    is no array of slides.
     """
     if not source.is_dir():
-        raise TacpipeError(f"{source} is no folder; give the folder that holds icub_fold_0.npy and so on.")
+        raise TacpipeError(f"{source} is not a folder; give the folder that holds icub_fold_0.npy and so on.")
     blocks: dict[str, Path] = {}
     for name, path in _found(source):
         if name in blocks:
@@ -76,7 +76,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     for name, path in sorted(blocks.items()):
         labels = path.with_name(path.name.replace("icub", "labels", 1))
         if not labels.is_file():
-            raise TacpipeError(f"{path} has no labels: {labels.name} is not beside it. Copy both files.")
+            raise TacpipeError(f"{path} has no labels: {labels.name} is not next to it. Copy both files.")
         for slide in range(_slides(path)):
             found[f"roboskin-{name}-{slide:03d}"] = {f"{file.name}[{slide}]": file for file in (path, labels)}
     return found
@@ -84,7 +84,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def roboskin(params: Params, files: Files) -> RecordingOutput:
-    """Return the stream roboskin of a slide: 60 columns, triangle by triangle, one row a frame; stamps are made."""
+    """Read published slides of an iCub RoboSkin.
+
+    Returns the stream roboskin: 60 columns, triangle by triangle, one row a frame; stamps follow from the mean rate.
+    """
     import numpy as np
 
     from tacpipe.channels import schema
@@ -93,7 +96,7 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.signals.scrambling import scramble
 
     (block, place), (labels, _) = sorted((path, _place(name)) for name, path in files.items())
-    slide = _felt(block, place)  # (triangle, taxel, time)
+    slide = _values(block, place)  # (triangle, taxel, time)
     if params.layout == "authors":
         slide = scramble(slide)
     frames = slide.shape[-1]
@@ -147,13 +150,13 @@ def _slides(path: Path) -> int:
             f"{path} has the shape {excerpt(shape)}; it must be (slide, triangle, taxel, time). Give the set's own files."
         )
     if kind is None:
-        told = excerpt(head["descr"])
+        described = excerpt(head["descr"])
         raise TacpipeError(
-            f"{path} cannot be read as an array of numbers: it holds {told}. Copy it again from its source."
+            f"{path} cannot be read as an array of numbers: it holds {described}. Copy it again from its source."
         )
     if math.prod(shape) * int(kind[1]) > held:
         raise TacpipeError(
-            f"{path} cannot be read as an array of numbers: it tells of {excerpt(shape)} numbers of {kind[1]} bytes, and "
+            f"{path} cannot be read as an array of numbers: it declares {excerpt(shape)} numbers of {kind[1]} bytes, and "
             f"{held} bytes follow. Copy it again from its source."
         )
     return int(shape[0])
@@ -172,11 +175,11 @@ def _part(block: Path) -> dict[str, Attribute]:
     return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
 
 
-def _felt(path: Path, place: int) -> NDArray[np.float32]:
-    """Return a slide as it was felt (triangle, taxel, time), float32; its values are checked.
+def _values(path: Path, place: int) -> NDArray[np.float32]:
+    """Return a slide as it was measured (triangle, taxel, time), float32; its values are checked.
 
-    Where a slide alone does not tell which of its axes is time, because next to nothing was touched, its block does.
-    Raises `TacpipeError` for values that are no readings, and where time cannot be found.
+    Where a slide alone does not state which of its axes is time, because next to nothing was touched, its block does.
+    Raises `TacpipeError` for values that are not readings, and where time cannot be found.
     """
     import numpy as np
 
@@ -198,12 +201,12 @@ def _felt(path: Path, place: int) -> NDArray[np.float32]:
             f"{path}, slide {place} holds values from {slide.min():g} to {slide.max():g}; readings lie from 0 to "
             f"{LARGEST:g}. It looks like 8-bit numbers that wrapped. Copy the file again, or leave the slide out."
         )
-    for told_by in (slide, block):
-        if is_time(told_by, -1, ALONG_TIME):
+    for evidence in (slide, block):
+        if is_time(evidence, -1, ALONG_TIME):
             return slide
-        if is_time(unscramble(told_by), -1, ALONG_TIME):
-            felt: NDArray[np.float32] = unscramble(slide)
-            return felt
+        if is_time(unscramble(evidence), -1, ALONG_TIME):
+            values: NDArray[np.float32] = unscramble(slide)
+            return values
     raise TacpipeError(
         f"{path}, slide {place}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
         f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {ALONG_TIME} or "
@@ -249,7 +252,7 @@ def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
         read_head = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
         shape, _, kind = read_head(file)
         if math.prod(shape) * kind.itemsize > len(content):  # before memory is taken for it
-            raise ValueError(f"its head claims {math.prod(shape)} numbers, and it has {len(content)} bytes")
+            raise ValueError(f"its head declares {math.prod(shape)} numbers, and it has {len(content)} bytes")
         found: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
@@ -258,5 +261,5 @@ def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
 
 
 def _unreadable(path: Path, error: BaseException) -> TacpipeError:
-    told = plain(" ".join(str(error).split()), 200)
-    return TacpipeError(f"{path} cannot be read as an array of numbers: {told}. Copy it again from its source.")
+    described = plain(" ".join(str(error).split()), 200)
+    return TacpipeError(f"{path} cannot be read as an array of numbers: {described}. Copy it again from its source.")

@@ -1,4 +1,4 @@
-"""Grasps of a Shadow hand, felt by two BioTac SP and seen by a camera before: yayaneath/vision2tactile (RA-L 2020).
+"""Grasps of a Shadow hand, measured by two BioTac SP and seen by a camera before: yayaneath/vision2tactile (RA-L 2020).
 
 A grasp is a folder named after its unix time, in the folder of its object: the object's cloud of points
 (``cloud-object.pcd``), the two points that the fingers were sent to (``best-grasp.txt``), and one reading of both fingers
@@ -49,10 +49,12 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
     Files are named as they lie, ``bleach/1561629162/tactile.tac``, so that object and time are part of a key. Where an
     earlier grasp has the same reading, byte by byte, its file is there too, as ``duplicate_of=`` and that recording's name:
-    no other recording bears on a key. Raises `TacpipeError` if ``source`` is no folder, holds no grasp, or one twice.
+    no other recording bears on a key. Raises `TacpipeError` if ``source`` is not a folder, holds no grasp, or one twice.
     """
     if not source.is_dir():
-        raise TacpipeError(f"{source} is no folder; give the folder that holds those of the objects, bleach and so on.")
+        raise TacpipeError(
+            f"{source} is not a folder; give the folder that holds those of the objects, bleach and so on."
+        )
     found: dict[str, dict[str, Path]] = {}
     named: list[tuple[str, Path]] = []
     for place, _, names in walk(source):
@@ -76,7 +78,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def vision2tactile(params: Params, files: Files) -> RecordingOutput:
-    """Return the streams cloud, grasp and reading of a grasp; one with the reading of an earlier one is marked."""
+    """Read published grasps with a point cloud and BioTac SPs.
+
+    Returns the streams cloud, grasp and reading; a grasp with the reading of an earlier one is marked.
+    """
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema
@@ -113,7 +118,7 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
 def session(label: str, time_s: int) -> str:
     """Return the session of a grasp: all of one object on one day (UTC).
 
-    Between days lie 18 hours or more of the published grasps, within one less than two: a grasp's own time tells its
+    Between days lie 18 hours or more of the published grasps, within one less than two: a grasp's own time states its
     session, whichever others are there.
 
     >>> session("bleach", 1561629162)
@@ -209,8 +214,8 @@ def _reading(path: Path) -> list[int]:
         count = cell.strip()
         if not (count.isascii() and count.isdigit() and len(count) <= 4 and int(count) <= LARGEST):
             raise TacpipeError(
-                f"{path}, row 1, field {place}: {count[:20]!r} is no count; it must be a whole number from 0 to {LARGEST} "
-                f"(12 bits). Copy it again."
+                f"{path}, row 1, field {place}: {count[:20]!r} is not a count; it must be a whole number from 0 to "
+                f"{LARGEST} (12 bits). Copy it again."
             )
         values.append(int(count))
     return values

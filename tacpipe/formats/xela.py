@@ -45,7 +45,7 @@ def read_floats(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
 
 
 def read_marker(path: Path, name: str) -> tuple[NDArray[np.float64], float]:
-    """Return the pose of a marker (time, 7), NaN where the camera did not see it, and the share of such rows.
+    """Return the pose of a marker (time, 7), NaN where the camera did not see it, and the fraction of such rows.
 
     Raises `TacpipeError`, naming file and row, where the quaternion has not length 1.
     """

@@ -1,7 +1,7 @@
 """Trials of two XELA uSkin on a Franka arm that grasps, lifts and moves household objects (RSS 2022).
 
 Published as imanlab/tactile_prediction_flat_dataset. A trial is a folder of CSV files with one row a callback and no
-clock: only the mean rate is known, so the stamps are made from it and say so. Robot and marker files may lack one row.
+clock: only the mean rate is known, so the stamps are made from it and state it. Robot and marker files may lack one row.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def xela_flat(params: Params, files: Files) -> RecordingOutput:
-    """Return the streams xela1, xela2, robot, marker1 and marker2 of a trial; an unseen marker is NaN."""
+    """Read published trials of two XELA uSkin, flat folder.
+
+    Returns the streams xela1, xela2, robot, marker1 and marker2; an unseen marker is NaN.
+    """
     import numpy as np
 
     from tacpipe.channels import schema

@@ -29,7 +29,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=1, discover=discover)
 def xela_psc(params: Params, files: Files) -> RecordingOutput:
-    """Return the streams xela1, xela2, robot, marker and slip of a trial; an unseen marker is NaN."""
+    """Read published trials of two XELA uSkin, with slip.
+
+    Returns the streams xela1, xela2, robot, marker and slip; an unseen marker is NaN.
+    """
     import numpy as np
     import pyarrow as pa
 
@@ -98,7 +101,7 @@ def _poses(path: Path) -> NDArray[np.float64]:
     if (error > ORTHONORMAL_TOLERANCE).any():
         row = int((error > ORTHONORMAL_TOLERANCE).argmax())
         raise TacpipeError(
-            f"{path}, row {file_row(path, row)}: ee_T is no rigid transform; it is off by {error[row]:.3g}, "
+            f"{path}, row {file_row(path, row)}: ee_T is not a rigid transform; it is off by {error[row]:.3g}, "
             f"{ORTHONORMAL_TOLERANCE} is allowed. Check that ee_T_03, ee_T_13 and ee_T_23 hold the position."
         )
     return np.column_stack([moved, continuous(quaternions_of(turned))])

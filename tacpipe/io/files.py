@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: draft, fsync, rename; and what the file system says, as sentences."""
+"""Files that are there whole or not at all: draft, fsync, rename; and what the file system states, as sentences."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EX
 def write_whole(
     path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
 ) -> bool:
-    """Write ``content``, whole or in blocks, to ``path`` by way of ``draft`` beside it; return False if ``exclusive`` lost.
+    """Write ``content``, whole or in blocks, to ``path`` by way of ``draft`` next to it; return False if ``exclusive`` lost.
 
     Whoever looks at ``path`` sees what was there before or all of ``content``. Missing folders are made. ``mode`` is less
     what the umask takes.
@@ -133,7 +133,7 @@ def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | No
 
 @contextlib.contextmanager
 def readable_errors(root: Path) -> Iterator[None]:
-    """Turn what the file system says into a sentence; what is looked for and not there stays what it is."""
+    """Turn what the file system states into a sentence; what is looked for and not there stays what it is."""
     try:
         yield
     except (FileNotFoundError, FileExistsError):
@@ -148,7 +148,7 @@ def may_not_write(error: StorageError) -> bool:
 
 
 def sentence(root: Path | str, error: OSError) -> StorageError:
-    """Return in words what the file system said of something under the store ``root``."""
+    """Return in words what the file system stated of something under the store ``root``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StorageError(
             f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
@@ -160,15 +160,15 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
             f"TACPIPE_STORE."
         )
     return StorageError(
-        f"The store {root} cannot be used: {error.strerror or error}, says the system of {error.filename or 'it'}. "
-        f"Look after the disk, then run the same command again."
+        f"The store {root} cannot be used: {error.filename or 'a file'}: {error.strerror or error}. "
+        f"Check the disk, then run the same command again."
     )
 
 
-def told(error: OSError) -> str:
-    """Return in words what the file system said of anything else."""
+def describe(error: OSError) -> str:
+    """Return in words what the file system stated of anything else."""
     return (
-        f"{error.filename or 'A file'} cannot be used: {error.strerror or error}. Nothing was half written; mend that, then "
+        f"{error.filename or 'A file'} cannot be used: {error.strerror or error}. Nothing was half written; fix that, then "
         f"run the same command again."
     )
 

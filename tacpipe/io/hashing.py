@@ -16,7 +16,7 @@ from tacpipe.printable import excerpt
 
 DIGEST = re.compile(r"[0-9a-f]{64}")  # as it is written, in whole or within a text
 SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a younger file may change without a trace
-_remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system said of the file, its digest
+_remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system stated of the file, its digest
 
 
 def canonical(value: Any) -> bytes:

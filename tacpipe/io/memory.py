@@ -1,4 +1,4 @@
-"""How much memory is left for this process, so that what a file claims is refused before it is taken."""
+"""How much memory is left for this process, so that what a file declares is refused before it is taken."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
 GROUP = Path("/sys/fs/cgroup")  # of a container: its limit, and what is used of it
 AT_HAND = 1 << 26  # bytes that are not worth asking the system about
-KEPT = 0.9  # share of what is left that one file may claim
+KEPT = 0.9  # fraction of what is left that one file may declare
 SCARCE = 1 << 29  # bytes: a request that fails although so much is left was for more than a sound file needs
 LIBRARIES = {  # bytes of address space that loading each takes, and its threads; measured with 2 cores
     "numpy": 140 << 20,
@@ -36,8 +36,8 @@ def available() -> int:
     """Return how many bytes this process can still take: by the computer, its container and its own limit."""
     left = [1 << 62]
     with contextlib.suppress(OSError, ValueError, IndexError):
-        told = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
-        left.append(int(told["MemAvailable"].split()[0]) << 10)
+        fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
+        left.append(int(fields["MemAvailable"].split()[0]) << 10)
     with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
         left.append(int((GROUP / "memory.max").read_text()) - int((GROUP / "memory.current").read_text()))
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -53,12 +53,12 @@ def limited() -> bool:
 
 
 def scarce() -> bool:
-    """Return whether so little is left that a request which fails says nothing of what asked for it."""
+    """Return whether so little is left that a request which fails states nothing of what asked for it."""
     return available() < SCARCE
 
 
 def shortage(error: BaseException) -> ShortageError | None:
-    """Return in words that memory or threads ran out, where ``error`` or what it came from says so; else None."""
+    """Return in words that memory or threads ran out, where ``error`` or what it came from states it; else None."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, ShortageError):
@@ -123,8 +123,8 @@ def require_library(name: str) -> None:
 
 
 @contextlib.contextmanager
-def told() -> Iterator[None]:
-    """Raise what says that memory ran out as `ShortageError`."""
+def raising_shortage() -> Iterator[None]:
+    """Raise what states that memory ran out as `ShortageError`."""
     try:
         yield
     except Exception as error:
@@ -140,15 +140,16 @@ def require(needed: int, what: str, *, error: type[TacpipeError] = TacpipeError)
     left = int(available() * KEPT)
     if needed > left:
         raise error(
-            f"{what} claims to be {_told(needed)} of data, and {_told(left)} of memory are left. If it is what you expect, "
-            f"read it on a computer with more memory or in parts; if it came from a stranger, do not trust it."
+            f"{what} declares {readable_size(needed)} of data, and {readable_size(left)} of memory are left. If that "
+            "is what you expect, read it on a computer with more memory or in parts; if its source is untrusted, do "
+            "not use it."
         )
 
 
-def _told(count: int) -> str:
+def readable_size(count: int) -> str:
     """Return a number of bytes in a unit that is read at a glance.
 
-    >>> _told(2_500_000_000), _told(10)
+    >>> readable_size(2_500_000_000), readable_size(10)
     ('2.5 GB', '0.00001 MB')
     """
     return (

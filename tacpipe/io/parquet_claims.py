@@ -57,11 +57,11 @@ def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collect
             pages = list(_pages(content, *_span(chunk, len(content), name)))
             values = sum(page.values for page in pages if page.kind != DICTIONARY)
             if values != chunk.get(5):
-                raise ValueError(f"column {name!r:.60} tells of {chunk.get(5)} values and holds {values}")
+                raise ValueError(f"column {name!r:.60} declares {chunk.get(5)} values and holds {values}")
             total += values * width if width else _texts(pages)
             largest = max(largest, *(page.unpacked for page in pages), 0)
     if told.get(3) != rows:
-        raise ValueError(f"it tells of {told.get(3)} rows, and its groups of {rows}")
+        raise ValueError(f"it declares {told.get(3)} rows, and its groups of {rows}")
     return total + largest
 
 
@@ -110,7 +110,7 @@ def _pages(content: bytes | memoryview, place: int, stop: int) -> Iterator[Page]
                 *(_whole(value) for value in (told.get(1), told.get(2), told.get(3), inner.get(1, 0), encoding))
             )
         if page.unpacked < 0 or page.size < 0 or page.values < 0 or place + page.size > stop:
-            raise ValueError(f"a page tells of {page.size} bytes, {page.unpacked} unpacked, of {stop - place}")
+            raise ValueError(f"a page declares {page.size} bytes, {page.unpacked} unpacked, of {stop - place}")
         place += page.size
         yield page
 

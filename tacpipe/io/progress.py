@@ -34,8 +34,8 @@ def wanted() -> bool:
     return sys.stderr.isatty() and not _quiet
 
 
-def say(sentence: str) -> None:
-    """Tell on stderr what a user should know while it happens, unless quiet was asked for."""
+def report(sentence: str) -> None:
+    """Report on stderr what a user should know while it happens, unless quiet was asked for."""
     if not _quiet:
         terminal.note(f"tacpipe: {sentence}")
 

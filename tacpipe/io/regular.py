@@ -3,7 +3,7 @@
 Every file of a store, of a remote store and of an untrusted dataset is opened here. A file of a store is never a symbolic
 link (``follow=False``), and none is read that is larger than what describes it declares (``most``), or than memory.
 
-What the system answers when a source file is read is no property of the recording: `failing` raises it as `StorageError`,
+What the system answers when a source file is read is not a property of the recording: `failing` raises it as `StorageError`,
 which ends the command, with ``--skip-bad`` too.
 """
 
@@ -53,8 +53,8 @@ def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
 def content(path: Path | str, most: int | None = None, *, follow: bool = True) -> bytes:
     """Return what a regular file of at most ``most`` bytes holds, by default of as many as memory takes.
 
-    Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` where memory is short, which says
-    nothing of the file.
+    Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` where memory is short, which
+    states nothing of the file.
     """
     handle, size = _open(path, follow=follow)
     try:
@@ -96,7 +96,8 @@ def expect_parsed(path: Path | str, size: int) -> None:
 
 
 def source(path: Path | str) -> bytes:
-    """Return what a file of a recording's source holds. Raises `TacpipeError` where it is no regular one, as `failing`."""
+    """Return what a file of a recording's source holds. Raises `TacpipeError` where it is not a regular one, as
+    `failing`."""
     with failing(path):
         return content(path)
 

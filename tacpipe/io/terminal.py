@@ -32,7 +32,7 @@ def result_json(value: Any) -> None:
 
 
 def note(text: object) -> None:
-    """Print on stderr what a user should know beside the result, line by line `shown`."""
+    """Print on stderr what a user should know next to the result, line by line `shown`."""
     with contextlib.suppress(OSError, ValueError):  # nobody can read it any more
         print(printable.lines(str(text).split("\n")), file=sys.stderr, flush=True)
 

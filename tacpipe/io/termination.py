@@ -1,4 +1,5 @@
-"""A wish to end, by Ctrl-C, SIGTERM or SIGHUP: a command ends within a second, whatever it is doing, and says one sentence.
+"""A termination request, by Ctrl-C, SIGTERM or SIGHUP: a command exits within a second, whatever it is doing, and
+states one sentence.
 
 Python hears of a signal between two of its own steps, and a long call in C has none. So a thread hears of it too, and ends
 the process where `KeyboardInterrupt` has not. That is safe at any point: nothing in a store is ever half written.
@@ -25,19 +26,19 @@ from tacpipe.errors import INTERRUPTED
 from tacpipe.io import terminal
 
 GRACE_S = 0.7  # to end in good order
-TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a wish is the same one
+TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a request is the same one
 SENTENCE = "tacpipe: interrupted; what was finished is kept."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class _Wishes:
-    """Tells wishes apart from their echoes."""
+class _Requests:
+    """Distinguishes requests apart from their echoes."""
 
     def __init__(self) -> None:
         self._last_s = -TWICE_S
 
     def another(self) -> bool:
-        """Return whether the signal that has just come is a wish of its own."""
+        """Return whether the signal that has just come is a request of its own."""
         now_s = time.monotonic()
         if now_s - self._last_s <= TWICE_S:
             return False
@@ -46,41 +47,41 @@ class _Wishes:
 
 
 class _Program:
-    """What this process knows of wishes to end; there is one."""
+    """What this process knows of termination requests; there is one."""
 
     def __init__(self) -> None:
-        self.heard = _Wishes()  # by the main thread
-        self.noticed = _Wishes()  # by the thread that listens
+        self.by_main_thread = _Requests()  # by the main thread
+        self.by_listener = _Requests()  # by the thread that listens
         self.ending = False
-        self.heeds = False  # it is a command's own process
-        self.held = False  # `KeyboardInterrupt` waits
-        self.own_way = False  # the next wish is the command's own business
+        self.installed = False  # it is a command's own process
+        self.deferred = False  # `KeyboardInterrupt` waits
+        self.own_way = False  # the next request is the command's own business
         self.sentence = SENTENCE
-        self.told = False
+        self.reported = False
         self.code: int | None = None  # of a command that is done
         self.restore: Callable[[], None] = lambda: None  # what was done to the terminal
 
     def ask(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt` for the first wish, end at once for the second: the handler of all signals."""
+        """Raise `KeyboardInterrupt` for the first request, end at once for the second: the handler of all signals."""
         hung_up = number == signal.SIGHUP
         if hung_up:
             drop_closed_streams()
-        if not self.heard.another() or (hung_up and self.ending):
+        if not self.by_main_thread.another() or (hung_up and self.ending):
             return
         if self.ending or self.code is not None:
             self.end()
         self.ending = True
-        if not self.held:
+        if not self.deferred:
             raise KeyboardInterrupt
 
     def listen(self, wakeups: int) -> None:
-        """See to it that the process ends soon after a wish: run by a thread that hears of signals from C."""
-        expected = requested = False
+        """See to it that the process ends soon after a request: run by a thread that hears of signals from C."""
+        expected = asked = False
         while True:
             (number,) = os.read(wakeups, 1)
-            if number not in _SIGNALS or not self.noticed.another() or (number == signal.SIGHUP and requested):
+            if number not in _SIGNALS or not self.by_listener.another() or (number == signal.SIGHUP and asked):
                 continue
-            requested = True
+            asked = True
             if self.own_way:
                 self.own_way = False
             elif expected:
@@ -96,8 +97,8 @@ class _Program:
     def end(self) -> NoReturn:
         """End the process without another step of what it was doing."""
         self.restore()
-        if self.code is None and not self.told and self.sentence:
-            self.told = True
+        if self.code is None and not self.reported and self.sentence:
+            self.reported = True
             with contextlib.suppress(OSError):
                 os.write(2, f"{printable.shown(self.sentence)}\n".encode(errors="backslashreplace"))
         os._exit(INTERRUPTED if self.code is None else self.code)
@@ -106,8 +107,8 @@ class _Program:
 _program = _Program()
 
 
-def heed() -> None:
-    """Heed wishes to end from now on: `KeyboardInterrupt` first, the end of the process soon after.
+def install_handlers() -> None:
+    """Handle termination requests from now on: `KeyboardInterrupt` first, the end of the process soon after.
 
     A signal that this process was started to ignore, as by ``nohup``, is ignored further.
     """
@@ -118,26 +119,26 @@ def heed() -> None:
     os.set_blocking(wakes, False)
     signal.set_wakeup_fd(wakes, warn_on_full_buffer=False)
     threading.Thread(target=_program.listen, args=(wakeups,), daemon=True).start()
-    _program.heeds = True
+    _program.installed = True
     _program.restore = _terminal()
     unraisable = sys.unraisablehook  # where an interrupt meets code that cannot raise, the thread ends the process
-    sys.unraisablehook = lambda told: None if told.exc_type is KeyboardInterrupt else unraisable(told)
+    sys.unraisablehook = lambda reported: None if reported.exc_type is KeyboardInterrupt else unraisable(reported)
 
 
-def wished() -> bool:
-    """Return whether the process is about to end because somebody wished it: errors then say nothing of the command."""
-    return _program.heeds and _program.ending
+def requested() -> bool:
+    """Return whether the process is about to end because somebody requested it: errors then state nothing of the command."""
+    return _program.installed and _program.ending
 
 
-def tell() -> None:
-    """Tell that the command was interrupted, and what is kept."""
-    sentence, _program.sentence, _program.told = _program.sentence, SENTENCE, True
+def report() -> None:
+    """Report that the command was interrupted, and what is kept."""
+    sentence, _program.sentence, _program.reported = _program.sentence, SENTENCE, True
     if sentence:
         terminal.note(sentence)
 
 
 def done(code: int) -> int:
-    """Return the exit code of a command that is done: whoever wishes it to end from now on gets this code.
+    """Return the exit code of a command that is done: whoever requests it to end from now on gets this code.
 
     An interrupted process ends here: taking down torch and the like would need another second.
     """
@@ -150,13 +151,13 @@ def done(code: int) -> int:
 
 
 @contextlib.contextmanager
-def saying(sentence: str) -> Iterator[None]:
-    """Have an interrupt in the block told in this sentence, which knows what is kept."""
+def reporting(sentence: str) -> Iterator[None]:
+    """Have an interrupt in the block stated in this sentence, which knows what is kept."""
     before, _program.sentence = _program.sentence, sentence
     try:
         yield
     except KeyboardInterrupt:
-        raise  # it is told further out
+        raise  # it is reported further out
     except BaseException:
         _program.sentence = before
         raise
@@ -164,19 +165,19 @@ def saying(sentence: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def held() -> Iterator[None]:
+def deferred() -> Iterator[None]:
     """Have `KeyboardInterrupt` wait for the end of the block, which is short and must not be left half done."""
-    before, _program.held = _program.ending, True
+    before, _program.deferred = _program.ending, True
     try:
         yield
     finally:
-        _program.held = False
+        _program.deferred = False
         if _program.ending and not before:
             raise KeyboardInterrupt
 
 
 class Ended:
-    """Whether somebody asked to end: the first wish ends what runs in its own way and keeps it, the second interrupts.
+    """Whether somebody asked to end: the first request ends what runs in its own way and keeps it, the second interrupts.
 
     ``number`` is the signal that asked, None before.
     """
@@ -184,7 +185,7 @@ class Ended:
     def __init__(self) -> None:
         self.number: int | None = None
         self._asked = threading.Event()
-        self._heard = _Wishes()
+        self._heard = _Requests()
 
     def __enter__(self) -> Ended:
         self._before: dict[signal.Signals, Any] = {}

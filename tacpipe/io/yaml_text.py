@@ -1,7 +1,7 @@
 """YAML from anywhere, read without trust: plain values alone, and no more of them than a person writes.
 
-A few lines of YAML can stand for any amount of data, by aliases of aliases and merged mappings, and brackets within
-brackets end the parser's stack. So the text's events are counted first, each alias as what it stands for.
+A few lines of YAML can represent any amount of data, by aliases of aliases and merged mappings, and brackets within
+brackets end the parser's stack. So the text's events are counted first, each alias as what it represents.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from typing import Any
 from tacpipe.printable import plain
 
 DEEPEST = 50  # levels of lists and mappings within one another
-MOST = 100_000  # values, with those that aliases stand for
+MOST = 100_000  # values, with those that aliases represent
 LONGEST = 10_000_000  # characters
 
 
 def load(content: str | bytes) -> Any:
-    """Return the value of a YAML document. Raises `ValueError`, with a line that says why, for what is none or too much."""
+    """Return the value of a YAML document. Raises `ValueError`, with a line that states why, for what is none or too
+    much."""
     import yaml
 
     if len(content) > LONGEST:
@@ -34,7 +35,7 @@ def load(content: str | bytes) -> Any:
 
 
 def _count(events: Any) -> None:
-    """Raise `ValueError` where the events of a text stand for too much."""
+    """Raise `ValueError` where the events of a text represent too much."""
     import yaml
 
     sizes: dict[str, int] = {}  # of what each anchor names, itself included
@@ -60,4 +61,4 @@ def _count(events: Any) -> None:
         if anchor is not None:
             sizes[anchor] = size
         if total > MOST:
-            raise ValueError(f"it stands for more than {MOST} values, by aliases or as written")
+            raise ValueError(f"it represents more than {MOST} values, by aliases or as written")

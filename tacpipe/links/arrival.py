@@ -1,4 +1,4 @@
-"""When something arrived: stamps of the wall clock, which kernels and files carry, told on the monotonic one."""
+"""When something arrived: stamps of the wall clock, which kernels and files carry, stated on the monotonic one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LOOKS = 3  # at both clocks, of which the quickest counts: another program may r
 class Arrivals:
     """Maps wall-clock stamps of arrivals to the monotonic clock; what is given out never goes back.
 
-    How far apart two stamps are stays as it was told, because the distance of the clocks is changed only when it must be.
+    How far apart two stamps are stays as it was given, because the distance of the clocks is changed only when it must be.
     """
 
     def __init__(self) -> None:
@@ -35,8 +35,8 @@ class Arrivals:
         A later stamp gives a later time, if only by 1 ns where the clocks' distance shrank meanwhile.
         """
         assert self._ahead_ns is not None, "look first"
-        is_believed = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
-        t_ns = wall_ns + self._ahead_ns if is_believed else self._now_ns
+        is_plausible = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
+        t_ns = wall_ns + self._ahead_ns if is_plausible else self._now_ns
         self._last_ns = max(t_ns, self._last_ns + (wall_ns > self._last_wall_ns))
         self._last_wall_ns = wall_ns
         return self._last_ns

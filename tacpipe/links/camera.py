@@ -48,8 +48,8 @@ def _serial(place: str, there: list[str], name: str) -> str:
         raise UsageError(f"camera:{place} names no camera; it should read camera:0, or hold a serial number.")
     if len(place) < 4 and int(place) < len(there):
         return there[int(place)]
-    told = f"there are {', '.join(there)}" if there else "there is none at all"
-    raise DeviceError(f"{name}: no RealSense camera {place} is connected; {told}. Plug it in to a USB 3 port.")
+    described = f"there are {', '.join(there)}" if there else "there is none at all"
+    raise DeviceError(f"{name}: no RealSense camera {place} is connected; {described}. Plug it in to a USB 3 port.")
 
 
 class CameraLink(Opened):
@@ -60,11 +60,11 @@ class CameraLink(Opened):
     def __init__(self, name: str, camera: Any) -> None:
         super().__init__(name)
         self.camera = camera
-        told = camera.get_metadata()
-        matrix = np.asarray(told.intrinsics.intrinsic_matrix)
+        metadata = camera.get_metadata()
+        matrix = np.asarray(metadata.intrinsics.intrinsic_matrix)
         self._focal = float(matrix[0, 0]), float(matrix[1, 1])
         self._centre = float(matrix[0, 2]), float(matrix[1, 2])
-        self._unit_m = 1 / float(told.depth_scale)  # which RealSense tells in counts a metre
+        self._unit_m = 1 / float(metadata.depth_scale)  # which RealSense gives in counts a metre
 
     def _receive(self, timeout_s: float) -> Arrived:
         until = time.monotonic() + timeout_s

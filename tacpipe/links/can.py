@@ -46,7 +46,7 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
 
 
 def parsed(place: str) -> tuple[str, str, int | None]:
-    """Return kind, channel and bit rate of an address, None where it tells none.
+    """Return kind, channel and bit rate of an address, None where it states none.
 
     >>> parsed("slcan:/dev/ttyACM0@1000000"), parsed("socketcan:can0")
     (('slcan', '/dev/ttyACM0', 1000000), ('socketcan', 'can0', None))
@@ -55,8 +55,8 @@ def parsed(place: str) -> tuple[str, str, int | None]:
     channel, at, bitrate = rest.partition("@")
     if kind not in KINDS or not channel or (at and not bitrate.isdigit()):
         raise UsageError(
-            f"can:{place} is no CAN bus; it should read can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of the kinds "
-            f"{', '.join(KINDS)}."
+            f"can:{place} is not a CAN bus; it should read can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of "
+            f"the kinds {', '.join(KINDS)}."
         )
     return kind, channel, int(bitrate) if at else None
 
@@ -125,7 +125,12 @@ class CanLink(Opened):
 
         try:
             self.bus.shutdown()
-        except (can.CanError, OSError, ValueError, termios.error):  # an adapter that is gone cannot be told to stop
+        except (
+            can.CanError,
+            OSError,
+            ValueError,
+            termios.error,
+        ):  # an adapter that is gone cannot be determined to stop
             port = getattr(self.bus, "serialPortOrig", None)  # of slcan, which stays open then
             if port is not None:
                 with contextlib.suppress(OSError):

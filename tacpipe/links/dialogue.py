@@ -1,4 +1,4 @@
-"""Carrying out what a sensor says to its device, and waiting for the replies."""
+"""Carrying out what a sensor states to its device, and waiting for the replies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SHOWN = 16  # bytes of what came instead of a reply
 
 
 class NoReplyError(DeviceError):
-    """No reply came in time: ``awaited`` says which and for how long, ``heard`` holds what came instead."""
+    """No reply came in time: ``awaited`` states which and for how long, ``heard`` holds what came instead."""
 
     def __init__(self, ask: Ask, heard: Arrived, stream: str) -> None:
         super().__init__(_silent(ask, heard, stream))
@@ -22,7 +22,7 @@ class NoReplyError(DeviceError):
 
 
 def hold(link: Link, dialogue: Dialogue, stream: str) -> Arrived:
-    """Carry out a dialogue; return what came that was no reply as (arrival, bytes), so that no sample is lost.
+    """Carry out a dialogue; return what came that was not a reply as (arrival, bytes), so that no sample is lost.
 
     What is behind a reply counts for the next question only if nothing is sent for it. Raises `NoReplyError` where no reply
     comes in time, and what a question raises for a reply that means no.

@@ -94,9 +94,9 @@ def _faces(folder: Path) -> dict[str, Face]:
             if entry.name.startswith(".") or entry.name.endswith(UNFINISHED):
                 continue
             with contextlib.suppress(FileNotFoundError):
-                told = entry.stat()
-                if entry.is_file() and told.st_size:
-                    faces[entry.name] = (told.st_ino, told.st_size, told.st_mtime_ns)
+                status = entry.stat()
+                if entry.is_file() and status.st_size:
+                    faces[entry.name] = (status.st_ino, status.st_size, status.st_mtime_ns)
     return faces
 
 
@@ -107,10 +107,10 @@ def _whole(path: Path, face: Face) -> bytes | None:
             if _is_written(file.fileno()):
                 return None
             data = file.read()
-            told = os.fstat(file.fileno())
+            status = os.fstat(file.fileno())
     except OSError:
         return None
-    return data if (told.st_ino, told.st_size, told.st_mtime_ns) == face and len(data) == told.st_size else None
+    return data if (status.st_ino, status.st_size, status.st_mtime_ns) == face and len(data) == status.st_size else None
 
 
 def _is_written(fileno: int) -> bool:

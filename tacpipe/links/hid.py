@@ -13,7 +13,7 @@ from tacpipe.links.opened import Arrived, Opened
 from tacpipe.sensors.sensor import Sensor
 
 LONGEST_WAIT_S = 0.03  # the kernel keeps 63 reports, 63 ms of the fastest device, and then drops the newest
-CHOICES = ("interface", "usage_page", "serial")  # what an address may say behind its ?
+CHOICES = ("interface", "usage_page", "serial")  # what an address may state behind its ?
 
 
 def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
@@ -23,13 +23,13 @@ def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
     the first. Raises `DeviceError` for a device that is missing, there twice, or not permitted.
     """
     module = ports.hid_module()
-    told = chosen(place, module.enumerate(), sensor.usage_page, name)
-    path: bytes = told["path"]
+    info = chosen(place, module.enumerate(), sensor.usage_page, name)
+    path: bytes = info["path"]
     device = module.device()
     try:
         device.open_path(path)
     except OSError as error:
-        raise _refused(path.decode(), told, name) from error
+        raise _refused(path.decode(), info, name) from error
     device.set_nonblocking(1)
     return HidLink(name, device)
 
@@ -43,40 +43,40 @@ def chosen(place: str, there: list[dict[str, Any]], usage_page: int | None, name
     wanted = dict(parse_qsl(query))
     if unknown := set(wanted) - set(CHOICES):
         raise UsageError(f"hid:{place}: there is no {', '.join(sorted(unknown))}; there are {', '.join(CHOICES)}.")
-    fitting = [told for told in there if _is(told, which, wanted)]
+    fitting = [info for info in there if _is(info, which, wanted)]
     if not fitting:
         raise DeviceError(
             f"{name}: there is no HID device {place}; {ports.listed(ports.hid_ports())}. Plug it in, or correct the "
             f"transport."
         )
-    ours = [told for told in fitting if told["usage_page"] == usage_page] or fitting
-    lowest = min(told["interface_number"] for told in ours)
-    ours = [told for told in ours if told["interface_number"] == lowest]
-    if len({told["path"] for told in ours}) > 1:
-        serials = ", ".join(f"hid:{which}?serial={told['serial_number'] or '...'}" for told in ours)
-        paths = ", ".join(f"hid:{told['path'].decode()}" for told in ours)
+    ours = [info for info in fitting if info["usage_page"] == usage_page] or fitting
+    lowest = min(info["interface_number"] for info in ours)
+    ours = [info for info in ours if info["interface_number"] == lowest]
+    if len({info["path"] for info in ours}) > 1:
+        serials = ", ".join(f"hid:{which}?serial={info['serial_number'] or '...'}" for info in ours)
+        paths = ", ".join(f"hid:{info['path'].decode()}" for info in ours)
         raise DeviceError(
             f"{name}: {len(ours)} devices are {place}; name one by its serial, {serials}, or its path, {paths}."
         )
     return ours[0]
 
 
-def _is(told: dict[str, Any], which: str, wanted: dict[str, str]) -> bool:
-    if told["path"].decode() != which and f"{told['vendor_id']:04x}:{told['product_id']:04x}" != which.lower():
+def _is(info: dict[str, Any], which: str, wanted: dict[str, str]) -> bool:
+    if info["path"].decode() != which and f"{info['vendor_id']:04x}:{info['product_id']:04x}" != which.lower():
         return False
     return (
-        wanted.get("serial", told["serial_number"]) == told["serial_number"]
-        and wanted.get("interface", str(told["interface_number"])) == str(told["interface_number"])
-        and wanted.get("usage_page", f"{told['usage_page']:04x}").lower() == f"{told['usage_page']:04x}"
+        wanted.get("serial", info["serial_number"]) == info["serial_number"]
+        and wanted.get("interface", str(info["interface_number"])) == str(info["interface_number"])
+        and wanted.get("usage_page", f"{info['usage_page']:04x}").lower() == f"{info['usage_page']:04x}"
     )
 
 
-def _refused(path: str, told: dict[str, Any], name: str) -> DeviceError:
+def _refused(path: str, info: dict[str, Any], name: str) -> DeviceError:
     if os.access(path, os.R_OK | os.W_OK):
         return DeviceError(f"{name}: {path} cannot be opened; unplug the device and plug it in again.")
     rule = (
-        f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{told["vendor_id"]:04x}", '
-        f'ATTRS{{idProduct}}=="{told["product_id"]:04x}", MODE="0660", TAG+="uaccess"'
+        f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{info["vendor_id"]:04x}", '
+        f'ATTRS{{idProduct}}=="{info["product_id"]:04x}", MODE="0660", TAG+="uaccess"'
     )
     return DeviceError(
         f"{name}: you may not open {path}; write the line {rule} to /etc/udev/rules.d/70-tacpipe.rules, run "
@@ -125,7 +125,7 @@ class HidLink(Opened):
 
 
 def _descriptor(device: Any) -> bytes:
-    """Return the report descriptor, nothing where hidapi is older than 0.14 or the system does not tell."""
+    """Return the report descriptor, nothing where hidapi is older than 0.14 or the system does not state."""
     try:
         return bytes(device.get_report_descriptor())
     except (AttributeError, OSError, ValueError):

@@ -28,10 +28,10 @@ def of_port(kind: str, port: int) -> list[str]:
     return _holding(targets)
 
 
-def told(holders: list[str]) -> str:
+def describe(holders: list[str]) -> str:
     """Return who holds it, as the end of a sentence.
 
-    >>> told(["screen (process 4711)"]), told([])
+    >>> describe(["screen (process 4711)"]), describe([])
     ('screen (process 4711)', 'a process of another user')
     """
     return " and ".join(holders) if holders else "a process of another user"

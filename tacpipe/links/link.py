@@ -1,4 +1,4 @@
-"""What a link is: it opens, gives what came with its arrival, says when it is lost, and closes; all kinds alike."""
+"""What a link is: it opens, gives what came with its arrival, states when it is lost, and closes; all kinds alike."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class LinkLostError(DeviceError):
 
 @dataclass(frozen=True)
 class Address:
-    """Where a device is: the kind of link, and what is told behind the colon."""
+    """Where a device is: the kind of link, and what is given behind the colon."""
 
     scheme: str
     place: str
@@ -60,7 +60,7 @@ class Link(Protocol):
 
     @property
     def overruns(self) -> int:
-        """How many packets this computer dropped so far because they were not fetched in time, where it tells."""
+        """How many packets this computer dropped so far because they were not fetched in time, where it states."""
 
     @property
     def foreign(self) -> int:
@@ -82,5 +82,7 @@ def parse(text: str) -> Address:
     scheme, colon, place = text.partition(":")
     if scheme not in SCHEMES or not colon or not place.isprintable() or not 0 < len(place) <= LONGEST:
         examples = "; ".join(SCHEMES.values())
-        raise UsageError(f"{excerpt(text)} is no address of a device; it should read like one of these: {examples}.")
+        raise UsageError(
+            f"{excerpt(text)} is not an address of a device; it should read like one of these: {examples}."
+        )
     return Address(scheme, place)

@@ -19,7 +19,7 @@ WRITE_S = 5.0  # a device that takes no byte for so long is gone
 
 
 class Opened:
-    """A link that is open. Subclasses say how to receive, send, wake a reader and release what they hold."""
+    """A link that is open. Subclasses state how to receive, send, wake a reader and release what they hold."""
 
     packets = False  # whether each entry of `read` is one packet
 
@@ -60,7 +60,7 @@ class Opened:
 
     @property
     def overruns(self) -> int:
-        """How many packets this computer dropped: 0 where it does not tell."""
+        """How many packets this computer dropped: 0 where it does not state."""
         return 0
 
     @property
@@ -74,7 +74,7 @@ class Opened:
         return False
 
     def lost(self, why: str, check: str = "its cable and its power") -> LinkLostError:
-        """Return the error that says that the device is gone."""
+        """Return the error that states that the device is gone."""
         return LinkLostError(f"{self.name} is lost: {why}. Check {check}.")
 
     def _refuse_closed(self) -> None:

@@ -22,7 +22,7 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
 
 
 def open_link(address: Address, sensor: Sensor, stream: str) -> Link:
-    """Return an open link to a sensor; ``stream`` names it in errors. Nothing is said to the device yet, see `dialogue`.
+    """Return an open link to a sensor; ``stream`` names it in errors. Nothing is sent to the device yet, see `dialogue`.
 
     Raises `DeviceError` with what to do where the device is missing, busy, not permitted, or refuses.
     """

@@ -1,4 +1,4 @@
-"""Which serial ports and HID devices this computer has now, and what they say of themselves."""
+"""Which serial ports and HID devices this computer has now, and what they state of themselves."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Port:
     """A port with something behind it."""
 
     address: str  # as a rig file names it
-    usb_id: str = ""  # "16d0:14cc", empty for what is no USB device
+    usb_id: str = ""  # "16d0:14cc", empty for what is not a USB device
     what: str = ""  # what the device calls itself
     lasting: str = ""  # a name of the same port that stays when cables are swapped
 
     def __str__(self) -> str:
-        told = ", ".join(part for part in (self.usb_id, self.what) if part)
-        return f"{self.address} ({told})" if told else self.address
+        described = ", ".join(part for part in (self.usb_id, self.what) if part)
+        return f"{self.address} ({described})" if described else self.address
 
 
 def serial_ports() -> list[Port]:
@@ -51,14 +51,18 @@ def hid_ports() -> list[Port]:
     except (DeviceError, MissingModuleError):
         return []
     return [
-        Port(f"hid:{told['path'].decode()}", f"{told['vendor_id']:04x}:{told['product_id']:04x}", _described(told))
-        for told in found
+        Port(
+            f"hid:{described['path'].decode()}",
+            f"{described['vendor_id']:04x}:{described['product_id']:04x}",
+            _described(described),
+        )
+        for described in found
     ]
 
 
-def _described(told: dict[str, Any]) -> str:
-    place = f"interface {told['interface_number']} usage page {told['usage_page']:04x}"
-    return f"{told['product_string'] or ''} {place}".strip()
+def _described(described: dict[str, Any]) -> str:
+    place = f"interface {described['interface_number']} usage page {described['usage_page']:04x}"
+    return f"{described['product_string'] or ''} {place}".strip()
 
 
 def listed(ports: list[Port]) -> str:

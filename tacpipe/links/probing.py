@@ -23,7 +23,7 @@ FIRST_S = 0.5  # that the first byte is awaited for, of a device that is awake
 LISTEN_S = 1.0  # from the first byte on
 REPLY_S = 0.5  # that a reply is awaited for
 REQUESTS = 20  # to a device that must be asked for each frame
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -43,22 +43,23 @@ class Report:
         return bool(self.findings) and (self.findings[0].evidence >= CERTAIN)
 
 
-def stand_in(baud: int, line: Line | None = None) -> Sensor:
+def placeholder(baud: int, line: Line | None = None) -> Sensor:
     """Return a sensor of which nothing is known but how its port is set."""
     kind = type("StandIn", (Sensor,), {"baud": baud, "rate_hz": 0.0, "line": line or Line()})
     made: Sensor = kind()
     return made
 
 
-def probe(address: Address, usb_id: str = "", *, passive: bool = False, tell: Tell = lambda _: None) -> Report:
-    """Return what speaks at ``address``. ``usb_id`` moves the drivers to the front that know it; ``tell`` is told each step.
+def probe(address: Address, usb_id: str = "", *, passive: bool = False, progress: Progress = lambda _: None) -> Report:
+    """Return what speaks at ``address``. ``usb_id`` moves the drivers that know it to the front; ``progress`` is called
+    with a text at each step.
 
     With ``passive`` nothing is written. An error of opening becomes the report's.
     """
     try:
-        report = _listened(address, usb_id, tell)
+        report = _listened(address, usb_id, progress)
         if not report.certain and not passive:
-            asked = _asked(address, usb_id, tell)
+            asked = _asked(address, usb_id, progress)
             if asked.findings and (not report.findings or asked.findings[0].evidence > report.findings[0].evidence):
                 report = asked
         return report
@@ -66,12 +67,12 @@ def probe(address: Address, usb_id: str = "", *, passive: bool = False, tell: Te
         return Report(str(address), error=str(error))
 
 
-def _listened(address: Address, usb_id: str, tell: Tell) -> Report:
+def _listened(address: Address, usb_id: str, progress: Progress) -> Report:
     """Return what is recognised without a word from us, at each likely rate of baud until there is no doubt."""
     best = Report(str(address))
     for number, baud in enumerate(_bauds(usb_id) if address.scheme == "serial" else [0]):
-        tell(f"{address}: listening{f' at {baud:,} baud' if baud else ''}")
-        with closing(open_link(address, stand_in(baud), "probe")) as link:
+        progress(f"{address}: listening{f' at {baud:,} baud' if baud else ''}")
+        with closing(open_link(address, placeholder(baud), "probe")) as link:
             chunks = _listen(link, FIRST_S if number else BOOT_S)
         report = _report(address, chunks, baud)
         if not chunks:  # a device that streams gives bytes at any rate, if wrong ones
@@ -83,19 +84,19 @@ def _listened(address: Address, usb_id: str, tell: Tell) -> Report:
     return best
 
 
-def _asked(address: Address, usb_id: str, tell: Tell) -> Report:
+def _asked(address: Address, usb_id: str, progress: Progress) -> Report:
     """Return what is recognised after each driver's opening, the ones that know the device first."""
     best = Report(str(address))
     for candidate in _by_usb(candidates(Chunks.of([]), address.scheme), usb_id):
         sensor = candidate.sensor
         if not _speaks(sensor):
             continue
-        tell(f"{address}: asking as {candidate.kind} does")
+        progress(f"{address}: asking as {candidate.kind} does")
         try:
             with closing(open_link(address, _quick(sensor), "probe")) as link:
                 chunks = _ask(link, sensor)
         except DeviceError as error:
-            tell(f"{address}: {error}")
+            progress(f"{address}: {error}")
             continue
         report = _report(address, chunks, getattr(sensor, "baud", 0), only=candidate.kind)
         if report.findings and (not best.findings or report.findings[0].evidence > best.findings[0].evidence):
@@ -106,7 +107,7 @@ def _asked(address: Address, usb_id: str, tell: Tell) -> Report:
 
 
 def _ask(link: Link, sensor: Sensor) -> Arrived:
-    """Return what a device says after a sensor's opening and requests; it is told to stop at the end."""
+    """Return what a device states after a sensor's opening and requests; it is asked to stop at the end."""
     try:
         came = hold(link, _hasty(sensor.opening(link.local)), "probe")
         request = sensor.request()
@@ -156,7 +157,7 @@ def _speaks(sensor: Sensor) -> bool:
 
 def _quick(sensor: Sensor) -> Sensor:
     """Return what opens a port as this sensor does, but for the time it settles: the device is awake by now."""
-    return stand_in(getattr(sensor, "baud", 0), replace(sensor.line, settle_s=0.0))
+    return placeholder(getattr(sensor, "baud", 0), replace(sensor.line, settle_s=0.0))
 
 
 def _hasty(dialogue: Dialogue) -> Dialogue:

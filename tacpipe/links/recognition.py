@@ -1,4 +1,4 @@
-"""Which sensor speaks: each driver's framer tries the bytes, and the same bytes shuffled tell what it takes by chance."""
+"""Which sensor speaks: each driver's framer tries the bytes, and the same bytes shuffled state what it takes by chance."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ PACKETS = (
     "can",
     "folder",
     "camera",
-)  # kinds of links whose chunks have a size that tells
+)  # kinds of links whose chunks have a size that states
 MOST = 1 << 18  # bytes that are looked at
-CERTAIN = 0.8  # share of the bytes beyond chance from which on there is no doubt
+CERTAIN = 0.8  # fraction of the bytes beyond chance from which on there is no doubt
 POSSIBLE = 0.2  # below it, nothing speaks for a driver
 FEWEST = 3  # frames
 
@@ -38,8 +38,8 @@ class Candidate:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        told = ", ".join(f"{name} = {value}" for name, value in self.options.items())
-        return f"{self.kind} ({told})" if told else self.kind
+        described = ", ".join(f"{name} = {value}" for name, value in self.options.items())
+        return f"{self.kind} ({described})" if described else self.kind
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Finding:
 
     candidate: Candidate
     frames: int
-    rate_hz: float  # of frames, 0 where fewer than two arrivals tell it
+    rate_hz: float  # of frames, 0 where fewer than two arrivals state it
     bytes: int  # that were looked at
-    explained: float  # share of them that is in frames
-    chance: float  # share of the same bytes in random order that would be
+    explained: float  # fraction of them that is in frames
+    chance: float  # fraction of the same bytes in random order that would be
 
     @property
     def name(self) -> str:
@@ -67,8 +67,8 @@ class Finding:
         rate = f" at {self.rate_hz:.4g} Hz" if self.rate_hz else ""
         alone = "by the size of the packets alone"
         chance = alone if self.chance > POSSIBLE else f"{100 * self.chance:.1f} % by chance"
-        share = f"{100 * self.explained:.1f} % of {self.bytes:,} bytes"
-        return f"{self.candidate}: {self.frames:,} frames{rate}, {share} ({chance})"
+        part = f"{100 * self.explained:.1f} % of {self.bytes:,} bytes"
+        return f"{self.candidate}: {self.frames:,} frames{rate}, {part} ({chance})"
 
 
 def candidates(data: Chunks, scheme: str) -> list[Candidate]:
@@ -100,11 +100,11 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[Candidate] | None = N
     shuffled = _shuffled(data)
     found = []
     for candidate in candidates(data, scheme) if sensors is None else sensors:
-        frames, share, rate_hz = _tried(candidate.sensor, data)
-        if frames < FEWEST or share < POSSIBLE:
+        frames, part, rate_hz = _tried(candidate.sensor, data)
+        if frames < FEWEST or part < POSSIBLE:
             continue
         _, chance, _ = _tried(candidate.sensor, shuffled)
-        finding = Finding(candidate, frames, rate_hz, len(data.data), share, chance)
+        finding = Finding(candidate, frames, rate_hz, len(data.data), part, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
             found.append(finding)
     return sorted(found, key=_rank)
@@ -123,7 +123,7 @@ def _rank(finding: Finding) -> tuple[float, float, float, int]:
 
 
 def _tried(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
-    """Return how many frames a sensor finds, the share of the bytes in them, and their rate in hertz."""
+    """Return how many frames a sensor finds, the fraction of the bytes in them, and their rate in hertz."""
     framer = sensor.framer()
     runs = [*framer.feed(data)[0], *framer.flush()[0]]
     stamps = [run.t_ns for run in runs if len(run.t_ns)]

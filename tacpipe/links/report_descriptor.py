@@ -1,4 +1,4 @@
-"""What a HID device says of its reports: how long those are that it sends, and whether a number leads each.
+"""What a HID device states of its reports: how long those are that it sends, and whether a number leads each.
 
 Source: Device Class Definition for Human Interface Devices (HID), version 1.11, section 6.2.2.
 """
@@ -25,7 +25,7 @@ class Reports:
 
     @property
     def most(self) -> int:
-        """Bytes of the longest report with its number, 64 where the device does not say."""
+        """Bytes of the longest report with its number, 64 where the device does not state."""
         return max((-(-bits // 8) for bits in self.bits.values()), default=64) + self.numbered
 
 

@@ -56,7 +56,7 @@ def refused(error: OSError, place: str, name: str) -> DeviceError:
     if error.errno in (errno.EBUSY, errno.EAGAIN):
         return _busy(place, holders.of_file(place), name)
     if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
-        return DeviceError(f"{name}: {place} is no serial port; {ports.listed(ports.serial_ports())}.")
+        return DeviceError(f"{name}: {place} is not a serial port; {ports.listed(ports.serial_ports())}.")
     return DeviceError(f"{name}: {place} cannot be opened: {error.strerror or error}. Unplug it and plug it in again.")
 
 
@@ -66,7 +66,7 @@ def _opened(place: str, baud: int, line: Line, name: str) -> serial.Serial:
 
     port = serial.Serial(timeout=0, exclusive=True)
     port.port, port.baudrate = place, baud
-    if line.dtr is not None:  # told before it opens, so that the line does not toggle
+    if line.dtr is not None:  # set before it opens, so that the line does not toggle
         port.dtr = line.dtr
     if line.rts is not None:
         port.rts = line.rts
@@ -74,7 +74,7 @@ def _opened(place: str, baud: int, line: Line, name: str) -> serial.Serial:
         port.open()
     except ValueError as error:
         raise UsageError(f"{name}: {place} cannot be set to {baud} baud ({error}); correct the option baud.") from error
-    except OSError as error:  # a SerialException is one, but tells the number of the error in its text alone
+    except OSError as error:  # a SerialException is one, but states the number of the error in its text alone
         raise refused(_cause(error), place, name) from error
     with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):  # no adapter that knows it
         port.set_low_latency_mode(True)  # FTDI adapters else hold bytes back for up to 16 ms
@@ -89,7 +89,9 @@ def _cause(error: OSError) -> OSError:
 
 
 def _busy(place: str, held: list[str], name: str) -> DeviceError:
-    return DeviceError(f"{name}: {place} is held by {holders.told(held)}; end it, because two readers share no bytes.")
+    return DeviceError(
+        f"{name}: {place} is held by {holders.describe(held)}; end it, because two readers share no bytes."
+    )
 
 
 def _right(place: str) -> str:

@@ -62,7 +62,7 @@ class ControlledLink(udp.UdpLink):
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         if any(fileno == self.control.socket.fileno() for fileno, _ in ready):
             try:
-                self.control.read(0)  # beyond a dialogue nothing is said there but that it ends
+                self.control.read(0)  # beyond a dialogue nothing comes there but its end
             except LinkLostError as error:
                 self._failed = error
         return super()._fetch(ready)

@@ -77,11 +77,11 @@ def bound(host: str, port: int, name: str) -> socket.socket:
     except OSError as error:
         made.close()
         if error.errno == errno.EADDRINUSE:
-            held = holders.told(holders.of_port("udp", port))
+            held = holders.describe(holders.of_port("udp", port))
             raise DeviceError(f"{name}: UDP port {port} is held by {held}; end it, or take another port.") from error
         if error.errno == errno.EADDRNOTAVAIL:
             raise DeviceError(
-                f"{name}: {host} is no address of this computer; listen on one of its own, or on all with udp::{port}."
+                f"{name}: {host} is not an address of this computer; listen on one of its own, or on all with udp::{port}."
             ) from error
         raise network.failed(error, host, port, name) from error
     return made
@@ -116,7 +116,7 @@ class UdpLink(Descriptor):
         self._sender: Any = None  # of the last datagram
         self._declared = sender  # the only host whose datagrams count, `FIRST` until it is known; empty: any
         self._foreign = 0
-        self._failed: LinkLostError | None = None  # why the link is lost, until that is told
+        self._failed: LinkLostError | None = None  # why the link is lost, until that is reported
 
     @property
     def local(self) -> Mapping[str, Any]:
@@ -161,15 +161,15 @@ class UdpLink(Descriptor):
         found: Arrived = []
         for _ in range(MOST_QUEUED):
             try:
-                data, told, _, sender = self.socket.recvmsg(MOST, ROOM)
+                data, ancillary, _, sender = self.socket.recvmsg(MOST, ROOM)
             except BlockingIOError:
                 return found
             except OSError as error:
                 if self._failed is not None:
                     return found
-                self._failed = self._refused(error)  # which the kernel tells once, before what waits
+                self._failed = self._refused(error)  # which the kernel states once, before what waits
                 continue
-            arrival_ns = self._arrival(told)
+            arrival_ns = self._arrival(ancillary)
             if self._counts(sender):
                 self._sender = sender
                 found.append((arrival_ns, data))
@@ -190,10 +190,10 @@ class UdpLink(Descriptor):
             return self.lost("the host is there, but refuses the port", "the port, and that it streams")
         return self.lost(error.strerror or str(error))
 
-    def _arrival(self, told: list[tuple[int, int, bytes]]) -> int:
-        """Return the arrival that the ancillary messages of a datagram tell, and take note of drops."""
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> int:
+        """Return the arrival that the ancillary messages of a datagram state, and take note of drops."""
         wall_ns = None
-        for level, kind, data in told:
+        for level, kind, data in ancillary:
             if level == socket.SOL_SOCKET and kind == STAMPS:
                 seconds, nanoseconds = struct.unpack("@ll", data[: struct.calcsize("@ll")])
                 wall_ns = seconds * 1_000_000_000 + nanoseconds

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 MOST = 1 << 24  # bytes of the largest message
-SILENT = logging.getLogger("tacpipe.links.websocket")  # a lost connection is told as such, not by a traceback
+SILENT = logging.getLogger("tacpipe.links.websocket")  # a lost connection is reported as such, not by a traceback
 SILENT.addHandler(logging.NullHandler())
 SILENT.propagate = False
-CLOSE_S = 1.0  # that the other end is given to say goodbye
+CLOSE_S = 1.0  # that the other end has to close the connection
 
 
 def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
@@ -48,7 +48,8 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
     except (WebSocketException, TimeoutError, OSError, EOFError) as error:
         wire.close()
         raise DeviceError(
-            f"{name}: what answers at {host} port {port} is no websocket ({error or type(error).__name__}); check the port."
+            f"{name}: what answers at {host} port {port} is not a websocket ({error or type(error).__name__}); check "
+            "the port."
         ) from error
     return WebsocketLink(name, connection)
 

@@ -88,7 +88,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
     if damaged:
         raise DamagedError(
             f"{len(damaged)} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
-            f"removed. `tacpipe store repair` finds those beside the store, and the commands that wrote the others write "
+            f"removed. `tacpipe store repair` finds those next to the store, and the commands that wrote the others write "
             f"them again; to do without a dataset, remove its quarantine/root-{damaged[0][:12]}…"
         )
     doubtful = _doubtful(store)
@@ -214,9 +214,9 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_rec
         except TacpipeError as error:
             if store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
                 raise DamagedError(
-                    f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is not "
-                    f"known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to go on without "
-                    f"it, remove it from objects/ and quarantine/."
+                    f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
+                    "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
+                    "continue without it, remove it from objects/ and quarantine/."
                 ) from error
             continue  # it never came here: of a dataset that was copied or pulled without what it descends from
         objects |= {found for _, found in manifest.objects()}
@@ -228,7 +228,7 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_rec
 def _doubtful(store: Store) -> dict[Path, set[str]]:
     """Return the digests in damaged records and manifests: nobody knows any more whether they were those of recordings.
 
-    Those that were made again, or brought back, are in doubt no longer.
+    Those that were recomputed, or brought back, are in doubt no longer.
     """
     found = {}
     for path in layout.entries(store.root, "quarantine"):
@@ -250,7 +250,7 @@ def ancestors(manifest: manifest_of.Manifest) -> list[str]:
 def _content(path: Path) -> tuple[bytes | None, bool]:
     """Return the manifest that lies at a root's path, None if there is none; and whether the path is there.
 
-    A path of which the system tells no more than that it failed counts as there: an error is no absence.
+    A path of which the system states no more than that it failed counts as there: an error is not an absence.
     """
     try:
         return regular.content(path / manifest_of.NAME, regular.JSON_BYTES), True
@@ -298,7 +298,7 @@ def _sweep(
     for path in layout.entries(store.root, "tmp"):
         if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
             continue
-        dead = path.name.startswith("run-")  # its run is over; of who told no run an old draft is swept up
+        dead = path.name.startswith("run-")  # its run is over; without a run, an old draft is swept up
         with contextlib.suppress(FileNotFoundError):
             old = abs(now_s - path.stat().st_mtime) >= (_YOUNG_S if dead else _DRAFT_S)
             collected.drafts += old and _drop(path, dry_run=dry_run)

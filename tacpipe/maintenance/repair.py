@@ -40,7 +40,7 @@ class Soundness:
     damaged: list[str] = field(default_factory=list)  # digests and keys, now in quarantine
     missing: list[str] = field(default_factory=list)  # objects that a root's manifest names
     repaired: list[str] = field(default_factory=list)
-    lost: dict[str, str] = field(default_factory=dict)  # digest to why it cannot be made again
+    lost: dict[str, str] = field(default_factory=dict)  # digest to why it cannot be recomputed
 
     @property
     def clean(self) -> bool:
@@ -57,12 +57,12 @@ class Soundness:
             lines.append(f"not part of a store, left as they are: {len(self.foreign) - _SHOWN} more")
         lines += [f"damaged, now in quarantine: {name}" for name in self.damaged]
         lines += [f"missing: {name}" for name in self.missing]
-        lines += [f"made again: {name}" for name in self.repaired]
-        lines += [f"cannot be made again: {name}: {why}" for name, why in self.lost.items()]
+        lines += [f"recomputed: {name}" for name in self.repaired]
+        lines += [f"cannot be recomputed: {name}: {why}" for name, why in self.lost.items()]
         if self.clean:
             lines.append("all sound")
         elif not self.repaired and not self.lost:
-            lines.append("`tacpipe store repair` makes again what it can")
+            lines.append("`tacpipe store repair` recomputes what it can")
         return "\n".join(lines)
 
 
@@ -124,7 +124,7 @@ def repair(store: Store) -> Soundness:
 
 
 def _roots_again(store: Store) -> list[str]:
-    """Write damaged roots anew whose datasets lie beside the store; return their names."""
+    """Write damaged roots anew whose datasets lie next to the store; return their names."""
     names, found = store.roots.damaged(), []
     for place, folders, files in walk(store.root.parent, links=False) if names else ():
         folders[:] = [folder for folder in folders if not folder.startswith(".")]

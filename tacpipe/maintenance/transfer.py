@@ -67,7 +67,7 @@ def push(
     that is called so there. What was pushed before stays as a snapshot.
 
     Raises `UsageError` where another dataset was pushed under the name meanwhile, unless ``replace``, and `DamagedError` for
-    a shard that is damaged here and cannot be made again.
+    a shard that is damaged here and cannot be recomputed.
     """
     there, done = Store(places.local(remote).absolute()), Transferred()
     for path in paths:
@@ -237,7 +237,7 @@ def _copy(
                     continue
                 try:
                     target.take(wanted, _counted(source.blocks(wanted, sizes[wanted]), sizes[wanted], path))
-                except MissingError:  # a copy beside the manifest or the stage that made it may bring it back
+                except MissingError:  # a copy next to the manifest or the stage that made it may bring it back
                     target.take(wanted, _counted([read(wanted, path)], sizes[wanted], path))
                 done.objects += 1
                 done.bytes += sizes[wanted]

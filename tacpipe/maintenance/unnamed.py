@@ -1,7 +1,7 @@
 """Manifests in a store that no root names any more, and that hold what cannot be computed again.
 
 A recording is marked as one by its record, by the manifests that name it, and by the roots that name these. Each of the
-three is enough: a manifest tells by itself what it holds, so it is found among the objects where its root was lost.
+three is enough: a manifest states by itself what it holds, so it is found among the objects where its root was lost.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class Forest:
         whole = all(one.dtype.kind == "i" for one in (self.roots, self.children, self.features))
         wrong = next((name for name, fine in shapes.items() if not fine), "" if whole else "numbers of nodes")
         if wrong or not ((self.roots >= 0) & (self.roots < nodes)).all():
-            raise ValueError(f"the {wrong or 'roots'} of a forest of {nodes} nodes are no such")
+            raise ValueError(f"the {wrong or 'roots'} of a forest of {nodes} nodes are out of range")
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor]) -> Forest:

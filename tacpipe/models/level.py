@@ -58,7 +58,7 @@ class Level:
         gain = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 1e-9 * (1 + np.abs(centre)))
         moves = gain > 0
         if not moves.any():
-            raise TacpipeError("All slides have the same mean levels, so nothing tells classes apart by them.")
+            raise TacpipeError("All slides have the same mean levels, so nothing distinguishes classes by them.")
         found = LinearDiscriminantAnalysis(
             solver="lsqr", shrinkage="auto", priors=np.full(len(classes), 1 / len(classes))
         )

@@ -143,6 +143,6 @@ def _check(features: Floats, labels: Labels, classes: int) -> None:
             "(slide, feature) and (slide,)."
         )
     if classes < 2:
-        raise TacpipeError(f"Slides of {classes} classes leave nothing to tell apart; give slides of two or more.")
+        raise TacpipeError(f"Slides of {classes} classes leave nothing to classify; give slides of two or more.")
     if not np.isfinite(features).all():
         raise TacpipeError("Some features are not finite. Look for slides with gaps, and leave these out.")

@@ -25,7 +25,7 @@ DECODERS = ("D1", "D2")
 
 @dataclass(frozen=True)
 class Shape:
-    """What a sensor's network reads and tells, and how it is built."""
+    """What a sensor's network reads and states, and how it is built."""
 
     channels: int
     classes: int
@@ -34,7 +34,7 @@ class Shape:
     hidden: int = HIDDEN
     latents: int = LATENTS
     unpool: str = "nearest"  # of the cnn: nearest, or last as in the published code
-    dropout: float = 0.0  # share of the latents left out before the classifier in each training step
+    dropout: float = 0.0  # fraction of the latents left out before the classifier in each training step
 
 
 class Told(NamedTuple):

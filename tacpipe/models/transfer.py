@@ -121,7 +121,7 @@ def _expected(means: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
         both = np.isfinite(means[:, 0]) & np.isfinite(other[:, 0])
         if both.sum() < SHARED:
             raise TacpipeError(
-                f"Two sensors were told {both.sum()} classes in common; {SHARED} at least show how they differ. Record "
+                f"Two sensors were given {both.sum()} classes in common; {SHARED} at least show how they differ. Record "
                 "more with both, or learn for each sensor alone."
             )
         there, here = other[both], means[both]

@@ -94,7 +94,7 @@ def tag(stage: AnyStage) -> str | None:
     if not all(choices) or len({choice for some in choices for choice in some}) < sum(map(len, choices)):
         raise TacpipeError(
             f"The params of {stage.function.__name__} are of {len(several)} kinds, and their first field, {name}, does "
-            f"not tell them apart: it must be a Literal in each, with choices that no other has."
+            f"not distinguish them: it must be a Literal in each, with choices that no other has."
         )
     return name
 
@@ -320,7 +320,7 @@ def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
         raise UsageError(f"{path} cannot be read: {error}.") from error
     for part in block.split("."):
         if not isinstance(found, dict):
-            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is no mapping.")
+            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is not a mapping.")
         if part not in found:
             if required:
                 raise UsageError(f"{path} has no block {block}; at {part} there are {listed(found)}.")

@@ -1,4 +1,4 @@
-"""A sealed recording put into the store and appended to its dataset, looked at once more before success is said."""
+"""A sealed recording put into the store and appended to its dataset, looked at once more before success is reported."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _others(manifest: Manifest, name: str, rig: str) -> set[str]:
 
 
 def _refuse(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
-    """Say that there is no recording; what holds no byte at all is removed."""
+    """Report that there is no recording; what holds no byte at all is removed."""
     received = sum(one.received for one in sealed.values())  # what was read and never written is gone
     if not received and not spooled.damage:
         spooled.remove()
@@ -103,7 +103,7 @@ def _refuse(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
     spoiled = sum(one.bytes for one in spooled.damage)
     raise TacpipeError(
         f"{received:,} bytes came from {', '.join(sealed)} and hold no sample; {spoiled:,} more are spoiled. "
-        f"`tacpipe acquire --dry-run` tells what each device sends."
+        f"`tacpipe acquire --dry-run` states what each device sends."
     )
 
 

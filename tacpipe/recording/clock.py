@@ -22,6 +22,6 @@ def sleep(seconds: float) -> None:
 
 def suspended_ns() -> int:
     """Return for how long the computer was suspended since its start, in ns: the monotonic clock stands still meanwhile."""
-    if not hasattr(time, "CLOCK_BOOTTIME"):  # this system does not tell
+    if not hasattr(time, "CLOCK_BOOTTIME"):  # this system does not state
         return 0
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()

@@ -32,6 +32,8 @@ def lines(attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, 
             found.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}, {lasts_s:.1f}{of} s")
         late = {stream: count for stream, count in values.items() if stream.endswith(UNCERTAIN)}
         if late:
-            told = ", ".join(f"{count} samples of {plain(key.removesuffix(UNCERTAIN))}" for key, count in late.items())
-            found.append(f"recorder held up: {plain(name)}: the arrival of {told} is uncertain")
+            described = ", ".join(
+                f"{count} samples of {plain(key.removesuffix(UNCERTAIN))}" for key, count in late.items()
+            )
+            found.append(f"recorder held up: {plain(name)}: the arrival of {described} is uncertain")
     return found[:MOST] + ([f"… and {len(found) - MOST} more"] if len(found) > MOST else [])

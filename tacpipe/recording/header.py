@@ -20,12 +20,12 @@ from tacpipe.store import store
 from tacpipe.store.roots import BESIDE_NAME
 from tacpipe.store.store import Store
 
-FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files beside the recordings
+FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files next to the recordings
 MOST_NS = 1 << 62  # of the readings of a clock
 
 
 def output(store: Store, dataset: Path) -> str:
-    """Return how a header names its dataset: relative to the project that the store lies beside, so both can be moved.
+    """Return how a header names its dataset: relative to the project that the store lies next to, so both can be moved.
 
     Outside of that project, and where the store lies elsewhere, the path is absolute.
     """
@@ -86,7 +86,7 @@ def _is_attribute(value: object) -> bool:
 
 
 def _project(beside: Store) -> Path | None:
-    """Return the project that a store lies beside, None for one that is named by TACPIPE_STORE."""
+    """Return the project that a store lies next to, None for one that is named by TACPIPE_STORE."""
     root = Path(os.path.abspath(beside.root))  # noqa: PTH100
     return root.parent if root.name == BESIDE_NAME else None
 

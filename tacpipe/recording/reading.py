@@ -1,4 +1,4 @@
-"""One stream from the bytes of its link to samples: framed, decoded, counted, with every loss told and counted once."""
+"""One stream from the bytes of its link to samples: framed, decoded, counted, with every loss reported and counted once."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Reading:
         self._before = Account()  # of the framers of links that were lost
         self._counting = _counting(sensor, sensor.counter)
         self._device_counting = _counting(sensor, sensor.device_counter)
-        self._unexplained: list[Loss] = []  # losses before a sample that tells how many frames they cost
+        self._unexplained: list[Loss] = []  # losses before a sample that states how many frames they cost
         self._last_ns: int | None = None
         self._device_ns: tuple[int, int] | None = None  # the device's clock as it was sent last, and unrolled
         self._silence: Event | None = None  # that may still be made up for
@@ -131,7 +131,7 @@ class Reading:
         return batch if kept.all() else _chosen(batch, kept)
 
     def _unrolled(self, sent_ns: Times, wrap_ns: int) -> Times:
-        """Return device times (sample,) that go on where the clock begins at 0 again; a smaller step back stays one."""
+        """Return device times (sample,) that continue where the clock begins at 0 again; a smaller step back stays one."""
         last_sent_ns, last_ns = self._device_ns or (int(sent_ns[0]), int(sent_ns[0]))
         steps_ns = np.diff(sent_ns, prepend=last_sent_ns)
         unrolled: Times = last_ns + np.cumsum(np.where(steps_ns < -wrap_ns // 2, steps_ns + wrap_ns, steps_ns))
@@ -139,7 +139,7 @@ class Reading:
         return unrolled
 
     def _explained(self, counted: Counted, t_ns: Times) -> list[Event]:
-        """Return the events of a batch whose samples are counted: each loss costs what the counter says, and no more."""
+        """Return the events of a batch whose samples are counted: each loss costs what the counter states, and no more."""
         events: list[Event] = []
         odd = np.flatnonzero((counted.missing > 0) | counted.duplicate | counted.late | counted.reset)
         for row in odd.tolist():
@@ -153,13 +153,13 @@ class Reading:
             if counted.reset[row]:
                 events.append(Event(at_ns, RESET, detail=f"began anew at {counted.seq[row]}"))
             for loss in [loss for loss in self._unexplained if loss.t_ns <= at_ns]:
-                share = min(loss.frames, missing)
-                missing -= share
-                events.append(_event(loss, share))
+                count = min(loss.frames, missing)
+                missing -= count
+                events.append(_event(loss, count))
                 self._unexplained.remove(loss)
             if missing:
                 events.append(Event(at_ns, LINK, frames=missing))
-        if len(t_ns):  # a loss after which the counter went on as it should cost no frame
+        if len(t_ns):  # a loss after which the counter continued as it should cost no frame
             last_ns = int(t_ns[-1])
             events += [_event(loss, 0) for loss in self._unexplained if loss.t_ns <= last_ns]
             self._unexplained = [loss for loss in self._unexplained if loss.t_ns > last_ns]
@@ -203,7 +203,7 @@ def _event(loss: Loss, frames: int) -> Event:
 def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[Event]:
     """Return the samples that the device passed over itself: those that its own counter misses beyond lost packets.
 
-    Where that counter began anew, or jumped beyond what time allows, it says nothing of that.
+    Where that counter began anew, or jumped beyond what time allows, it states nothing of that.
     """
     beyond = np.where(skipped.reset, 0, skipped.missing - counted.missing)
     found = [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]

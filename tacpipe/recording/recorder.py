@@ -1,4 +1,4 @@
-"""A rig at work: all its stations, what is told of them, and the spool while a recording runs."""
+"""A rig at work: all its stations, what is informed of them, and the spool while a recording runs."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Recorder:
             self._watched(name, station.take())
             early = _since(self._before[name], since_ns) if preroll else None
             found = station.begin(functools.partial(spool.tally, spool.streams[name]), early)
-            if station.error is not None:  # of what happened before a recording nothing else would tell
+            if station.error is not None:  # of what happened before a recording nothing else would state
                 spool.note(Note(clock.now_ns(), name, LOST, str(station.error)))
             if early is not None:
                 _spooled(spool, name, [*early, *found])

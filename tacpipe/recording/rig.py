@@ -31,7 +31,7 @@ from tacpipe.printable import excerpt, plain
 from tacpipe.sensors.sensor import Sensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
-TAKEN = ("events", "truth")  # streams that a recording has beside those of its sensors
+TAKEN = ("events", "truth")  # streams that a recording has next to those of its sensors
 KEYS = ("name", "sensor", "transport", "options", "emulate")
 
 
@@ -65,7 +65,7 @@ def read(path: Path) -> Rig:
     except TacpipeError as error:
         raise UsageError(str(error)) from error
     except FileNotFoundError:
-        raise UsageError(f"There is no rig file {path}; docs/rig.md tells how to write one.") from None
+        raise UsageError(f"There is no rig file {path}; its format is documented in docs/rig.md.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"The rig file {path} cannot be read: {error}.") from error
     return parse(text, str(path))
@@ -74,7 +74,7 @@ def read(path: Path) -> Rig:
 def parse(text: str, where: str = "rig.toml") -> Rig:
     """Return the rig of a rig file's text; ``where`` names it in errors.
 
-    Raises `UsageError` for what is no TOML, for an unknown key, sensor, option or address, and for a name that is taken.
+    Raises `UsageError` for what is not a TOML, for an unknown key, sensor, option or address, and for a name that is taken.
     """
     try:
         found = tomllib.loads(text)
@@ -98,8 +98,8 @@ def parse(text: str, where: str = "rig.toml") -> Rig:
     labels = _table(found, "labels", where)
     for name, value in labels.items():
         if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
-            told = f"label {plain(name)} is {excerpt(value)}"
-            raise UsageError(f"{where}: {told}; it must be text, a finite number, true or false.")
+            described = f"label {plain(name)} is {excerpt(value)}"
+            raise UsageError(f"{where}: {described}; it must be text, a finite number, true or false.")
     return Rig(streams, master, labels, _table(found, "emulate", where), text)
 
 

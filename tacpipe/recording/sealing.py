@@ -71,10 +71,12 @@ class _Stalls:
         if stall.late_ns:
             self._windows.append((note.t_ns, note.t_ns + MOST_CATCH_UP_NS, note.t_ns - stall.late_ns))
         self._suspended += [(note.t_ns, stall.suspended_ns)] if stall.suspended_ns else []
-        told = [f"nothing was read for {stall.lasted_ns / 1e9:.3f} s"]
-        told += [f"the computer was suspended for {stall.suspended_ns / 1e9:.3f} s of it"] if stall.suspended_ns else []
-        told += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
-        return Event(note.t_ns, STALLED, detail="; ".join(told))
+        facts = [f"nothing was read for {stall.lasted_ns / 1e9:.3f} s"]
+        facts += (
+            [f"the computer was suspended for {stall.suspended_ns / 1e9:.3f} s of it"] if stall.suspended_ns else []
+        )
+        facts += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
+        return Event(note.t_ns, STALLED, detail="; ".join(facts))
 
     def uncertain_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return by how much samples may have come earlier than these stamps (sample,); 0 where they are certain."""
@@ -96,9 +98,9 @@ def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
 
 
 def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
-    """Return one stream of a spool: ``t_ns`` in UTC, the device's time and counters beside it, and the channels.
+    """Return one stream of a spool: ``t_ns`` in UTC, the device's time and counters next to it, and the channels.
 
-    ``end_ns`` is when the last byte of any stream came: one that fell silent long before says so.
+    ``end_ns`` is when the last byte of any stream came: one that fell silent long before states it.
     """
     sensor = rig.streams[name].sensor
     reading, parts, stalls = Reading(sensor), _Parts(), _Stalls()
@@ -112,8 +114,8 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
             if block.what in (STALLED, CAUGHT_UP):
                 stall = stalls.take(block)
                 parts.events += [] if stall is None else [stall]
-            elif block.what != OPENED or away:  # that it opened before it was recorded is no event
-                parts.events.append(_told(block, sensor))
+            elif block.what != OPENED or away:  # that it opened before it was recorded is not an event
+                parts.events.append(_event_of(block, sensor))
             continue
         chunks += len(block.size)
         size += len(block.data)
@@ -145,14 +147,14 @@ def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, 
     return (0, 0) if tallied is None or tallied.chunks <= chunks else (tallied.chunks - chunks, tallied.bytes - size)
 
 
-def _told(note: Note, sensor: Sensor) -> Event:
-    """Return the event of a note; packets that this computer dropped are lost, where no counter says so itself."""
+def _event_of(note: Note, sensor: Sensor) -> Event:
+    """Return the event of a note; packets that this computer dropped are lost, where no counter states it itself."""
     dropped = int(note.detail) if note.what == OVERRUN and sensor.counter is None else 0
     return Event(note.t_ns, note.what, dropped, detail=note.detail)
 
 
 def _silent_end(sensor: Sensor, batches: Sequence[Batch], end_ns: int) -> list[Event]:
-    """Return the event of a stream that gave nothing any more well before the end; no counter tells of that."""
+    """Return the event of a stream that gave nothing any more well before the end; no counter reports on that."""
     last_ns = int(batches[-1].t_ns[-1]) if batches else end_ns
     apart_s = (end_ns - last_ns) / 1e9
     if not sensor.awaited or apart_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):

@@ -16,7 +16,7 @@ UNTOLD = ("rate_hz", "baud")  # options that make no difference to what a frame 
 def sentence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, reply: bool = False) -> str:
     """Return which device, what is wrong and what to do, for a stream on which ``awaited`` did not come.
 
-    ``heard`` is what came instead; with ``reply`` a reply was awaited, so that frames of the sensor itself say something.
+    ``heard`` is what came instead; with ``reply`` a reply was awaited, so that frames of the sensor itself state something.
     """
     joined = Chunks.joined(list(heard))
     about = f"Stream {stream.name} ({stream.address}): {awaited}"
@@ -25,8 +25,8 @@ def sentence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, reply: bo
     if not joined.data:
         rate = f", set to {stream.sensor.baud} baud as we are" if serial else ""
         end = f"; {probe} tries all rates" if serial else ""
-        told = f"{about}, but nothing came. Check power and cable, and that it is {stream.kind}{rate}{end}."
-        return f"{told} {stream.sensor.exclusive}".strip()
+        described = f"{about}, but nothing came. Check power and cable, and that it is {stream.kind}{rate}{end}."
+        return f"{described} {stream.sensor.exclusive}".strip()
     about += f", but {len(joined.data):,} bytes came that hold none."
     known = _known(stream, joined, reply=reply)
     if known:

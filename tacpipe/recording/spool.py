@@ -80,7 +80,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a spool that are no block: at its end what a crash tore off, elsewhere what a disk did."""
+    """Bytes of a spool that are not a block: at its end what a crash tore off, elsewhere what a disk did."""
 
     offset: int
     bytes: int
@@ -115,16 +115,16 @@ class Spool:
         with readable_errors(store):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             self.folder.mkdir(mode=0o700)
-            told = {**header, "streams": list(streams), "clock": now()}
+            entry = {**header, "streams": list(streams), "clock": now()}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             fcntl.flock(self._file, fcntl.LOCK_EX)  # until the process ends: nobody recovers what is being written
             self._tally = _tally(self.folder, len(streams))
-            content = json.dumps(told, sort_keys=True).encode()
+            content = json.dumps(entry, sort_keys=True).encode()
             write_whole(str(self.folder / "header.json"), content, str(self.folder / ".header.json"))
             for folder in (self.folder, self.folder.parent):
                 sync_folder(str(folder))
         self._waiting: list[bytes] = []
-        self.failed: OSError | None = None  # what the disk said to a sync: it says so once
+        self.failed: OSError | None = None  # what the disk stated to a sync: it states it once
 
     def tally(self, stream: int, chunks: int, size: int, last_ns: int) -> None:
         """Note how much a stream has received in all, before it is appended."""
@@ -160,7 +160,7 @@ class Spool:
             ) from error
 
     def sync(self) -> None:
-        """Have what was written outlast a loss of power; a disk that fails is told by the next `write`."""
+        """Have what was written outlast a loss of power; a disk that fails is reported by the next `write`."""
         try:
             os.fdatasync(self._file)
         except OSError as error:
@@ -212,13 +212,13 @@ class Spooled:
     @property
     def ended(self) -> str:
         """How the recording ended, as far as its blocks were read: one whose process did not end it was recovered."""
-        told = next((note.detail for note in self._notes if note.what == ENDED), "")
-        return told if told in (COMPLETED, INTERRUPTED) else RECOVERED
+        entry = next((note.detail for note in self._notes if note.what == ENDED), "")
+        return entry if entry in (COMPLETED, INTERRUPTED) else RECOVERED
 
     def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | Note]]:
         """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
 
-        What is no block is passed over, and noted in ``damage``. Notes on the recording are read along, see `ended`.
+        What is not a block is passed over, and noted in ``damage``. Notes on the recording are read along, see `ended`.
         """
         wanted = None if stream is None else self.streams.index(stream)
         self.damage, self._notes = [], []
@@ -241,14 +241,14 @@ class Spooled:
                 _, _, kind, number, _, count, size = HEAD.unpack_from(content, place)
                 if (wanted is None or number == wanted) and number < len(self.streams):
                     body = content[place + HEAD.size : place + HEAD.size + size]
-                    told = _body(kind, self.streams[number], count, body)
-                    if told is None:
+                    entry = _body(kind, self.streams[number], count, body)
+                    if entry is None:
                         self._damaged(place, stop - place)
                     else:
-                        yield self.streams[number], told
+                        yield self.streams[number], entry
                 elif number == WHOLE:
-                    told = _body(kind, "", count, content[place + HEAD.size : place + HEAD.size + size])
-                    self._notes += [told] if isinstance(told, Note) else []
+                    entry = _body(kind, "", count, content[place + HEAD.size : place + HEAD.size + size])
+                    self._notes += [entry] if isinstance(entry, Note) else []
                 place = stop
 
     def _damaged(self, offset: int, size: int) -> None:
@@ -264,7 +264,7 @@ class Spooled:
             with self._opened("tally") as file:
                 content = file.read(len(self.streams) * TALLY.size)
             return {name: Tallied(*TALLY.unpack_from(content, n * TALLY.size)) for n, name in enumerate(self.streams)}
-        except (FileNotFoundError, struct.error):  # one that cannot be read now is no reason to forget what was lost
+        except (FileNotFoundError, struct.error):  # one that cannot be read now is not a reason to forget what was lost
             return {}
 
     def utc_ns(self, t_ns: Any) -> Any:
@@ -289,7 +289,7 @@ class Spooled:
         return kept / self.folder.name
 
     def _opened(self, name: str) -> io.FileIO:
-        """Return one of its files, opened. Raises `TacpipeError` for one that is no regular file, or another user's."""
+        """Return one of its files, opened. Raises `TacpipeError` for one that is not a regular file, or another user's."""
         path = self.folder / name
         try:
             file = io.FileIO(path, opener=lambda name, _: os.open(name, READ))
@@ -356,7 +356,7 @@ def abandoned(store: Path) -> list[Path]:
     ids = users(store / FOLDER, everybodys.values())
     for folder in [folder for folder, owner in everybodys.items() if owner in ids]:
         try:
-            with claimed(folder) as ours:
+            with locked(folder) as ours:
                 age_s = time.time() - (folder / "bytes" if ours else folder).stat().st_mtime
                 if ours and (folder / "header.json").exists():
                     found.append((-age_s, folder))
@@ -368,12 +368,12 @@ def abandoned(store: Path) -> list[Path]:
             continue
         except OSError as error:
             if error.errno != errno.ENOTEMPTY:
-                found.append((0.0, folder))  # who tries to seal it tells what is wrong with it
+                found.append((0.0, folder))  # who tries to seal it states what is wrong with it
     return [folder for _, folder in sorted(found)]
 
 
 @contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[bool]:
+def locked(folder: Path) -> Iterator[bool]:
     """Hold a spool while in the block; yield False if it is gone, or if a process writes or seals it."""
     try:
         handle = os.open(folder / "bytes", READ)
@@ -442,7 +442,7 @@ def _next(handle: int, content: mmap.mmap, place: int) -> int:
     except OSError as error:
         if error.errno == errno.ENXIO:  # nothing follows but a hole
             return len(content)
-        stop = len(content)  # a file system that does not tell
+        stop = len(content)  # a file system that does not state
     found = content.find(MARK, place + 1, stop)
     return stop if found < 0 else found
 
@@ -451,8 +451,8 @@ def _body(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | No
     """Return what a block holds, None where its sum is right and it is still none: another program wrote it."""
     try:
         if kind == NOTE:
-            told = json.loads(body)
-            return Note(int(told["t_ns"]), stream, str(told["what"]), str(told["detail"]))
+            entry = json.loads(body)
+            return Note(int(entry["t_ns"]), stream, str(entry["what"]), str(entry["detail"]))
         stamps = np.frombuffer(body, "<i8", count)
         sizes = np.frombuffer(body, "<u4", count, 8 * count).astype(np.int64)
     except (ValueError, LookupError, TypeError, RecursionError, OverflowError):

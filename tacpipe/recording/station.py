@@ -30,7 +30,7 @@ STALLED, CAUGHT_UP = (
 )  # this program was held up; from here on arrivals are certain again
 READ_S = 0.1  # longest wait of a read, after which the thread looks whether it should end
 AGAIN_S = (0.1, 2.0)  # between two tries to open a lost link: first, and at most
-MUTE_S = 4.0  # after which a device that should send datagrams and does not is asked anew: nothing else tells its loss
+MUTE_S = 4.0  # after which a device that should send datagrams and does not is asked anew: nothing else states its loss
 TARE_S = 5.0  # in which a device must have tared
 STOP_S = 2.0  # in which a thread must have ended
 REPLY_S = 0.5  # after which a device that is asked for each frame is asked once more
@@ -74,7 +74,7 @@ class Station:
             return self._taken()
 
     def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
-        """Return what came since the last call, and tell ``tally`` from now on how much came after that.
+        """Return what came since the last call, and state ``tally`` from now on how much came after that.
 
         ``early`` is what came before and is recorded too: it counts, and with it what this returns. None: neither.
         """
@@ -90,7 +90,7 @@ class Station:
             return found
 
     def end(self) -> list[Chunks | Note]:
-        """Return what came since the last call, and tell no tally any more."""
+        """Return what came since the last call, and state no tally any more."""
         with self._keeping:
             self._tally = None
             self._note_foreign(self._link)
@@ -121,16 +121,16 @@ class Station:
         return True
 
     def stop(self) -> None:
-        """End the thread, tell the device to stop, close the link."""
+        """End the thread, state the device to stop, close the link."""
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(timeout=STOP_S)
         link, self._link = self._link, None
         if link is not None:
-            with contextlib.suppress(Exception):  # whatever a device says to its end, the others are to be closed too
-                said = self.stream.sensor.closing()
-                if said:
-                    link.write(said)
+            with contextlib.suppress(Exception):  # whatever a device states to its end, the others are to be closed too
+                answer = self.stream.sensor.closing()
+                if answer:
+                    link.write(answer)
             with contextlib.suppress(Exception):
                 link.close()
 
@@ -155,7 +155,7 @@ class Station:
                 self._read()
             except TacpipeError as error:
                 self._lose(error)
-            except Exception as error:  # of a driver: told as a loss, and no other stream suffers
+            except Exception as error:  # of a driver: stated as a loss, and no other stream suffers
                 self._lose(DeviceError(f"Stream {self.stream.name} failed: {type(error).__name__}: {error}"))
 
     def _lose(self, error: TacpipeError) -> None:
@@ -186,9 +186,9 @@ class Station:
             self._obey(link, pace)
             if answers:
                 for _, chunk in came:
-                    said = sensor.answer(chunk)
-                    if said:
-                        link.write(said)
+                    answer = sensor.answer(chunk)
+                    if answer:
+                        link.write(answer)
                         pace.resume(clock.now_ns())
             if link.overruns != self._overruns:
                 self._overran(link.overruns)
@@ -211,13 +211,15 @@ class Station:
         return came
 
     def _heard(self, before_s: float, came: list[tuple[int, bytes]]) -> float:
-        """Return when the device was heard last. Raises `LinkLostError` for one that is mute, where silence alone tells."""
+        """Return when the device was heard last. Raises `LinkLostError` for one that is mute, where silence alone states."""
         sensor, address, now_s = self.stream.sensor, self.stream.address, time.monotonic()
         if came or address.scheme not in TALKING or sensor.listens or not sensor.awaited:
             return now_s
         if now_s - before_s > MUTE_S:
-            told = f"Stream {self.stream.name} ({address}) is lost: nothing came for {MUTE_S:g} s. {sensor.exclusive}"
-            raise LinkLostError(told.strip())
+            described = (
+                f"Stream {self.stream.name} ({address}) is lost: nothing came for {MUTE_S:g} s. {sensor.exclusive}"
+            )
+            raise LinkLostError(described.strip())
         return before_s
 
     def _ask(self, link: Link, asked: bytes, pace: Pace) -> None:
@@ -240,8 +242,8 @@ class Station:
 
     def _note_foreign(self, link: Link | None) -> None:
         if link is not None and link.foreign > self._foreign:
-            told = f"{link.foreign - self._foreign} packets of other senders were left out"
-            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, told))
+            described = f"{link.foreign - self._foreign} packets of other senders were left out"
+            self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, described))
             self._foreign, self._foreign_s = link.foreign, time.monotonic()
 
     def _overran(self, overruns: int) -> None:

@@ -62,12 +62,12 @@ class Recorded:
 
     def line(self) -> str:
         """Return it in words."""
-        told = ", ".join(
+        described = ", ".join(
             f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
             for name, rows in self.rows.items()
         )
         kept = f"; its spool is kept in {self.spool}" if self.spool else ""
-        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {told}{kept}"
+        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {described}{kept}"
 
 
 def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> tuple[list[Recorded], list[str]]:
@@ -110,10 +110,10 @@ def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
     from tacpipe.recording import rig as rig_of
 
     spooled = Spooled(folder, users(folder.parent, [folder.lstat().st_uid]))
-    told = spooled.header.get("rig")
-    if not isinstance(told, str):
-        raise TacpipeError(f"Its rig file is {excerpt(told)}; it must be a text.")
-    rig = rig_of.parse(told, f"The rig file in {folder}")
+    described = spooled.header.get("rig")
+    if not isinstance(described, str):
+        raise TacpipeError(f"Its rig file is {excerpt(described)}; it must be a text.")
+    rig = rig_of.parse(described, f"The rig file in {folder}")
     header.check(spooled.header, rig.streams)
     return _sealed(store, header.destination(spooled.header, store, opened), spooled, rig)
 
@@ -123,9 +123,9 @@ def _record(
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
-    told = {"output": header.output(store, plan.output), "recording": name, "attributes": attributes}
+    described = {"output": header.output(store, plan.output), "recording": name, "attributes": attributes}
     wanted = {"duration_s": plan.duration_s, "keep": plan.keep_spool}
-    spool = Spool(store.root, {**told, **wanted, "rig": recorder.rig.text}, list(recorder.stations))
+    spool = Spool(store.root, {**described, **wanted, "rig": recorder.rig.text}, list(recorder.stations))
     began_s = clock.now_s()
     how = COMPLETED
 
@@ -138,7 +138,10 @@ def _record(
         return ended() or stops()
 
     kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
-    with termination.saying(f"tacpipe: interrupted. {kept}."), contextlib.closing(spool):  # nobody else may recover it
+    with (
+        termination.reporting(f"tacpipe: interrupted. {kept}."),
+        contextlib.closing(spool),
+    ):  # nobody else may recover it
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
             spool.note(Note(clock.now_ns(), "", ENDED, how))
@@ -147,7 +150,7 @@ def _record(
         try:
             return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig), lost
         except TacpipeError as error:
-            raise type(error)(f"{error} {kept} once that is mended.") from error
+            raise type(error)(f"{error} {kept} once that is fixed.") from error
         except Exception as error:
             error.add_note(f"{kept}.")
             raise
@@ -169,7 +172,7 @@ def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
 def _triggers(
     recorder: Recorder, plan: Plan, pressed: triggers.Keys, tap: triggers.Tap | None
 ) -> tuple[triggers.Trigger, triggers.Trigger]:
-    """Return what starts the next trial, and what stops it beside its duration."""
+    """Return what starts the next trial, and what stops it next to its duration."""
     contact = None
     if "contact" in (plan.start, plan.stop):
         contact = triggers.Contact(recorder.watches, plan.contact_count)
@@ -178,6 +181,6 @@ def _triggers(
     if contact is not None:
         starts["contact"], stops["contact"] = contact.touched, contact.released
     if tap is not None:
-        starts["tap"], stops["tap"] = (lambda: tap.said("start")), (lambda: tap.said("stop"))
-        stops["duration"] = lambda: tap.said("start") and False  # one that comes meanwhile begins no other trial
+        starts["tap"], stops["tap"] = (lambda: tap.received("start")), (lambda: tap.received("stop"))
+        stops["duration"] = lambda: tap.received("start") and False  # one that comes meanwhile begins no other trial
     return starts[plan.start], stops[plan.stop]

@@ -24,7 +24,7 @@ Trigger = Callable[[], bool]
 
 
 class Keys(Protocol):
-    """Tells whether a key was pressed."""
+    """Detects whether a key was pressed."""
 
     def __call__(self, *, must: bool = False) -> bool:
         """Return whether it was since the last call. With ``must``, raises `UsageError` where none can be any more."""
@@ -32,14 +32,14 @@ class Keys(Protocol):
 
 @contextlib.contextmanager
 def keys() -> Iterator[Keys]:
-    """Yield what tells whether Enter or the space bar was pressed."""
+    """Yield what states whether Enter or the space bar was pressed."""
     try:
         source = sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):  # there is none, or it is closed
         source = -1
     settings = None
     waiting, ended = b"", source < 0
-    with contextlib.suppress(Exception):  # no terminal: lines of standard input stand for keys
+    with contextlib.suppress(Exception):  # no terminal: lines of standard input represent keys
         import termios
         import tty
 
@@ -83,7 +83,7 @@ def _pressed(typed: bytes, *, lines: bool) -> tuple[int, bool]:
 
 
 class Contact:
-    """Tells from the tactile channels of all streams whether something is touched."""
+    """Detects from the tactile channels of all streams whether something is touched."""
 
     def __init__(self, watches: Mapping[str, Watch], threshold: float) -> None:
         found = {name: [place for place, _ in tactile_channels(watch.stream)] for name, watch in watches.items()}
@@ -113,18 +113,18 @@ class Contact:
 
 
 class Tap:
-    """Tells from what the lab's own programs say whether a trial begins or ends."""
+    """Detects from what the lab's own programs state whether a trial begins or ends."""
 
     def __init__(self, watches: Mapping[str, Watch]) -> None:
         self._watches = [watch for watch in watches.values() if watch.stream.kind == TAP]
         if not self._watches:
             raise UsageError(
-                'This rig has no stream of sensor "tap" that could say when to start or stop. Add one to the rig file, or '
+                'This rig has no stream of sensor "tap" that could state when to start or stop. Add one to the rig file, or '
                 "start and stop by key, time or contact."
             )
         self._since_ns = [clock.now_ns() for _ in self._watches]
 
-    def said(self, word: str) -> bool:
+    def received(self, word: str) -> bool:
         """Return whether ``{"event": word}`` came since this was made; what came up to it, or at all, is dealt with."""
         for number, watch in enumerate(self._watches):
             for chunk in watch.heard:

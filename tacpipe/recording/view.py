@@ -55,8 +55,8 @@ class View:
         if self._live is not None:
             self._live.update(self._picture(state, figures))
         else:
-            told = "; ".join(line(name, found) for name, found in figures.items())
-            terminal.note(f"{state}: {told}")
+            described = "; ".join(line(name, found) for name, found in figures.items())
+            terminal.note(f"{state}: {described}")
 
     def _picture(self, state: str, figures: Mapping[str, Figures]) -> Any:
         from rich.console import Group

@@ -1,4 +1,4 @@
-"""What can be told of a stream while it comes: rate, losses, jitter, latency, the newest values."""
+"""What can be determined of a stream while it comes: rate, losses, jitter, latency, the newest values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tacpipe.recording.spool import Note
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 
-SPAN_NS = 2_000_000_000  # over which rate and jitter are told
+SPAN_NS = 2_000_000_000  # over which rate and jitter are given
 REST_S = 0.5  # over which the level of a tactile channel at rest is taken
 
 
@@ -42,7 +42,7 @@ class Watch:
         self.samples = 0
         self.error = ""  # what its driver could not make of what came
         self.newest: NDArray[np.float64] | None = None  # (channel,)
-        self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to tell what speaks where no frame is found
+        self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to state what speaks where no frame is found
         self.last_ns: int | None = None  # arrival of the newest sample
         self._reading = Reading(stream.sensor)
         self._recent: deque[tuple[NDArray[np.int64], NDArray[np.int64] | None]] = deque()

@@ -19,6 +19,6 @@ def tree(result: Dataset, name: str) -> Tree:
 
 
 def history(result: Dataset) -> list[Tree]:
-    """Return what ``history.jsonl`` tells, one line an epoch; empty where nothing was trained by epochs."""
+    """Return what ``history.jsonl`` states, one line an epoch; empty where nothing was trained by epochs."""
     lines = result.files["history.jsonl"].splitlines() if "history.jsonl" in result.files else []
     return [json.loads(line) for line in lines if line.strip()]

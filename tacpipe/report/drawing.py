@@ -115,5 +115,5 @@ def legend_below(axes: Axes, columns: int = 1) -> None:
 
 
 def hue(number: int, of: int) -> tuple[float, float, float]:
-    """Return a colour that is told from its neighbours' on a light page and on a dark one."""
+    """Return a colour that is derived from its neighbours' on a light page and on a dark one."""
     return colorsys.hls_to_rgb(number / max(of, 1), (0.45, 0.6)[number % 2], 0.75)

@@ -1,4 +1,5 @@
-"""What came out, first on the page: sentences whose colour says no more than their intervals, and the table behind them."""
+"""What came out, first on the page: sentences whose colour states no more than their intervals, and the table behind
+them."""
 
 from __future__ import annotations
 
@@ -13,9 +14,9 @@ from tacpipe.report import markup
 def box(sentences: Sequence[tuple[str, str]]) -> str:
     """Return sentences with their verdicts (`tacpipe.metrics.headline.verdict`), green only where it is ``better``."""
     return "\n".join(
-        f'<p class="{f"headline {verdict}".strip()}">{escape(_unbroken(told))}</p>'
-        for told, verdict in sentences
-        if told
+        f'<p class="{f"headline {verdict}".strip()}">{escape(_unbroken(described))}</p>'
+        for described, verdict in sentences
+        if described
     )
 
 
@@ -31,5 +32,5 @@ def table(headlines: Sequence[Headline]) -> str:
     )
 
 
-def _unbroken(told: str) -> str:
-    return told.replace(" %", "\N{NO-BREAK SPACE}%")
+def _unbroken(described: str) -> str:
+    return described.replace(" %", "\N{NO-BREAK SPACE}%")

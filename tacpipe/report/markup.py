@@ -59,8 +59,8 @@ def skill(value: float) -> str:
     >>> skill(-43.559), skill(0.1234)
     ('−43.6', '+0.123')
     """
-    told = f"{value:+.3g}" if abs(value) < 1000 else f"{value:+,.0f}"
-    return told.replace("-", "−")
+    described = f"{value:+.3g}" if abs(value) < 1000 else f"{value:+,.0f}"
+    return described.replace("-", "−")
 
 
 def number(value: float) -> str:
@@ -102,9 +102,9 @@ def sure(mean: float, low: float, high: float) -> Markup:
     """
     if math.isnan(mean):
         return Markup("not defined")
-    told = [decimals(value) for value in (mean, low, high)]
-    spread = low < high and told[1] != told[2]  # neither NaN nor persistence beside itself
-    return Markup(told[0] + (f"<br><small>{told[1]} to {told[2]}</small>" if spread else ""))
+    described = [decimals(value) for value in (mean, low, high)]
+    spread = low < high and described[1] != described[2]  # neither NaN nor persistence next to itself
+    return Markup(described[0] + (f"<br><small>{described[1]} to {described[2]}</small>" if spread else ""))
 
 
 def with_sd(mean: float, sd: float, digits: int = 4) -> str:

@@ -1,4 +1,4 @@
-"""What tells a method from others that would have the same name: the settings in which they differ."""
+"""What distinguishes a method from others that would have the same name: the settings in which they differ."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 Tree = Mapping[str, Any]
 
 
-def told_apart(
+def distinct_names(
     named: Sequence[tuple[str, Tree]], usual: Collection[tuple[str, Any]] = ()
 ) -> list[tuple[str, tuple[str, ...]]]:
     """Return a name for each method, given a first name and all its settings, and the settings that were added to it.
 
-    Settings are told where methods of the same first name differ in them, but for empty ones and those in ``usual``.
+    Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``.
 
-    >>> told_apart([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
+    >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', ('deep',)), ('net · no deep', ('no deep',)), ('tree', ())]
     """
     alike: dict[str, list[Tree]] = {}

@@ -61,7 +61,7 @@ def _title(tasks: Iterable[str], packages: dict[str, Any]) -> str:
 
 
 def _task(result: Dataset) -> str:
-    """Return the task of a result, empty where it does not say."""
+    """Return the task of a result, empty where it does not state."""
     return str(contents.tree(result, "config.json").get("task", ""))
 
 

@@ -17,12 +17,13 @@ Tree = Mapping[str, Any]
 
 
 def simulated(result: Dataset) -> bool:
-    """Say whether any recording of a result was simulated."""
+    """Return whether any recording of a result was simulated."""
     return any(bool(shard.attributes.get("simulated")) for shard in result.recordings.values())
 
 
 def published(result: Dataset, sets: Collection[str]) -> bool:
-    """Say whether all recordings of a result are of published ``sets``: what their papers say is about these data alone.
+    """Return whether all recordings of a result are of published ``sets``: what their papers state is about these data
+    alone.
 
     The attribute ``published``, which `tacpipe ingest` sets, names the set of a recording.
     """

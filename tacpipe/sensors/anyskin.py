@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 TAIL = b"\r\n"
 CHANNELS = 4  # a magnetometer
 # A Melexis MLX90393 gives 16 bits of at least 0.15 µT each (datasheet, table of sensitivities); numbers out of this range
-# come from bytes that are no frame.
+# come from bytes that are not a frame.
 LEAST, MOST = 2.0**-20, 2.0**20
 
 

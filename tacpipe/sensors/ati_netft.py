@@ -57,7 +57,7 @@ class AtiNetFT(Sensor):
         if (self.counts_per_force > 0) != (self.counts_per_torque > 0) or self.counts_per_force < 0:
             raise UsageError(
                 f"ati-netft: counts_per_force is {self.counts_per_force:g} and counts_per_torque "
-                f"{self.counts_per_torque:g}; give both as the box's configuration page tells them, or neither."
+                f"{self.counts_per_torque:g}; give both as the box's configuration page states them, or neither."
             )
         object.__setattr__(self, "device_counter", (1 << 32) // self.every)
 
@@ -67,7 +67,7 @@ class AtiNetFT(Sensor):
         return max(1, round(self.internal_hz / self.rate_hz))
 
     def fields(self) -> list[pa.Field]:
-        """Return ``status`` (uint32, 0: all is well) and the load: int32 counts, or N and N m where those are told."""
+        """Return ``status`` (uint32, 0: all is well) and the load: int32 counts, or N and N m where those are given."""
         import pyarrow as pa
 
         from tacpipe.channels import schema

@@ -11,7 +11,7 @@ counter of frames (uint16, little-endian), then the 44 words, of each word one f
 little-endian sum of all bytes before. A bridge that sends this can be read; firmware for one is a loop of SPI transfers
 and one write.
 
-One row is one frame. Its time is that of the frame; each field says with ``offset_ns`` how much later its word was
+One row is one frame. Its time is that of the frame; each field states with ``offset_ns`` how much later its word was
 sampled.
 """
 

@@ -35,7 +35,7 @@ Span = tuple[int, int, int]  # frames of one size that follow one another: where
 
 
 class ByteFramer:
-    """Cuts a stream of bytes into frames as a `Framing` tells."""
+    """Cuts a stream of bytes into frames as a `Framing` states."""
 
     def __init__(self, framing: Framing) -> None:
         self.framing = framing
@@ -221,7 +221,7 @@ class ByteFramer:
         """Return of the places within a frame from ``start`` on the one at which marks repeat for longest, as `_search`.
 
         A payload that holds still may show the marker in every frame. Where marks alone speak for frames, only its change
-        tells the true place.
+        states the true place.
         """
         size = self.framing.size
         if self.framing.summed or size is None:

@@ -54,11 +54,11 @@ class Clouds(Sensor):
         return list(Cloud(np.zeros((0, 3), np.float32), colours).table().schema)
 
     def framer(self) -> Framer:
-        """Return a framer that takes chunks which are clouds, with colours as the options tell."""
+        """Return a framer that takes chunks which are clouds, with colours as the options state."""
         return TextFramer(self._is_right)
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return a row for each point; ``rows`` says of which cloud it is."""
+        """Return a row for each point; ``rows`` states of which cloud it is."""
         found = [self._points(frame) for frame in frames]
         points = [xyz for xyz, _ in found] or [np.zeros((0, 3), np.float32)]
         rows = np.repeat(np.arange(len(found)), [len(xyz) for xyz, _ in found]).astype(np.int64)
@@ -92,7 +92,7 @@ class Clouds(Sensor):
 
 @functools.lru_cache(maxsize=AT_HAND)
 def _parsed(content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
-    """Return points and colours as they stand in a chunk. Raises `TacpipeError` where it is no cloud."""
+    """Return points and colours as they stand in a chunk. Raises `TacpipeError` where it is not a cloud."""
     if content.startswith(MAGIC):
         return DepthFrame.of_bytes(content).points()
     if content.startswith(b"ply"):

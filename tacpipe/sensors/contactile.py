@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 RATES = (100, 250, 500, 1000)
 COUNTER = 1 << 32
 LARGEST = 8192  # bytes of a frame
-JUMP_S = 0.25  # a counter that leaps farther than this lasts is no loss: the session changed
+JUMP_S = 0.25  # a counter that leaps farther than this lasts is not a loss: the session changed
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Contactile(Sensor):
         """Return the values of all blocks, with the hub's counter and time.
 
         Frames without the blocks of slip, as they come before the watch began, are left out where ``slip`` is set.
-        Raises `DeviceError` where the controller has other sensors than the options say.
+        Raises `DeviceError` where the controller has other sensors than the options state.
         """
         parts: list[tuple[NDArray[np.int64], tuple[NDArray[Any], ...], NDArray[np.uint8]]] = []
         for rows, layout in pts.layouts(frames):
@@ -117,12 +117,12 @@ class Contactile(Sensor):
             if layout.counts != (self.pillars,) * self.sensors:
                 raise DeviceError(
                     f"The controller has sensors of {', '.join(map(str, layout.counts)) or 'no'} pillars and the options "
-                    f"say {self.sensors} of {self.pillars}; set sensors and pillars."
+                    f"state {self.sensors} of {self.pillars}; set sensors and pillars."
                 )
             if self.slip and not layout.slips:
                 continue
-            told = frames[rows]
-            parts.append((rows, self._values(told, layout), _gathered(told, layout.places(pts.HUB), 12)[:, 0]))
+            selected = frames[rows]
+            parts.append((rows, self._values(selected, layout), _gathered(selected, layout.places(pts.HUB), 12)[:, 0]))
         if not parts:
             return self._nothing()
         rows = np.concatenate([part[0] for part in parts])
@@ -185,7 +185,7 @@ class Contactile(Sensor):
         yield Ask(b"z\n", pause_s=2.0)
 
     def device(self) -> Device:
-        """Return a controller that streams from power-on at the rate that it was last told."""
+        """Return a controller that streams from power-on at the rate that it was last stated."""
         return _Controller()
 
 

@@ -1,4 +1,4 @@
-"""The counters that devices send along, unrolled, and what they say is missing."""
+"""The counters that devices send along, unrolled, and what they state is missing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Integers = NDArray[np.int64]
 MOST_RATE_HZ = 100_000.0  # of a device whose rate nobody gave: no program sends records faster
 RESET_TIMES = 3.0  # a gap longer than so many times what the clock allows is a device that began anew
 RESET_SLACK = 32  # samples beyond that which a burst may bring
-AGREES = 0.05  # beyond the slack, of what the clock estimates for an outage through which the device went on counting
+AGREES = 0.05  # beyond the slack, of what the clock estimates for an outage through which the device continued counting
 LATE_NS = 250_000_000  # a link that reorders does so within this; a count that goes back later is a device's restart
 
 
@@ -50,9 +50,9 @@ class Counting:
         self._doubted = self._last is not None
 
     def feed(self, raw: Integers, t_ns: Integers) -> Counted:
-        """Return what counters (sample,) as sent say, with the arrival of each.
+        """Return what counters (sample,) as sent state, with the arrival of each.
 
-        Where the samples come further apart than half the counter's range lasts, the arrival tells how often it went round.
+        Where the samples come further apart than half the counter's range lasts, the arrival states how often it went round.
         """
         if not len(raw):
             nothing = np.zeros(0, dtype=bool)
@@ -78,7 +78,7 @@ class Counting:
         return signed
 
     def _again(self, raw: int, at_ns: int, last_raw: int, last_seq: int, last_ns: int) -> Counted:
-        """Return what the first counter after an outage says, if the clock agrees with it."""
+        """Return what the first counter after an outage states, if the clock agrees with it."""
         half, rounds = self.modulus // 2, self.modulus // self.step
         steps, off = divmod((raw - last_raw + half) % self.modulus - half, self.step)
         expected = (at_ns - last_ns) * 1e-9 * self.rate_hz
@@ -97,7 +97,7 @@ class Counting:
         return Counted(np.array([last_seq + steps]), np.array([steps - 1]), nothing, nothing, np.array([reset]))
 
     def _went_on(self, raw: int) -> int:
-        """Return by how much a count goes on from where it was before a reset, 0 where it does not."""
+        """Return by how much a count continues from where it was before a reset, 0 where it does not."""
         if self._before is None:
             return 0
         half = self.modulus // 2

@@ -1,7 +1,7 @@
 """FlexiTac and boards of its kind: a grid of piezoresistive taxels, read row by row by an Arduino.
 
 A frame is ``AA 55`` and a byte a taxel, the ADC's upper eight bits of ten, row by row; it streams from power-up and takes no
-commands. There is neither length, nor counter, nor sum, and ``AA 55`` may stand among the taxels: what tells the frames
+commands. There is neither length, nor counter, nor sum, and ``AA 55`` may stand among the taxels: what states the frames
 is that the mark repeats at their size.
 Source: the package flexitac 0.3.1 (MIT) and the firmware that comes with it.
 """

@@ -69,7 +69,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Loss:
-    """Bytes that are no frame, what became of them, and how many frames are lost for it as far as the bytes tell."""
+    """Bytes that are not a frame, what became of them, and how many frames are lost for it as far as the bytes state."""
 
     t_ns: int
     cause: str
@@ -110,14 +110,14 @@ class Framing:
     marker: bytes = b""  # that each begins with
     tail: bytes = b""  # that each ends with
     size: int | None = None  # of the whole frame in bytes, where all have the same
-    header: int = 0  # bytes from which ``sizes`` tells the size, the marker included
+    header: int = 0  # bytes from which ``sizes`` states the size, the marker included
     sizes: Callable[[Bytes], NDArray[np.integer[Any]]] | None = None  # (frame, header) to (frame,), whole sizes
-    most: int = 4096  # largest size; a frame that says more of itself is none
+    most: int = 4096  # largest size; a frame that states more of itself is none
     check: Callable[[Bytes], NDArray[np.bool_]] | None = None  # (frame, byte) to (frame,)
     lock: int = 2  # good frames in a row that it takes to lock
     confirm: int = 0  # good frames that must follow one before it is given out
     weak: bool = (
-        False  # ``check`` is no sum: frames that are none may pass it again and again while a payload holds still
+        False  # ``check`` is not a sum: frames that are none may pass it again and again while a payload holds still
     )
 
     @property

@@ -168,7 +168,8 @@ class Franka(Sensor):
 
 
 class _Arm(Device):
-    """The arm's side of a connection: it sends its state to ``port`` once that was told; other commands are not answered."""
+    """The arm's side of a connection: it sends its state to ``port`` once that was given; other commands are not
+    answered."""
 
     port: int | None = None
 
@@ -176,11 +177,11 @@ class _Arm(Device):
         self.heard += data
         replies = []
         while (size := whole(bytes(self.heard))) > 0:
-            told = bytes(self.heard[:size])
+            message = bytes(self.heard[:size])
             del self.heard[:size]
-            command, number, _ = HEADER.unpack_from(told)
+            command, number, _ = HEADER.unpack_from(message)
             if command == CONNECT_COMMAND and size == CONNECT.size:
-                _, _, _, version, port = CONNECT.unpack(told)
+                _, _, _, version, port = CONNECT.unpack(message)
                 status = DONE if version == VERSION else OTHER_VERSION
                 replies.append(CONNECTED.pack(command, number, CONNECTED.size, status, VERSION))
                 if status == DONE:

@@ -53,7 +53,7 @@ class Generic(Sensor):
     sum: Sum | None = None  # how a frame is summed, and which number holds that
     sequence: Sequence | None = None  # which number counts the frames
     clock: Clock | None = None  # which number is the device's time
-    length: Length | None = None  # which number tells the size of a frame; none: all have the same
+    length: Length | None = None  # which number states the size of a frame; none: all have the same
     packets: bool = False  # each packet of the link is a frame (udp, hid), which then needs no marker
     start: str = ""  # what has the board stream, in hexadecimal; none: it streams by itself
     stop: str = ""  # what ends that, in hexadecimal
@@ -65,7 +65,7 @@ class Generic(Sensor):
             _bytes(name, getattr(self, name))
         if not (self.marker or self.tail or self.packets):
             raise UsageError(
-                'generic: nothing tells where a frame begins; give marker or tail, such as marker = "AA 55", or '
+                'generic: nothing states where a frame begins; give marker or tail, such as marker = "AA 55", or '
                 "packets = true where each packet of the link is a frame."
             )
         if self.size > MOST:
@@ -110,7 +110,8 @@ class Generic(Sensor):
             if not 0 <= self.size - self.length.plus < place.range:
                 raise UsageError(
                     f"generic: the length would be {self.size - self.length.plus} for a frame of {self.size} bytes, of "
-                    f"which it does not count {self.length.plus}, as plus says; it must be between 0 and {place.range - 1}."
+                    f"which it does not count {self.length.plus}, as plus states; it must be between 0 and "
+                    f"{place.range - 1}."
                 )
 
     @functools.cached_property
@@ -176,8 +177,8 @@ class Generic(Sensor):
 
     def _sizes(self, heads: Bytes) -> NDArray[np.int64]:
         assert self.length is not None
-        told = self._places[self.length.number].take(heads)[:, 0]
-        sizes: NDArray[np.int64] = np.minimum(told.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
+        declared = self._places[self.length.number].take(heads)[:, 0]
+        sizes: NDArray[np.int64] = np.minimum(declared.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
         return sizes
 
     def _is_right(self, frames: Bytes) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 A board sends each triangle in two CAN frames, in the order of their numbers: identifier class << 8 | board << 4 |
 triangle, the first byte ``40`` before taxels 1 to 7, ``C0`` before 8 to 12 and two bytes of diagnostics. The class is
-4, of boards with the older configuration 3. Taxels 7 and 11 are thermal pads, which feel no pressure. A taxel rests at
+4, of boards with the older configuration 3. Taxels 7 and 11 are thermal pads, which measure no pressure. A taxel rests at
 240 and falls when it is pressed.
 Diagnostics, big-endian: bit 0 the triangle does not answer, bits 4 to 15 one of its 12 taxels is stuck.
 Source: canBusSkin of icub-main, for messages and identifiers. Which taxels are thermal and the order of the bytes of
@@ -136,23 +136,23 @@ class IcubSkin(Sensor):
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
         """Configure board and triangles, and let the board send."""
         if self.old:
-            yield self._told(OLD_TIMING, 1, 1, 1, 0, OFFSET >> 8, 0, 0, pause_s=0.01)
-            yield self._told(OLD_TRIANGLES, SHIFT, 0x22, NO_LOAD, 0, 0xFF, 0xFF, 0x0A)
+            yield self._command(OLD_TIMING, 1, 1, 1, 0, OFFSET >> 8, 0, 0, pause_s=0.01)
+            yield self._command(OLD_TRIANGLES, SHIFT, 0x22, NO_LOAD, 0, 0xFF, 0xFF, 0x0A)
             return
-        yield self._told(BOARD, 0, self.period_ms, NO_LOAD)
+        yield self._command(BOARD, 0, self.period_ms, NO_LOAD)
         last = MOST_TRIANGLES - 1
-        yield self._told(TRIANGLE, 0, last, SHIFT, 1, OFFSET & 0xFF, OFFSET >> 8, pause_s=0.5)
-        yield self._told(TRANSMIT, 0)
+        yield self._command(TRIANGLE, 0, last, SHIFT, 1, OFFSET & 0xFF, OFFSET >> 8, pause_s=0.5)
+        yield self._command(TRANSMIT, 0)
 
     def closing(self) -> bytes:
-        """Have the board send no more; one with the older configuration cannot be told so."""
-        return b"" if self.old else self._told(TRANSMIT, 1).send
+        """Have the board send no more; one with the older configuration cannot be determined so."""
+        return b"" if self.old else self._command(TRANSMIT, 1).send
 
-    def _told(self, *data: int, pause_s: float = 0.0) -> Ask:
+    def _command(self, *data: int, pause_s: float = 0.0) -> Ask:
         return Ask(can_frame(POLLING << 8 | self.board, bytes(data)), pause_s=pause_s)
 
     def device(self) -> Device:
-        """Return a board that waits to be told to send."""
+        """Return a board that waits to be asked to send."""
         return _Board(self)
 
 
@@ -166,14 +166,14 @@ class _Board(Device):
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         while len(self.heard) >= CAN:
-            told = bytes(self.heard[:CAN])
+            message = bytes(self.heard[:CAN])
             del self.heard[:CAN]
-            if int.from_bytes(told[:4], "little") != POLLING << 8 | self.sensor.board:
+            if int.from_bytes(message[:4], "little") != POLLING << 8 | self.sensor.board:
                 continue
-            if told[DATA] == TRANSMIT and not self.sensor.old:
-                self.streaming = told[DATA + 1] == 0
-            elif told[DATA] == BOARD and told[DATA + 2]:
-                self.rate_hz = 1000 / told[DATA + 2]
-            elif told[DATA] == OLD_TIMING and self.sensor.old:
+            if message[DATA] == TRANSMIT and not self.sensor.old:
+                self.streaming = message[DATA + 1] == 0
+            elif message[DATA] == BOARD and message[DATA + 2]:
+                self.rate_hz = 1000 / message[DATA + 2]
+            elif message[DATA] == OLD_TIMING and self.sensor.old:
                 self.streaming = True
         return []

@@ -129,11 +129,11 @@ class _Bridge(Device):
         self.heard += data
         replies = []
         while (stop := self.heard.find(b"\n")) >= 0:
-            told = bytes(self.heard[: stop + 1]).strip()
+            command = bytes(self.heard[: stop + 1]).strip()
             del self.heard[: stop + 1]
-            if told in (ON.strip(), OFF.strip()):
-                self.streaming = told == ON.strip()
-            elif told == INFO.strip():
+            if command in (ON.strip(), OFF.strip()):
+                self.streaming = command == ON.strip()
+            elif command == INFO.strip():
                 hardware = self.model.removeprefix("fulai-")
                 replies.append(f"OK BRIDGE MODEL=FULAI FW=1.0 HW=V{hardware} PROTOCOL=VOFA HAND=LEFT\r\n".encode())
         return replies

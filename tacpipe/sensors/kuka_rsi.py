@@ -1,7 +1,7 @@
 """KUKA arms by the Robot Sensor Interface (RSI): an XML text by UDP every 4 or 12 ms.
 
 The controller sends ``<Rob Type="KUKA"><RIst X="…" …/>…<IPOC>n</IPOC></Rob>`` to the address in its configuration file, in
-mm and degrees; IPOC is its clock in milliseconds. Unless that file says ONLYSEND, each text must be answered in time with
+mm and degrees; IPOC is its clock in milliseconds. Unless that file states ONLYSEND, each text must be answered in time with
 the same IPOC, or the controller stops; the answer here holds no correction, so the arm is not moved by it. Source: KUKA,
 RobotSensorInterface 3.x, as read in the package rsipi 0.3.0.
 """
@@ -62,7 +62,7 @@ class KukaRsi(Sensor):
     )
 
     outputs: tuple[str, ...] = ("RIst", "AIPos")  # elements that the controller sends, or their attributes, as Tech.C11
-    only_send: bool = False  # the configuration says ONLYSEND TRUE: nothing is answered, which is best for recording
+    only_send: bool = False  # the configuration states ONLYSEND TRUE: nothing is answered, which is best for recording
     sen_type: str = "ImFree"  # SENTYPE of the configuration
     rate_hz: float = 250.0  # 250 for a cycle of 4 ms, 83.33 for 12 ms
 
@@ -165,11 +165,11 @@ def _table(outputs: tuple[str, ...], packets: tuple[bytes, ...]) -> Floats | Non
 
 @functools.lru_cache(maxsize=BATCHES_AT_HAND)
 def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Pattern, NDArray[np.intp]] | None:
-    """Return the pattern of a text in which each number stands for itself, and which ones are IPOC and the outputs."""
-    pattern, told = number_texts.pattern(text), _numbers(outputs, text)
-    if pattern is None or told is None:
+    """Return the pattern of a text in which each number represents itself, and which ones are IPOC and the outputs."""
+    pattern, content = number_texts.pattern(text), _numbers(outputs, text)
+    if pattern is None or content is None:
         return None
-    columns = np.array(told) - number_texts.FIRST
+    columns = np.array(content) - number_texts.FIRST
     known = (columns >= 0) & (columns < len(pattern.before))
     return (pattern, columns.astype(np.intp)) if known.all() else None
 
@@ -179,14 +179,14 @@ def _width(name: str) -> int:
 
 
 def _texts(root: ElementTree.Element, name: str) -> list[str]:
-    """Return what a text says of an output, number by number; what is missing is left out."""
+    """Return what a text states of an output, number by number; what is missing is left out."""
     tag, _, attribute = name.partition(".")
     element = root.find(tag)
     if element is None:
         return []
     if name not in ATTRIBUTES and not attribute:
-        told = (element.text or "").strip()
-        return [TRUTH.get(told.lower(), told)]
+        content = (element.text or "").strip()
+        return [TRUTH.get(content.lower(), content)]
     texts = [element.get(part) for part in ATTRIBUTES.get(name, (attribute,))]
     return [TRUTH.get(text.lower(), text) for text in texts if text is not None]
 

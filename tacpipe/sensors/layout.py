@@ -44,8 +44,8 @@ class Number:
     unit: str = "1"  # in which it is
     quantity: str = "tactile"  # what it is, as docs/format.md lists it
     order: Order | None = None  # of its bytes, where it is not that of the frame
-    equals: int | None = None  # what it always is; such a number is looked at and is no channel
-    skip: bool = False  # it is no channel
+    equals: int | None = None  # what it always is; such a number is looked at and is not a channel
+    skip: bool = False  # it is not a channel
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Length:
-    """What tells the size of a frame, where a board sends frames of several sizes."""
+    """What states the size of a frame, where a board sends frames of several sizes."""
 
     number: str  # the name of the number that holds it
     plus: int = 0  # bytes of the whole frame that it does not count
@@ -161,7 +161,7 @@ def places(numbers: Iterable[Number], begin: int, order: Order) -> dict[str, Pla
                 _refuse(f"the number {number.name} has equals, which only whole numbers can have, and is {number.type}")
             if not least <= number.equals < least + place.range:
                 _refuse(
-                    f"the number {number.name} can never be {number.equals}, as equals says: its type is {number.type}"
+                    f"the number {number.name} can never be {number.equals}, as equals states: its type is {number.type}"
                 )
         found[number.name] = place
         begin = place.stop

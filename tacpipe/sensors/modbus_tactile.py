@@ -63,7 +63,7 @@ class ModbusTactile(Sensor):
         return bytes([self.address, PRESSURES]) + (2 * self.points).to_bytes(2, "little")
 
     def framer(self) -> Framer:
-        """Return a framer of replies with all taxels; other replies, with their own sums, are no frames."""
+        """Return a framer of replies with all taxels; other replies, with their own sums, are not frames."""
         return ByteFramer(Framing(marker=self.header, size=HEADER + 2 * self.points + 2, check=_crc_is_right))
 
     def decode(self, frames: Bytes) -> Samples:
@@ -88,8 +88,10 @@ class ModbusTactile(Sensor):
         Raises `DeviceError` if it has more or fewer, or refuses.
         """
         yield self._writing(SENDING, 0, "that it waits to be asked")
-        told = yield self._asking(READ_REGISTERS, COUNT.to_bytes(2, "big") + b"\x00\x01", 7, "how many taxels it has")
-        points = int.from_bytes(told[-4:-2], "big")
+        message = yield self._asking(
+            READ_REGISTERS, COUNT.to_bytes(2, "big") + b"\x00\x01", 7, "how many taxels it has"
+        )
+        points = int.from_bytes(message[-4:-2], "big")
         if points != self.points:
             raise DeviceError(
                 f"The module has {points} taxels, not {self.points}; write points = {points} in the rig file."
@@ -117,7 +119,7 @@ class ModbusTactile(Sensor):
 
 @dataclass
 class _Module(Device):
-    """The module's side: counts what it is asked for, reads and writes registers, tells what it is."""
+    """The module's side: counts what it is asked for, reads and writes registers, states what it is."""
 
     registers: dict[int, int] = field(default_factory=dict)
     asked: int = 0
@@ -130,16 +132,16 @@ class _Module(Device):
             size = sizes.get(self.heard[1], HEADER)
             if len(self.heard) < size:
                 break
-            told = bytes(self.heard[:size])
-            if with_crc(told[:-2]) != told:
+            message = bytes(self.heard[:size])
+            if with_crc(message[:-2]) != message:
                 del self.heard[:1]
                 continue
             del self.heard[:size]
-            if told[0] not in (BROADCAST, self.registers[ADDRESS]):
+            if message[0] not in (BROADCAST, self.registers[ADDRESS]):
                 continue
-            reply = self._answer(told[1], told[2:-2])
-            if reply is not None and told[0] != BROADCAST:
-                replies.append(with_crc(told[:1] + reply))
+            reply = self._answer(message[1], message[2:-2])
+            if reply is not None and message[0] != BROADCAST:
+                replies.append(with_crc(message[:1] + reply))
         return replies
 
     def _answer(self, function: int, data: bytes) -> bytes | None:
@@ -186,10 +188,10 @@ def _reply(address: int, function: int, size: int) -> Callable[[bytes], int | tu
             head = bytes([address, code])
             start = came.find(head)
             while start >= 0:
-                told = came[start : start + length]
-                if len(told) == length and with_crc(told[:-2]) == told:
+                message = came[start : start + length]
+                if len(message) == length and with_crc(message[:-2]) == message:
                     if code != function:
-                        why = REFUSALS.get(told[2], f"error {told[2]}")
+                        why = REFUSALS.get(message[2], f"error {message[2]}")
                         raise DeviceError(f"The module refused function {function:#04x}: {why}.")
                     return start, start + length
                 start = came.find(head, start + 1)

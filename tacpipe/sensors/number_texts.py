@@ -24,7 +24,7 @@ SPACES = b" \t\r\n"
 NEWLINE = 0x0A
 MOST_BYTES = (1 << 31) - 1  # that 32-bit places in a text reach
 NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # of an XML text, between its marks
-FIRST = 1_000_000  # by which numbers stand for themselves, see `numbered`
+FIRST = 1_000_000  # by which numbers represent themselves, see `numbered`
 ODD = (b"<?", b"<!", b"&", b"'", b"\0")  # in an XML text: other marks than quotes and tags
 APART = b"\0"  # between texts: no XML holds it
 
@@ -99,7 +99,7 @@ def _marks(text: bytes) -> Places:
 
 
 def _texts(text: bytes, edges: Places) -> pa.Array | None:
-    """Return the pieces of a text between ``edges``; None where it is too long to tell them."""
+    """Return the pieces of a text between ``edges``; None where it is too long to state them."""
     import pyarrow as pa
 
     if len(text) > MOST_BYTES:

@@ -114,16 +114,16 @@ class OptoForce(Sensor):
 
 
 class _Daq(Device):
-    """The DAQ's side: streams at the rate that it was last told, not at all after a stop."""
+    """The DAQ's side: streams at the rate that it was last stated, not at all after a stop."""
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         while (start := self.heard.find(CONFIGURE)) >= 0 and len(self.heard) >= start + 9:
-            told = bytes(self.heard[start : start + 9])
+            message = bytes(self.heard[start : start + 9])
             del self.heard[: start + 9]
-            if with_sum(told[:7]) == told:
+            if with_sum(message[:7]) == message:
                 rates = {speed: rate for rate, speed in SPEEDS.items()}
-                self.streaming, self.rate_hz = told[4] != STOP, rates.get(told[4])
+                self.streaming, self.rate_hz = message[4] != STOP, rates.get(message[4])
         return []
 
 

@@ -2,7 +2,7 @@
 
 What it pushes begins with ``AA 56 00``, the length of what follows but for the sum, and an error code; then for each module
 that is plugged in, in order, its whole force, six bytes of which every other one counts, and three bytes a point: x and y
-int8, z uint8, in tenths of a newton; then the sum. It neither counts its frames nor tells the time.
+int8, z uint8, in tenths of a newton; then the sum. It neither counts its frames nor states the time.
 Source: the package paxini-sdk 0.1.0 (MIT), which cites the vendor's manual and its programs.
 """
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 FINGERS, PHALANGES = ("thumb", "index", "middle", "ring", "little"), ("proximal", "middle", "tip", "nail")
 SLOTS = tuple(f"{finger}_{part}" for finger in FINGERS for part in PHALANGES) + tuple(f"palm{n}" for n in range(1, 9))
-VARIANTS = {  # product to its points, no two alike, which is how the board's count tells them apart
+VARIANTS = {  # product to its points, no two alike, which is how the board's count distinguishes them
     "MC-M2020-Elite": 9,
     "IP-S1610-Elite": 25,
     "DP-S1813-Elite": 31,
@@ -161,8 +161,8 @@ class Paxini(Sensor):
         there = _modules(_data(active), _data(counts))
         if there != self.points:
             raise DeviceError(
-                f"The board ({_text(_data(version))}) has {_told(there)}; the rig file says "
-                f"{_told(self.points)}. Correct modules and variants there: {_suggestion(there)}."
+                f"The board ({_text(_data(version))}) has {_module_list(there)}; the rig file states "
+                f"{_module_list(self.points)}. Correct modules and variants there: {_suggestion(there)}."
             )
         taken = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
         if _data(taken)[:1] not in (b"", b"\x00"):
@@ -186,7 +186,7 @@ class Paxini(Sensor):
             )
 
     def device(self) -> Device:
-        """Return a board with these modules that waits to be told to push."""
+        """Return a board with these modules that waits to be asked to push."""
         counts = b"".join(two(self.points.get(slot, 0)) for slot in SLOTS)
         bits = sum(1 << SLOTS.index(module) for module in self.modules)
         memory = {VERSION: b"PX-HS V1.0.0".ljust(15, b"\x00"), ACTIVE: bits.to_bytes(4, "little"), POINTS: counts}
@@ -226,7 +226,7 @@ def _writing(register: int, data: bytes, what: str) -> Ask:
 def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:
     """Return what finds a reply among what came: an earlier stream may still run, and hold its first bytes by chance.
 
-    The reply to a write may lack the data of which it tells the length.
+    The reply to a write may lack the data of which it states the length.
     """
 
     def until(came: bytes) -> int | tuple[int, int]:
@@ -234,8 +234,8 @@ def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, i
             head = REPLY + bytes([code]) + two(register)
             start = came.find(head)
             while start >= 0:
-                told = number(came[start + 6 : start + 8]) if len(came) >= start + REPLY_HEADER else 0
-                for length in (told, 0) if function != READ_FUNCTION else (told,):
+                declared = number(came[start + 6 : start + 8]) if len(came) >= start + REPLY_HEADER else 0
+                for length in (declared, 0) if function != READ_FUNCTION else (declared,):
                     stop = start + REPLY_HEADER + length + 1
                     if stop <= len(came) and sums(came[start:stop]):
                         if code != function:
@@ -252,7 +252,7 @@ def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, i
 def pushed(came: bytes) -> int | tuple[int, int]:
     """Find the reply to the order to push, which is a frame without forces, or else forces, which are not taken.
 
-    Raises `DeviceError` if the reply tells of an error.
+    Raises `DeviceError` if the reply reports on an error.
     """
     found: int | tuple[int, int] = 0
     start = came.find(PUSH)
@@ -280,7 +280,7 @@ def _modules(active: bytes, counts: bytes) -> dict[str, int]:
     return {slot: number(counts[2 * n : 2 * n + 2]) for n, slot in enumerate(SLOTS) if bits >> n & 1}
 
 
-def _told(modules: Mapping[str, int]) -> str:
+def _module_list(modules: Mapping[str, int]) -> str:
     return ", ".join(f"{slot} of {count} points" for slot, count in modules.items()) or "no module"
 
 

@@ -68,7 +68,7 @@ class Board(Device):
     memory: dict[int, bytes] = field(default_factory=dict)
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to what was written; what is no message is passed over."""
+        """Return the replies to what was written; what is not a message is passed over."""
         self.heard += data
         replies = []
         while (start := self.heard.find(REQUEST)) >= 0 and len(self.heard) >= start + REPLY_HEADER:
@@ -77,12 +77,12 @@ class Board(Device):
             size = REPLY_HEADER + 1 + (0 if function == READ_FUNCTION else length)
             if len(self.heard) < start + size:
                 break
-            told = bytes(self.heard[start : start + size])
-            if not sums(told):
+            request = bytes(self.heard[start : start + size])
+            if not sums(request):
                 del self.heard[: start + 1]
                 continue
             del self.heard[: start + size]
-            replies += self._answer(function, register, length, told[REPLY_HEADER:-1])
+            replies += self._answer(function, register, length, request[REPLY_HEADER:-1])
         return replies
 
     def _answer(self, function: int, register: int, length: int, data: bytes) -> list[bytes]:

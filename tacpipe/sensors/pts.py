@@ -1,4 +1,4 @@
-"""The layout of Contactile's PTS v2.0 frames: where in the bytes the values stand, as a frame's own tables tell.
+"""The layout of Contactile's PTS v2.0 frames: where in the bytes the values stand, as a frame's own tables state.
 
 A frame is ``55 66 77 88``, a body, ``AA BB CC DD``; all is little-endian. The body begins with W, the width of offsets
 (1 to 8), and a table of (uint16 type, W bytes offset from the body's begin), zeros behind it allowed, and ends with the
@@ -45,11 +45,11 @@ class _NoLayoutError(ValueError):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the values of a frame stand, counted from its first byte, and the bytes that say so."""
+    """Where the values of a frame stand, counted from its first byte, and the bytes that state it."""
 
     entries: dict[int, tuple[tuple[int, ...], ...]]  # block to the places of values: by sensor, and by pillar in it
-    fixed: Places  # (byte,), places of all bytes that are no values
-    told: Bytes  # (byte,), what stands there
+    fixed: Places  # (byte,), places of all bytes that are not values
+    expected: Bytes  # (byte,), what stands there
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -67,7 +67,7 @@ class Layout:
 
     def fits(self, frames: Bytes) -> NDArray[np.bool_]:
         """Return which of ``frames`` (frame, byte) have this layout."""
-        same: NDArray[np.bool_] = (frames[:, self.fixed] == self.told).all(axis=1)
+        same: NDArray[np.bool_] = (frames[:, self.fixed] == self.expected).all(axis=1)
         return same
 
 

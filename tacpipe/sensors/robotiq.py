@@ -2,7 +2,7 @@
 
 A packet, either way, is ``9A``, a byte that nobody sums, a command, a length and so many bytes. A packet of data holds a
 field after the other: a byte with its kind in the upper half and the finger in bits 3 and 2, then big-endian numbers.
-Nothing but this structure tells a packet, so all of it is looked at: it must be made of known fields, to the last byte.
+Nothing but this structure states a packet, so all of it is looked at: it must be made of known fields, to the last byte.
 Source: the package pyrobotiqtactile 0.1.2 (BSD-3-Clause).
 """
 
@@ -89,7 +89,7 @@ class Robotiq(Sensor):
 
     @property
     def period_ms(self) -> int:
-        """The time from a packet to the next, as the device is told it."""
+        """The time from a packet to the next, as the device is given it."""
         return round(1000 / self.rate_hz)
 
     def fields(self) -> list[pa.Field]:
@@ -154,7 +154,7 @@ class Robotiq(Sensor):
         yield Ask(command(SYNCHRONOUS, bytes([self.period_ms])))
 
     def device(self) -> Device:
-        """Return a pair of fingertips that wait to be told their period, or to be asked."""
+        """Return a pair of fingertips that wait to be given their period, or to be asked."""
         return _Fingertips(streaming=False)
 
     @functools.cached_property
@@ -193,7 +193,7 @@ class Robotiq(Sensor):
 
 @dataclass
 class _Fingertips(Device):
-    """The fingertips' side: they tell their version, send a packet when asked, or stream with a period."""
+    """The fingertips' side: they state their version, send a packet when asked, or stream with a period."""
 
     asked: int = 0
     version: bytes = field(default=b"\x01\x00\x00")
@@ -205,14 +205,14 @@ class _Fingertips(Device):
             size = HEADER + self.heard[start + 3]
             if len(self.heard) < start + size:
                 break
-            told = bytes(self.heard[start : start + size])
+            message = bytes(self.heard[start : start + size])
             del self.heard[: start + size]
-            if told[2] in (SYNCHRONOUS, ASYNCHRONOUS) and size == HEADER + 1:
-                self.streaming = told[4] > 0
-                self.rate_hz = 1000 / told[4] if told[4] else None
-            elif told[2] == READ:
+            if message[2] in (SYNCHRONOUS, ASYNCHRONOUS) and size == HEADER + 1:
+                self.streaming = message[4] > 0
+                self.rate_hz = 1000 / message[4] if message[4] else None
+            elif message[2] == READ:
                 self.asked += 1
-            elif told[2] == VERSION:
+            elif message[2] == VERSION:
                 replies.append(command(VERSION, self.version))
         return replies
 
@@ -294,7 +294,7 @@ def _alike(frames: Bytes, rows: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.i
 
 
 def _is_packet(frames: Bytes) -> NDArray[np.bool_]:
-    """Return which frames (frame, byte) of one size, which their headers tell, are made of known fields, or a version."""
+    """Return which frames (frame, byte) of one size, which their headers state, are made of known fields, or a version."""
     good = frames[:, 2] == VERSION
     for rows, layout in _alike(frames, np.flatnonzero(~good)):
         good[rows] = layout is not None

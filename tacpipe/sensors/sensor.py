@@ -1,4 +1,4 @@
-"""What a sensor is to tacpipe: bytes in, samples out, what it must be told, and the device's side of it for the emulator.
+"""What a sensor is to tacpipe: bytes in, samples out, the requests it needs, and the device's side of it for the emulator.
 
 A product is one file with one frozen dataclass, a `Sensor`. Its fields are the options of the rig file, each with a
 comment that is its help. Nothing here does input or output: a link carries the bytes, see `tacpipe.links`.
@@ -23,13 +23,13 @@ Frames = Any  # NDArray[np.uint8] (frame, byte) of frames of one size, or list[b
 
 @dataclass(frozen=True)
 class Samples:
-    """What frames say. ``values`` are blocks (sample, channel), side by side in the order of the sensor's fields."""
+    """What frames state. ``values`` are blocks (sample, channel), side by side in the order of the sensor's fields."""
 
     values: tuple[NDArray[Any], ...]
     seq: NDArray[np.int64] | None = (
         None  # (sample,), the counter as the frame holds it; `Sensor.counter` is its modulus
     )
-    t_device_ns: NDArray[np.int64] | None = None  # (sample,), when the device says that the sample was taken
+    t_device_ns: NDArray[np.int64] | None = None  # (sample,), when the device states that the sample was taken
     device_seq: NDArray[np.int64] | None = None  # (sample,), a second counter, of samples taken rather than sent
     rows: NDArray[np.int64] | None = None  # (sample,), the frame that each is of; None: one a frame, in order
 
@@ -55,8 +55,8 @@ class Ask:
 
     def found(self, came: bytes) -> tuple[int, int] | None:
         """Return where the reply is in what came since, (start, stop), None while it is not whole or none is awaited."""
-        told = self.until(came) if self.until is not None and came else 0
-        return told if isinstance(told, tuple) else (0, told) if told else None
+        end = self.until(came) if self.until is not None and came else 0
+        return end if isinstance(end, tuple) else (0, end) if end else None
 
 
 Dialogue = Generator[Ask, bytes, None]  # yields what is asked, is sent the reply
@@ -76,7 +76,7 @@ class Device:
     """The device's side of a protocol, as the emulator plays it: this one streams from the start and hears nothing."""
 
     streaming: bool = True
-    rate_hz: float | None = None  # None: the sensor's own; a device that is told its rate sets it
+    rate_hz: float | None = None  # None: the sensor's own; a device that is given its rate sets it
     heard: bytearray = field(default_factory=bytearray)
 
     def hear(self, data: bytes) -> list[bytes]:
@@ -110,7 +110,7 @@ class Sensor:
 
     @property
     def awaited(self) -> bool:
-        """Whether samples should come all the time, so that silence says that something is wrong."""
+        """Whether samples should come all the time, so that silence states that something is wrong."""
         return self.steady and self.rate_hz > 0
 
     def fields(self) -> list[pa.Field]:
@@ -130,7 +130,7 @@ class Sensor:
         raise NotImplementedError
 
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
-        """Say what the device must be told before it streams; ``local`` holds what the link knows (``port``)."""
+        """Yield the requests that the device needs before it streams; ``local`` holds what the link knows (``port``)."""
         yield from ()
 
     def closing(self) -> bytes:
@@ -138,7 +138,7 @@ class Sensor:
         return b""
 
     def taring(self) -> Dialogue:
-        """Say what makes the device take its present reading for zero; nothing where it has no such command."""
+        """Yield what makes the device take its present reading for zero; nothing where it has no such command."""
         yield from ()
 
     def request(self) -> bytes:

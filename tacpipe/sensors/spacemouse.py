@@ -1,12 +1,12 @@
 """3Dconnexion SpaceMouse on HID: what its cap is pushed and turned by, and its buttons, a row an event.
 
-A report says a part of the state: number 1 translation and rotation, six little-endian int16, or, of older devices,
+A report states a part of the state: number 1 translation and rotation, six little-endian int16, or, of older devices,
 translation alone and number 2 rotation; number 3 the buttons, a bit each; number 23 of wireless ones the battery. A
 push goes to about 350.
 Source: the reports as hidraw gives them, number first.
 
-An event tells one part and leaves the others as they were. `StateFramer` keeps that state and makes of every report a
-frame that says all of it, so that `SpaceMouse.decode` needs no memory. Until a part was told it is 0: the cap at rest.
+An event states one part and leaves the others as they were. `StateFramer` keeps that state and makes of every report a
+frame that states all of it, so that `SpaceMouse.decode` needs no memory. Until a part was given it is 0: the cap at rest.
 """
 
 from __future__ import annotations
@@ -81,16 +81,16 @@ class SpaceMouse(Sensor):
     def encode(self, samples: Samples) -> list[bytes]:
         """Return a report a sample: of the part that differs from the sample before, at first from rest.
 
-        Where several parts differ, a report cannot say so: the buttons go first, then rotation where it is ``split``.
+        Where several parts differ, a report cannot state it: the buttons go first, then rotation where it is ``split``.
         """
         axes, buttons = samples.values
         axes_bytes = np.ascontiguousarray(axes, "<i2").view(np.uint8)
         state = np.hstack([axes_bytes, np.ascontiguousarray(buttons, "<u4").view(np.uint8)])  # (sample, byte)
         differs = np.diff(state.astype(np.int16), axis=0, prepend=0) != 0
-        told = np.where(differs[:, 6:12].any(axis=1) & self.split, ROTATION, TRANSLATION)
-        told[differs[:, 12:].any(axis=1)] = BUTTONS
+        reported = np.where(differs[:, 6:12].any(axis=1) & self.split, ROTATION, TRANSLATION)
+        reported[differs[:, 12:].any(axis=1)] = BUTTONS
         reports = []
-        for number, row in zip(told.tolist(), state, strict=True):
+        for number, row in zip(reported.tolist(), state, strict=True):
             part = row[:12] if number == TRANSLATION and not self.split else row[PARTS[number]]
             reports.append(bytes([number]) + part.tobytes())
         return reports
@@ -141,8 +141,8 @@ def merged(reports: Sequence[bytes], state: Bytes) -> Bytes:
     return frames[1:]
 
 
-def _carry(frames: Bytes, place: slice, told: NDArray[np.bool_], said: Bytes) -> None:
-    """Write a part of the state into ``frames``, whose first row is that before: where it was told, and on from there."""
-    frames[1:, place][told] = said[told]
-    last = np.maximum.accumulate(np.where(told, np.arange(1, len(told) + 1), 0))
+def _carry(frames: Bytes, place: slice, reported: NDArray[np.bool_], sent: Bytes) -> None:
+    """Write a part of the state into ``frames``, whose first row is that before: where it was given, and on from there."""
+    frames[1:, place][reported] = sent[reported]
+    last = np.maximum.accumulate(np.where(reported, np.arange(1, len(reported) + 1), 0))
     frames[1:, place] = frames[last, place]

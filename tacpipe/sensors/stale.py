@@ -1,4 +1,4 @@
-"""Frames of the last session that a device kept and sends first, told by the jump of its counter and thrown away."""
+"""Frames of the last session that a device kept and sends first, stated by the jump of its counter and thrown away."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A tap: what a lab's own programs know, sent to the recording as lines of JSON by UDP.
 
-A line is one record, ``{"width_m": 0.031, "phase": "lift"}``; a packet holds one or several. The rig file tells which keys
-become columns of numbers; the whole record is kept as text beside them, so nothing that was sent is lost. Keys with a
+A line is one record, ``{"width_m": 0.031, "phase": "lift"}``; a packet holds one or several. The rig file states which keys
+become columns of numbers; the whole record is kept as text next to them, so nothing that was sent is lost. Keys with a
 meaning: ``seq`` and ``t_ns`` where the options promise them, ``event`` (start, stop, label, or another word), and ``grasp``,
 ``{"g1": [x, y, z], "g2": [x, y, z], "R": [[…], […], […]]}`` in metres, whose columns of R are the wrist's axes.
 """
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 Record = Mapping[str, Any]
 
-TOLD = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key, of a part as in pose.x or q.0, with its unit
+ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key, of a part as in pose.x or q.0, with its unit
 TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
 LARGEST = 1 << 62  # of counters and times
 
 
 @dataclass(frozen=True)
 class Tap(Sensor):
-    """Records of a program. A key that a record lacks is NaN in its column; text where a number was told is refused."""
+    """Records of a program. A key that a record lacks is NaN in its column; text where a number was given is refused."""
 
     summary: ClassVar[str] = "Records of your own programs, sent as lines of JSON by UDP."
     links: ClassVar[tuple[str, ...]] = ("udp",)
@@ -51,11 +51,11 @@ class Tap(Sensor):
     rate_hz: float = 0.0  # records a second; 0: they come when they come
 
     def __post_init__(self) -> None:
-        columns = [_column(told) for told in self.numbers]
-        for told, column in zip(self.numbers, columns, strict=True):
-            if not TOLD.fullmatch(told) or column in TAKEN or columns.count(column) > 1 or not column[0].isalpha():
+        columns = [_column(entry) for entry in self.numbers]
+        for entry, column in zip(self.numbers, columns, strict=True):
+            if not ENTRY.fullmatch(entry) or column in TAKEN or columns.count(column) > 1 or not column[0].isalpha():
                 raise UsageError(
-                    f"tap: {told!r} among numbers makes no column; name each key once, with its unit behind a colon, as "
+                    f"tap: {entry!r} among numbers makes no column; name each key once, with its unit behind a colon, as "
                     f"width_m:m or pose.x, and none of {', '.join(TAKEN)}."
                 )
         if self.grasp and self.numbers:
@@ -72,7 +72,7 @@ class Tap(Sensor):
             fields = [schema.float_field(name, "m", "position", name[3]) for name in POINTS]
             turned = [schema.float_field(name, "1", "orientation", name[-1]) for name in WRIST]
             return fields + turned if self.grasp == "wrist" else fields
-        numbers = [schema.float_field(_column(told), _unit(told), "state") for told in self.numbers]
+        numbers = [schema.float_field(_column(entry), _unit(entry), "state") for entry in self.numbers]
         text = {"unit": "1", "quantity": "text"}
         return [*(pa.field(name, pa.string(), metadata=text) for name in ("event", "json")), *numbers]
 
@@ -112,9 +112,9 @@ class Tap(Sensor):
         texts, numbers = samples.values
         for record, (event, _), row in zip(records, texts.tolist(), numbers.tolist(), strict=True):
             record |= {"event": event} if event else {}
-            for told, number in zip(self.numbers, row, strict=True):
+            for entry, number in zip(self.numbers, row, strict=True):
                 if not math.isnan(number):
-                    _put(record, _path(told), number)
+                    _put(record, _path(entry), number)
         return [
             (text or json.dumps(record)).encode() for record, (_, text) in zip(records, texts.tolist(), strict=True)
         ]
@@ -127,26 +127,26 @@ class Tap(Sensor):
             return False
 
     def _holds(self, record: Any) -> bool:
-        """Return whether a line is a record, numbers are where numbers were told, and what is promised is there.
+        """Return whether a line is a record, numbers are where numbers were given, and what is promised is there.
 
-        Raises `ValueError` for an event that is no text in UTF-8.
+        Raises `ValueError` for an event that is not text in UTF-8.
         """
         if not isinstance(record, dict) or not isinstance(record.get("event", ""), str):
             return False
         record.get("event", "").encode()
-        promised = [name for name, told in (("seq", self.counted), ("t_ns", self.timed)) if told]
+        promised = [name for name, entry in (("seq", self.counted), ("t_ns", self.timed)) if entry]
         if not all(type(record.get(name)) is int and 0 <= record[name] < LARGEST for name in promised):
             return False
         if self.grasp:
             return "grasp" not in record or _is_grasp(record["grasp"], turned=self.grasp == "wrist")
-        found = [_at(record, _path(told)) for told in self.numbers]
+        found = [_at(record, _path(entry)) for entry in self.numbers]
         return all(value is None or isinstance(value, float) or _is_whole(value) for value in found)
 
     def _numbers(self, records: Sequence[Record]) -> NDArray[np.float64]:
         """Return the numbers (sample, channel) of records, NaN where there is none."""
         found = np.full((len(records), len(self.numbers)), np.nan)
-        for column, told in enumerate(self.numbers):
-            path = _path(told)
+        for column, entry in enumerate(self.numbers):
+            path = _path(entry)
             for row, record in enumerate(records):
                 value = _at(record, path)
                 if value is not None:
@@ -163,11 +163,11 @@ class Tap(Sensor):
         return np.hstack([points, wrists.transpose(0, 2, 1).reshape(len(records), len(WRIST))])
 
 
-def _is_grasp(told: Any, *, turned: bool) -> bool:
+def _is_grasp(entry: Any, *, turned: bool) -> bool:
     """Return whether a record's grasp is one that a hand can make, with its wrist where that is wanted."""
     try:
-        points = [np.array(told[name], dtype=np.float64) for name in ("g1", "g2")]
-        wrist = np.array(told["R"], dtype=np.float64) if turned else None
+        points = [np.array(entry[name], dtype=np.float64) for name in ("g1", "g2")]
+        wrist = np.array(entry["R"], dtype=np.float64) if turned else None
         if any(point.shape != (3,) for point in points):
             return False
         Grasp(points[0], points[1], wrist)
@@ -185,21 +185,21 @@ def _lines(packet: bytes) -> list[bytes]:
     return [line.strip() for line in packet.split(b"\n") if line.strip()]
 
 
-def _path(told: str) -> tuple[str, ...]:
-    return tuple(told.partition(":")[0].split("."))
+def _path(entry: str) -> tuple[str, ...]:
+    return tuple(entry.partition(":")[0].split("."))
 
 
-def _column(told: str) -> str:
+def _column(entry: str) -> str:
     """Return the name of a number's column.
 
     >>> _column("pose.x:m")
     'pose_x'
     """
-    return "_".join(_path(told)).lower()
+    return "_".join(_path(entry)).lower()
 
 
-def _unit(told: str) -> str:
-    return told.partition(":")[2] or "1"
+def _unit(entry: str) -> str:
+    return entry.partition(":")[2] or "1"
 
 
 def _at(record: Any, path: Sequence[str]) -> Any:

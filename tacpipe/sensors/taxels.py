@@ -21,7 +21,7 @@ def numbered(name: str, count: int) -> list[str]:
 def fields(count: int, kind: pa.DataType, unit: str, axes: str = "", prefix: str = "", **layout: str) -> list[pa.Field]:
     """Return the fields ``taxel01`` to the last, or ``taxel01_x``, … where a taxel has ``axes``, each of this type.
 
-    ``prefix`` goes before each name, and ``layout`` into the metadata of each, beside ``taxel`` and ``axis``.
+    ``prefix`` goes before each name, and ``layout`` into the metadata of each, next to ``taxel`` and ``axis``.
     """
     import pyarrow as pa
 

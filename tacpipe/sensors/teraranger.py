@@ -94,13 +94,13 @@ class _Evo(Device):
             size = 4 if self.heard[start + 1] == BINARY[1] else 5
             if len(self.heard) < start + size:
                 break
-            told = bytes(self.heard[start : start + size])
-            if told not in (BINARY, START, STOP):
+            message = bytes(self.heard[start : start + size])
+            if message not in (BINARY, START, STOP):
                 del self.heard[: start + 1]
                 continue
             del self.heard[: start + size]
-            self.binary = self.binary or told == BINARY
-            self.started = told == START if told != BINARY else self.started
+            self.binary = self.binary or message == BINARY
+            self.started = message == START if message != BINARY else self.started
             self.streaming = self.binary and self.started
         return []
 

@@ -1,7 +1,7 @@
 """From texts to frames: packets that are a text each, and streams of lines.
 
-What tells a frame of text from another text is its content, which takes a look at each. A sensor that can look at many at
-once, and faster so, says as ``every`` whether all of them are frames; a text that is none is then found half by half.
+What states a frame of text from another text is its content, which takes a look at each. A sensor that can look at many at
+once, and faster so, states as ``every`` whether all of them are frames; a text that is none is then found half by half.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class TextFramer:
 
 
 class LineFramer:
-    """Cuts a stream of text into its lines, without their ends; ``check`` tells which are frames."""
+    """Cuts a stream of text into its lines, without their ends; ``check`` states which are frames."""
 
     def __init__(self, check: Check, every: CheckOfAll | None = None, most: int = 4096) -> None:
         self.check, self.every, self.most = check, every, most
@@ -56,7 +56,7 @@ class LineFramer:
         self._begun = False
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
-        """Return the lines that are complete now, and those that are no frames as losses."""
+        """Return the lines that are complete now, and those that are not frames as losses."""
         self.account.received += len(chunks.data)
         self._text.append(chunks)
         text = self._text.data

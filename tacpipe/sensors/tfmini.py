@@ -1,7 +1,7 @@
 """Benewake TFmini, TFmini-S and TFmini Plus: one distance along a line of sight, over a UART.
 
 Frames of 9 bytes: ``59 59``, little-endian distance and strength, two bytes that differ by model, and the 8-bit sum of
-all before. Commands to Plus and S are ``5A``, their length, a number, what they say and the 8-bit sum. The original has
+all before. Commands to Plus and S are ``5A``, their length, a number, what they state and the 8-bit sum. The original has
 none here.
 Source: Benewake's manuals of TFmini (SJ-PM-TFmini-T-01), TFmini-S (SJ-PM-TFmini-S) and TFmini Plus
 (SJ-GU-TFmini-Plus-01).
@@ -9,7 +9,7 @@ Source: Benewake's manuals of TFmini (SJ-PM-TFmini-T-01), TFmini-S (SJ-PM-TFmini
 Distances stay as they were sent, codes included:
 
 ======== =====================================================================================
-distance what it says
+distance what it states
 ======== =====================================================================================
 0        nothing was measured (Plus, S)
 65535    the signal is too weak to be trusted: strength below 100, of the original below 20
@@ -51,7 +51,7 @@ class TfMini(Sensor):
 
     summary: ClassVar[str] = "Benewake TFmini, TFmini-S and TFmini Plus distance sensors over a UART."
 
-    model: Literal["original", "s", "plus"] = "plus"  # which of the three; S and Plus can be told rate and unit
+    model: Literal["original", "s", "plus"] = "plus"  # which of the three; S and Plus can be determined rate and unit
     unit: Literal["cm", "mm"] = "cm"  # of the distance
     rate_hz: float = 100.0  # 1000 divided by a whole number; the original's is 100
     save: bool = True  # keep rate and unit in the sensor's flash, as the manual asks for
@@ -103,7 +103,7 @@ class TfMini(Sensor):
         return ByteFramer(Framing(marker=MARKER, size=SIZE, check=_sum_is_right, confirm=1))
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return distance and strength, and what the model sends beside them."""
+        """Return distance and strength, and what the model sends next to them."""
         words = np.ascontiguousarray(frames[:, 2:8]).view("<u2").astype(np.uint16)  # (frame, word)
         if self.model == "original":
             return Samples((words[:, :2], np.ascontiguousarray(frames[:, 6:8])))
@@ -117,7 +117,7 @@ class TfMini(Sensor):
         return np.hstack([body, sum8(body)[:, None]])
 
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
-        """Set unit and rate and switch the stream on; the original streams by itself and is told nothing."""
+        """Set unit and rate and switch the stream on; the original streams by itself and is given nothing."""
         if self.model == "original":
             return
         yield _asked(UNIT, bytes([UNITS[self.unit]]))
@@ -141,41 +141,41 @@ class _TfMini(Device):
             size = self.heard[start + 1]
             if len(self.heard) < start + size:
                 break
-            told = bytes(self.heard[start : start + size])
+            message = bytes(self.heard[start : start + size])
             del self.heard[: start + max(size, 1)]
-            if size >= 4 and command(told[2], told[3:-1]) == told:
-                replies += self._done(told[2], told[3:-1])
+            if size >= 4 and command(message[2], message[3:-1]) == message:
+                replies += self._done(message[2], message[3:-1])
         return replies
 
-    def _done(self, number: int, said: bytes) -> list[bytes]:
+    def _done(self, number: int, payload: bytes) -> list[bytes]:
         if number == VERSION:
             return [command(VERSION, b"\x01\x02\x03")]
         if number == SAVE:
             return [command(SAVE, b"\x00")]
         if number == RATE:
-            self.rate_hz = float(int.from_bytes(said, "little")) or None
+            self.rate_hz = float(int.from_bytes(payload, "little")) or None
         if number == ENABLE:
-            self.streaming = said == b"\x01"
-        return [command(number, said)] if number in (RATE, UNIT, ENABLE) else []
+            self.streaming = payload == b"\x01"
+        return [command(number, payload)] if number in (RATE, UNIT, ENABLE) else []
 
 
-def command(number: int, said: bytes = b"") -> bytes:
+def command(number: int, payload: bytes = b"") -> bytes:
     """Return a command to the sensor, or its reply.
 
     >>> command(0x03, (100).to_bytes(2, "little")).hex(" ")
     '5a 06 03 64 00 c7'
     """
-    body = bytes([0x5A, len(said) + 4, number]) + said
+    body = bytes([0x5A, len(payload) + 4, number]) + payload
     return body + bytes([sum(body) & 0xFF])
 
 
-def _asked(number: int, said: bytes = b"") -> Ask:
-    return Ask(command(number, said), until=_reply(number, said), what=f"the reply to command {number:#04x}")
+def _asked(number: int, payload: bytes = b"") -> Ask:
+    return Ask(command(number, payload), until=_reply(number, payload), what=f"the reply to command {number:#04x}")
 
 
-def _reply(number: int, said: bytes) -> Callable[[bytes], int | tuple[int, int]]:
+def _reply(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, int]]:
     """Return what finds the reply among frames, which may hold its first bytes by chance."""
-    size = 5 if number == SAVE else len(said) + 4
+    size = 5 if number == SAVE else len(payload) + 4
     head = bytes([0x5A, size, number])
 
     def until(data: bytes) -> int | tuple[int, int]:

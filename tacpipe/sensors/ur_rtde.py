@@ -1,8 +1,8 @@
 """Universal Robots arms by RTDE, the real-time data exchange of their controllers, protocol version 2.
 
-Packages over TCP, big-endian: u16 size with this header, u8 type, payload. The host says which version it speaks, how often
-it wants which outputs (a recipe), and starts; a data package is then the recipe's number and the outputs one by one. Reading
-takes no right to move the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
+Packages over TCP, big-endian: u16 size with this header, u8 type, payload. The host states which version it speaks, how
+often it wants which outputs (a recipe), and starts; a data package is then the recipe's number and the outputs one by
+one. Reading takes no right to move the arm. Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class UrRtde(Sensor):
         return [field for name in self.outputs for field in fields_of(name)]
 
     def framer(self) -> Framer:
-        """Return a framer of packages; one of data must be as long as the recipe says, and have another behind it.
+        """Return a framer of packages; one of data must be as long as the recipe states, and have another behind it.
 
         There is no sum; a package that was cut would take its missing bytes from the next.
         """
@@ -124,12 +124,12 @@ class UrRtde(Sensor):
             )
         names = (STAMP, *self.outputs)
         reply = yield _ask(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(names).encode())
-        said = reply[HEADER.size :]
-        recipe, kinds = said[:1], said[1:].decode("latin-1").split(",")
+        answer = reply[HEADER.size :]
+        recipe, kinds = answer[:1], answer[1:].decode("latin-1").split(",")
         for name, kind in zip(names, kinds, strict=False):
             if kind != type_of(name):
                 raise DeviceError(
-                    f"The controller says {kind} to the output {name}, which should be {type_of(name)}. Leave it out of "
+                    f"The controller states {kind} to the output {name}, which should be {type_of(name)}. Leave it out of "
                     f"the option outputs, or update the controller."
                 )
         if len(kinds) != len(names) or recipe in (b"", b"\0"):
@@ -157,24 +157,24 @@ class _Controller(Device):
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         replies = []
-        for kind, told in _taken(self.heard):
+        for kind, package in _taken(self.heard):
             if kind == VERSION:
-                replies.append(packed(kind, bytes([told == PROTOCOL.to_bytes(2, "big")])))
+                replies.append(packed(kind, bytes([package == PROTOCOL.to_bytes(2, "big")])))
             elif kind == CONTROLLER:
                 replies.append(packed(kind, struct.pack(">4I", *EMULATED)))
             elif kind == OUTPUTS:
-                replies.append(self._recipe(told))
+                replies.append(self._recipe(package))
             elif kind == INPUTS:
-                kinds = ",".join(type_of(name) or "NOT_FOUND" for name in told.decode("latin-1").split(","))
+                kinds = ",".join(type_of(name) or "NOT_FOUND" for name in package.decode("latin-1").split(","))
                 replies.append(packed(kind, b"\1" + kinds.encode()))
             elif kind in (START, PAUSE):
                 self.streaming = kind == START
                 replies.append(packed(kind, b"\1"))
         return replies
 
-    def _recipe(self, told: bytes) -> bytes:
-        names = tuple(told[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
-        self.rate_hz = float(struct.unpack(">d", told[:8])[0])
+    def _recipe(self, package: bytes) -> bytes:
+        names = tuple(package[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
+        self.rate_hz = float(struct.unpack(">d", package[:8])[0])
         kinds = ",".join(str(type_of(name)) if name in self.known else "NOT_FOUND" for name in names)
         return packed(OUTPUTS, bytes([names == self.known]) + kinds.encode())
 
@@ -208,7 +208,7 @@ def _ask(kind: int, payload: bytes) -> Ask:
             size, found = HEADER.unpack_from(data, place)
             if found not in KINDS or size < HEADER.size:
                 raise DeviceError(
-                    f"Bytes {data[place : place + 8].hex(' ')} came, which are no RTDE. Is the port 30004?"
+                    f"Bytes {data[place : place + 8].hex(' ')} came, which are not RTDE. Is the port 30004?"
                 )
             if found == kind:
                 return (place, place + size) if len(data) >= place + size else 0

@@ -1,4 +1,4 @@
-"""Options that a product may be set to, as far as its bytes tell: what to try where nobody wrote them down."""
+"""Options that a product may be set to, as far as its bytes state: what to try where nobody wrote them down."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Weiss Robotics WTS tactile sensors: a matrix of pressure cells over USB.
 
-Every message, both ways, is ``AA AA AA``, a number, the size of what it says (uint16), that, and a check sum (uint16), all
+Every message, both ways, is ``AA AA AA``, a number, the size of what it states (uint16), that, and a check sum (uint16), all
 little-endian. The sum is taken over the whole message with `crc16_wts`, which no standard knows. Frames are messages of
 number 0: the time (uint32, 10 µs), flags, and the cells row by row, uint16 each. With flag bit 0 the cells are run-length
-coded: of each word the upper 4 bits say how many cells in a row have the value of the lower 12. A reply has the number of
+coded: of each word the upper 4 bits state how many cells in a row have the value of the lower 12. A reply has the number of
 the command and begins with an error code (uint16, 0: done).
 
 Source: wts_driver (GPL-3) for messages, numbers and sum; its example ``AA AA AA 06 01 00 FF 2A 87`` is checked in the
@@ -57,7 +57,7 @@ class WeissWts(Sensor):
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
             raise UsageError(
-                f"weiss-wts: {self.rows} rows of {self.columns} columns are no matrix; both must be 1 or more."
+                f"weiss-wts: {self.rows} rows of {self.columns} columns are not a matrix; both must be 1 or more."
             )
         if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - self.delay_ms) > 0.01:
             raise UsageError(
@@ -89,10 +89,10 @@ class WeissWts(Sensor):
         whole: NDArray[np.bool_] = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
         rows = np.flatnonzero(whole & (frames[:, 3] == FRAME))
         if len(rows):
-            whole[rows] = self._cells_told(frames[rows]) == self.cells
+            whole[rows] = self._cell_counts(frames[rows]) == self.cells
         return whole
 
-    def _cells_told(self, frames: Bytes) -> NDArray[np.int64]:
+    def _cell_counts(self, frames: Bytes) -> NDArray[np.int64]:
         """Return how many cells each frame has; -1 where it is too short for any."""
         size = frames.shape[1] - CELLS_AT - 2
         if size < 2 or size % 2:
@@ -137,15 +137,15 @@ class WeissWts(Sensor):
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
         """Stop what still streams, compare the matrix with the options, start frames.
 
-        Raises `DeviceError` where the sensor has another matrix, or says no.
+        Raises `DeviceError` where the sensor has another matrix, or states no.
         """
         yield Ask(message(STOP), until=_reply(STOP, refusable=True), what="the reply to stop")
         found = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
-        said = found[HEADER:-2]
-        columns, rows = (int.from_bytes(said[start : start + 2], "little") for start in (2, 4))
+        payload = found[HEADER:-2]
+        columns, rows = (int.from_bytes(payload[start : start + 2], "little") for start in (2, 4))
         if (rows, columns) != (self.rows, self.columns):
             raise DeviceError(
-                f"The WTS has {rows} rows of {columns} columns and the options say {self.rows} of {self.columns}; "
+                f"The WTS has {rows} rows of {columns} columns and the options state {self.rows} of {self.columns}; "
                 f"set rows = {rows} and columns = {columns}."
             )
         start = bytes([RUN_LENGTH if self.compress else 0]) + self.delay_ms.to_bytes(2, "little")
@@ -174,18 +174,18 @@ class _Wts(Device):
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
         replies, stop = [], 0
-        for number, stop, said in messages(bytes(self.heard)):  # noqa: B007
-            replies.append(message(number, self._done(number, said)))
+        for number, stop, payload in messages(bytes(self.heard)):  # noqa: B007
+            replies.append(message(number, self._done(number, payload)))
         del self.heard[:stop]
         return replies
 
-    def _done(self, number: int, said: bytes) -> bytes:
+    def _done(self, number: int, payload: bytes) -> bytes:
         done, unknown = b"\x00\x00", b"\x0e\x00"
         if number == MATRIX:
             sizes = (self.sensor.columns, self.sensor.rows, 340, 340, HIGHEST)  # cells are 3.4 mm wide, in 1/100 mm
             return done + b"".join(size.to_bytes(2, "little") for size in sizes)
-        if number == START and len(said) == 3:
-            self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(said[1:], "little"))
+        if number == START and len(payload) == 3:
+            self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(payload[1:], "little"))
         elif number == STOP:
             self.streaming = False
         elif number != TARE:
@@ -193,13 +193,13 @@ class _Wts(Device):
         return done
 
 
-def message(number: int, said: bytes = b"") -> bytes:
+def message(number: int, payload: bytes = b"") -> bytes:
     """Return a message, to the sensor or from it.
 
     >>> message(0x06, b"\\xff").hex(" ")
     'aa aa aa 06 01 00 ff 2a 87'
     """
-    body = MARKER + bytes([number]) + len(said).to_bytes(2, "little") + said
+    body = MARKER + bytes([number]) + len(payload).to_bytes(2, "little") + payload
     return body + int(crc16_wts(np.frombuffer(body, np.uint8)[None])[0]).to_bytes(2, "little")
 
 
@@ -208,10 +208,10 @@ def messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     start = data.find(MARKER)
     while start >= 0 and len(data) >= start + HEADER:
         size = int.from_bytes(data[start + 4 : start + 6], "little")
-        told = data[start : start + HEADER + size + 2]
-        if len(told) == HEADER + size + 2 and message(told[3], told[HEADER:-2]) == told:
-            yield told[3], start + len(told), told[HEADER:-2]
-            start += len(told) - 1
+        packet = data[start : start + HEADER + size + 2]
+        if len(packet) == HEADER + size + 2 and message(packet[3], packet[HEADER:-2]) == packet:
+            yield packet[3], start + len(packet), packet[HEADER:-2]
+            start += len(packet) - 1
         start = data.find(MARKER, start + 1)
 
 
@@ -233,14 +233,14 @@ def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int | t
     """Return what finds the reply among frames."""
 
     def until(data: bytes) -> int | tuple[int, int]:
-        for told, stop, said in messages(data):
-            if told == number:
-                code = int.from_bytes(said[:2], "little")
+        for packet, stop, payload in messages(data):
+            if packet == number:
+                code = int.from_bytes(payload[:2], "little")
                 if code and not refusable:
                     raise DeviceError(
                         f"The WTS refused command {number:#04x} with error {code}; its manual lists the errors."
                     )
-                return stop - HEADER - len(said) - 2, stop
+                return stop - HEADER - len(payload) - 2, stop
         return 0
 
     return until

@@ -2,7 +2,7 @@
 
 ``{"message": 17, "time": 1763.2, "1": {"sensor": "1", "time": 1763.2, "taxels": 16, "data": "7FA1,81C0,…", "calibrated":
 […]}, "2": {…}}``: ``message`` counts, keys that are numbers are sensors, ``data`` is three hexadecimal counts a taxel, x, y,
-z, and ``calibrated``, where the server has a calibration, three newtons a taxel. The first text after a connection says
+z, and ``calibrated``, where the server has a calibration, three newtons a taxel. The first text after a connection states
 Welcome for its ``message`` and holds no reading. Source: the vendor's ROS node xela_server_ros 1.7.6, as read.
 """
 
@@ -49,7 +49,7 @@ class Xela(Sensor):
 
     sensor: int = 1  # number of the sensor at the server
     taxels: int = 16  # of the sensor: 16 of a 4x4, 24 of a 4x6, 30 of a curved fingertip
-    forces: bool = False  # keep calibrated forces beside the counts; needs the server's calibration
+    forces: bool = False  # keep calibrated forces next to the counts; needs the server's calibration
     rate_hz: float = 100.0  # that the server is set to
 
     def __post_init__(self) -> None:
@@ -117,9 +117,9 @@ class Xela(Sensor):
 
     def _are_right(self, packets: Sequence[bytes]) -> bool:
         texts = _parsed(tuple(packets))
-        return texts is not None and all(map(self._says, texts))
+        return texts is not None and all(map(self._is_servers, texts))
 
-    def _says(self, text: Any) -> bool:
+    def _is_servers(self, text: Any) -> bool:
         """Return whether a text is the server's: with what this sensor's part must have, or without this sensor."""
         if not isinstance(text, dict) or "message" not in text:
             return False
@@ -138,7 +138,7 @@ class Xela(Sensor):
 
 @functools.lru_cache(maxsize=4)  # kept between the framer's look at them and their decoding
 def _parsed(packets: tuple[bytes, ...]) -> list[Any] | None:
-    """Return what texts hold; None where one is no JSON."""
+    """Return what texts hold; None where one is not JSON."""
     try:
         return [json.loads(_decoded(packet)) for packet in packets]
     except (ValueError, RecursionError):
@@ -192,7 +192,7 @@ def _list_of(width: int) -> re.Pattern[str]:
 
 
 def _are_finite(values: Sequence[Any]) -> bool:
-    """Return whether a list holds numbers alone, and finite ones: their sum tells."""
+    """Return whether a list holds numbers alone, and finite ones: their sum states."""
     try:
         return math.isfinite(sum(values))
     except (TypeError, OverflowError):

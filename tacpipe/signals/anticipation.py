@@ -3,7 +3,7 @@
 A curve of forecasts drawn at the time they are made always looks early if it is any good, and also if it overshoots;
 so warnings are counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) in row t the forecast, made at t, of
 ``truth`` k rows later, k being the ``horizon``; NaN where there is none. ``groups`` (time,) numbers recordings or
-contacts, equal neighbours belong together, and nothing is told across them. Each feature is judged by itself.
+contacts, equal neighbours belong together, and nothing is given across them. Each feature is evaluated by itself.
 
 - A *change* is a run of rows t in which |z_t - z_{t-k}| is beyond 3 times its standard deviation sd in calibration data,
   until it is below 1.5 times. A run that begins within 2 k rows of the end of the last belongs to it: a difference over
@@ -12,10 +12,10 @@ contacts, equal neighbours belong together, and nothing is told across them. Eac
   within a twentieth of z_t - z_{t-k} from z_{t-k}. Were it t itself, a forecast that merely follows would look early,
   because a change that takes time has begun before it is beyond 3 sd.
 - An *alarm* is on in a row in which |ahead_t - z_t| > theta. It *leads* an event at T if it is on in one of the rows
-  T - k, ..., T - 1, by T less the first of them: what k rows foretell is never known more than k rows before.
+  T - k, ..., T - 1, by T less the first of them: what k rows predict is never known more than k rows before.
 - A *false alarm* is one in a row that is free of events: with a forecast whose k rows are in the group, and before
-  T - k - k/5 or from the end of the change on for every event T. An alarm stands for the k rows that it foretells: one
-  that is still on after these is the next, so that an alarm that never ends is no rare one.
+  T - k - k/5 or from the end of the change on for every event T. An alarm represents the k rows that it predicts: one
+  that is still on after these is the next, so that an alarm that never ends is not a rare one.
 
 Events that do not have a forecast in each of the k rows before are not counted: they could not be led by k rows.
 Persistence forecasts no change, hence never alarms.
@@ -37,17 +37,17 @@ Flags = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
 ON_SD, OFF_SD = 3.0, 1.5  # of the differences, between which a change begins and ends
-ONSET_SHARE = 0.05  # of a change, up to which it has not begun
-EARLY_SHARE = 0.2  # of the horizon, by which an alarm may come too early and still not be false
+ONSET_FRACTION = 0.05  # of a change, up to which it has not begun
+EARLY_FRACTION = 0.2  # of the horizon, by which an alarm may come too early and still not be false
 FALSE_ALARMS_PER_MINUTE = 1.0  # of each feature, where nothing happens
 
 
 @dataclass(frozen=True)
 class Anticipation:
-    """How well changes were foretold, over all features; NaN where nothing tells."""
+    """How well changes were predicted, over all features; NaN where nothing states."""
 
     events: int
-    recall: float  # share of the events that an alarm leads
+    recall: float  # fraction of the events that an alarm leads
     median_lead_rows: float  # of the events that an alarm leads
     median_lead_frames: float  # new frames from alarm to event, the event's own included
     false_alarms_per_minute: float  # and feature, in rows free of events
@@ -121,7 +121,7 @@ def score(
     rate_hz: float,
     held: Flags | None = None,
 ) -> Anticipation:
-    """Return how well ``ahead`` foretells the changes of ``truth`` with alarms beyond ``theta`` (feature,).
+    """Return how well ``ahead`` predicts the changes of ``truth`` with alarms beyond ``theta`` (feature,).
 
     ``held`` (time,) marks rows that repeat the frame before; None: every row is a new frame.
     """
@@ -179,13 +179,13 @@ def _changes_of(truth: Floats, moved: Floats, spaced: Rows, horizon: int, sd: fl
     """Return onset and end of the changes (change, 2) of one feature, ``truth`` and ``moved`` each (time,)."""
     size = np.abs(moved)
     on = (size > ON_SD * sd) & (sd > 0)
-    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # where nothing is known, nothing goes on
+    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # where nothing is known, nothing continues
     if not len(starts):
         return np.zeros((0, 2), dtype=np.intp)
     apart = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
     starts, stops = starts[np.append(True, apart)], stops[np.append(apart, True)]
     before = starts[:, None] + np.arange(-horizon, 0)  # (change, row)
-    begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_SHARE * size[starts][:, None]
+    begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_FRACTION * size[starts][:, None]
     lasts = np.argmin(begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
     return np.stack([starts - lasts, stops], axis=1)
 
@@ -195,7 +195,7 @@ def _free(deviation: Floats, those: Rows, stretches: Rows, horizon: int) -> Flag
     free: Flags = np.isfinite(deviation)
     free[max(len(free) - horizon, 0) :] = False
     free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
-    early = horizon + round(EARLY_SHARE * horizon)
+    early = horizon + round(EARLY_FRACTION * horizon)
     for onset, stop in those:
         near = slice(max(onset - early, 0), stop)
         free[near] &= stretches[near] != stretches[onset]
@@ -203,7 +203,7 @@ def _free(deviation: Floats, those: Rows, stretches: Rows, horizon: int) -> Flag
 
 
 def _count(alarms: Rows, horizon: int, enough: float = np.inf) -> int:
-    """Return how many alarms the rows ``alarms`` are, sorted: each stands for the k rows after it, too.
+    """Return how many alarms the rows ``alarms`` are, sorted: each represents the k rows after it, too.
 
     No choice of rows more than k apart is larger, so that more rows never make fewer alarms. Counts no further than one
     beyond ``enough``.
@@ -220,9 +220,9 @@ def _minutes(rows: Flags, rate_hz: float) -> float:
 
 
 def _check(truth: Floats, horizon: int, *, groups: NDArray[Any], **others: Floats) -> None:
-    """Refuse what cannot be judged."""
+    """Refuse what cannot be evaluated."""
     if horizon < 1:
-        raise TacpipeError(f"A forecast of {horizon} rows foretells nothing; the horizon must be 1 or more.")
+        raise TacpipeError(f"A forecast of {horizon} rows predicts nothing; the horizon must be 1 or more.")
     if truth.ndim != 2 or len(groups) != len(truth):
         raise TacpipeError(
             f"Features of {truth.shape} and {len(groups)} group numbers do not fit; there must be one a row."

@@ -1,7 +1,8 @@
 """Which axis of an array is time: the one along which neighbours resemble each other most.
 
 A sensor that is read faster than what it touches moves gives readings that hardly change from one to the next, and
-channels that differ. Where an array was reshaped wrongly, its last axis mixes both, and neighbours along it are strangers.
+channels that differ. Where an array was reshaped wrongly, its last axis mixes both, and neighbours along it are
+untrusted sources.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def lag_one(values: NDArray[Any], axis: int) -> float:
 def is_time(values: NDArray[Any], axis: int, least: float = LEAST) -> bool:
     """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``least`` or more, and the largest.
 
-    False where nothing varies along it: such an array tells nothing about its axes.
+    False where nothing varies along it: such an array states nothing about its axes.
     """
     wanted = axis % values.ndim
     along = [lag_one(values, place) for place in range(values.ndim)]

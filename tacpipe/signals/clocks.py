@@ -1,11 +1,11 @@
-"""A device's own clock beside the times at which its samples reached the host.
+"""A device's own clock next to the times at which its samples reached the host.
 
 The model: ``arrival = offset + (1 + drift) * device + latency``. A latency is never negative, and the fastest samples of
-a link take nearly the same time, so the line is a lower envelope: what lies above it is delay, and says nothing about
+a link take nearly the same time, so the line is a lower envelope: what lies above it is delay, and states nothing about
 the clock. Of all lines below the samples it is the one with the least sum of vertical distances (Moon, Skelly, Towsley,
 "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999), taken after samples that come
 impossibly early are left out. On simulated links its drift was two to five times as precise as that of a Theil-Sen line
-through low quantiles of blocks. The least latency itself cannot be told from an offset; it stays in the offset.
+through low quantiles of blocks. The least latency itself cannot be distinguished from an offset; it stays in the offset.
 
 A device that restarts steps its clock. Steps are looked for first, and each segment between them has its own line.
 Stamps are int64 nanoseconds; first values are subtracted before anything becomes a float.
@@ -30,7 +30,7 @@ STEP_NS = 20_000_000  # smaller steps are latency: no device restarts within 20 
 STEP_WINDOW_NS = 2_000_000_000  # on both sides of a step the clock has to stay that long; stalls of a host are shorter
 STEP_WINDOW_ROWS = (16, 4096)
 STEPS_LOOKED_AT = 64  # the largest jumps; a link that stalls more often than that hides restarts no smaller than these
-LOW = 0.1  # quantile that stands for the fastest samples of a stretch: a few wrong stamps do not move it
+LOW = 0.1  # quantile that represents the fastest samples of a stretch: a few wrong stamps do not move it
 ROUGH_LOW, ROUGH_BLOCKS, ROUGH_ROWS = 0.05, 64, 8  # quantile, number and least length of the blocks of the first line
 EARLY_NS = 100_000.0  # least distance below the first line beyond which a sample is left out
 LINE_ROWS, LINE_NS = 32, 2_000_000_000  # what is shorter shows jitter, not drift
@@ -86,10 +86,10 @@ class ClockFit:
 def fit_clock(device_ns: Times, arrival_ns: Times, certain: NDArray[np.bool_] | None = None) -> ClockFit:
     """Return the fit of a device's clock (time,) against the arrival of its samples (time,), in row order.
 
-    Where ``certain`` (time,) is given, the other rows have arrivals that say nothing, as of a host that was held up, and are
-    left out; where no row is certain, all are taken. A segment too short to show a drift takes that of the longest one that
-    does, or none. Raises `TacpipeError` for a clock that stands still, or whose rate differs from the host's by more than
-    10 %.
+    Where ``certain`` (time,) is given, the other rows have arrivals that state nothing, as of a host that was held up,
+    and are left out; where no row is certain, all are taken. A segment too short to show a drift takes that of the
+    longest one that does, or none. Raises `TacpipeError` for a clock that stands still, or whose rate differs from the
+    host's by more than 10 %.
 
     >>> device_ns = np.arange(0, 10_000_000_000, 1_000_000)
     >>> fit = fit_clock(device_ns, 500 + device_ns + device_ns // 20_000)
@@ -98,7 +98,7 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: NDArray[np.bool_] | 
     """
     if len(device_ns) != len(arrival_ns) or not len(device_ns):
         raise TacpipeError(
-            f"{len(device_ns)} device stamps and {len(arrival_ns)} arrivals are no clock to fit; there must be as many "
+            f"{len(device_ns)} device stamps and {len(arrival_ns)} arrivals are not a clock to fit; there must be as many "
             "of both, and one at least."
         )
     if certain is not None and certain.any() and not certain.all():
@@ -146,7 +146,7 @@ def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
     """Return, sorted, the rows at which the device's clock steps against the host's for good.
 
     A late sample jumps too, but the clock behind it is where it was: so the fastest samples of the two seconds before
-    and after must lie apart by at least half the jump. Raises nothing; a gap in both clocks is no step.
+    and after must lie apart by at least half the jump. Raises nothing; a gap in both clocks is not a step.
     """
     apart = arrival_ns - device_ns
     apart = (apart - apart[0]).astype(np.float64)  # (time,)
@@ -159,7 +159,7 @@ def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
     period_ns = max(float(np.median(_some(np.diff(arrival_ns)))), 1.0)
     reach = int(np.clip(STEP_WINDOW_NS / period_ns, *STEP_WINDOW_ROWS))
     steps: list[int] = [0, len(apart)]
-    for row in rows.tolist():  # largest first, so that a step is told from the stalls around it
+    for row in rows.tolist():  # largest first, so that a step is derived from the stalls around it
         first = max(max(step for step in steps if step <= row), row - reach)
         stop = min(min(step for step in steps if step >= row), row + reach)
         if first < row < stop:
@@ -198,7 +198,7 @@ def _drift(device_ns: Times, arrival_ns: Times) -> float | None:
         rate = "none" if rough is None else f"{1 / (1 + rough):.4g}" if rough > -1 else "negative"
         raise TacpipeError(
             f"The device's clock runs at {rate} times the host's over {span_ns / 1e9:.4g} s; it must run within 10 % of "
-            "it, and t_device_ns be in nanoseconds. Mend the stamps, or use the time of arrival (`--clock arrival`)."
+            "it, and t_device_ns be in nanoseconds. Fix the stamps, or use the time of arrival (`--clock arrival`)."
         )
     level_ns = apart_ns - rough * since_ns
     possible = level_ns >= _earliest(level_ns)

@@ -34,7 +34,7 @@ def rest_level(values: NDArray[Any], t_ns: Times, rest_s: float) -> Floats:
     Raises `TacpipeError` if there are no rows.
     """
     if not len(t_ns):
-        raise TacpipeError("The level at rest cannot be told from a recording without rows.")
+        raise TacpipeError("The level at rest cannot be distinguished from a recording without rows.")
     rows = int(np.searchsorted(t_ns, t_ns[0] + round(rest_s * 1e9), side="right"))
     level: Floats = np.median(values[: max(rows, 1)], axis=0).astype(np.float64)
     return level
@@ -51,7 +51,7 @@ def axis_mean_level(values: NDArray[Any], axes: int = 3) -> Floats:
     """
     _require_taxels(values, axes)
     if not len(values):
-        raise TacpipeError("The level at rest cannot be told from a recording without rows.")
+        raise TacpipeError("The level at rest cannot be distinguished from a recording without rows.")
     first = values[0].astype(np.float64).reshape(-1, axes)  # (taxel, axis)
     level: Floats = (first - np.trunc(first.mean(axis=0))).ravel()
     return level
@@ -79,7 +79,7 @@ def noise_thresholds(values: NDArray[Any], load: Floats, t_ns: Times, rest_s: fl
     The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds; samples that repeat the one
     before in all channels of ``values`` (time, channel) are left out. Contact starts at 40 times the noise, but at no
     more than a quarter of the recording's largest load, at least at a twentieth of that, and at least at 10 times the
-    noise; it ends at two thirds of that. On 52 published trials of a XELA uSkin this is 70 to 230 counts, beside the 120
+    noise; it ends at two thirds of that. On 52 published trials of a XELA uSkin this is 70 to 230 counts, next to the 120
     that were set by hand. Without any load the thresholds are infinite.
     """
     finite = np.isfinite(load)

@@ -1,4 +1,4 @@
-"""The moment at which a hand has closed: all its fingers press, and what they feel has come to rest."""
+"""The moment at which a hand has closed: all its fingers press, and what they measure has come to rest."""
 
 from __future__ import annotations
 

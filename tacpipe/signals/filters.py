@@ -74,7 +74,7 @@ def butterworth(cutoff_hz: float, rate_hz: float) -> Biquad:
 
 
 def median(values: NDArray[Any], rows: int) -> Floats:
-    """Return the median of the ``rows`` (odd) around each row of ``values`` (time,); end values go on beyond the ends.
+    """Return the median of the ``rows`` (odd) around each row of ``values`` (time,); end values continue beyond the ends.
 
     >>> median(np.array([1, 9, 1, 1, 2]), 3).tolist()
     [1.0, 1.0, 1.0, 1.0, 2.0]

@@ -70,7 +70,7 @@ def joint_frames(chain: Chain, joint_rad: Floats) -> Floats:
 def carries(chain: Chain, joint_rad: Floats, hand_m: Floats) -> bool:
     """Return whether a hand at ``hand_m`` (time, 3) hangs rigidly on the chain's last link: whether it is this arm.
 
-    Rows that are not finite do not tell.
+    Rows that are not finite do not state.
     """
     known = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
     last, hand_m = joint_frames(chain, joint_rad[known])[:, -1], hand_m[known]

@@ -2,7 +2,7 @@
 
 Time is int64 nanoseconds throughout. Only differences of stamps become floats, so that stamps near 1.6e18 (UTC today)
 lose nothing: as float64 they would be rounded to 256 ns. Stamps must not run backwards; equal ones are allowed, and the
-last of them counts. Beyond the first and the last sample a signal keeps its end value; `in_gap` tells where that is.
+last of them counts. Beyond the first and the last sample a signal keeps its end value; `in_gap` states where that is.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> NDArray[np.bool_]:
 def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
     """Return the sample rows before and after each grid point and the weight of the latter, each (grid,).
 
-    At a sample both rows are that sample, so that what lies behind it has no say.
+    At a sample both rows are that sample, so that what lies behind it has no state.
     """
     _require_samples(t_ns)
     last = len(t_ns) - 1

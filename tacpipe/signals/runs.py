@@ -40,7 +40,7 @@ def in_long_runs(state: Flags, rows: int) -> Flags:
 
 
 def lasting(state: Flags, rows: int) -> Flags:
-    """Return in which rows ``state`` (time,) has held for ``rows`` rows, this one included: the same, told causally."""
+    """Return in which rows ``state`` (time,) has held for ``rows`` rows, this one included: the same, stated causally."""
     count = np.arange(1, len(state) + 1)
     last_off = np.maximum.accumulate(np.where(state, 0, count))  # rows up to the last that was off
     found: Flags = state & (count - last_off >= rows)

@@ -2,7 +2,7 @@
 
 Each slide was written as (taxel, time, triangle) and then read as (triangle, taxel, time) without moving its axes, so that
 what is called time holds all triangles by turns: ``X[r, c, j] = U[(T r + j) mod 6, c, floor((T r + j) / 6)]`` for slides of
-T frames and 6 triangles, where U is the slide as it was felt. Values change places only, so the way back is exact.
+T frames and 6 triangles, where U is the slide as it was measured. Values change places only, so the way back is exact.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def scramble(slides: NDArray[Any]) -> NDArray[Any]:
 
 
 def unscramble(published: NDArray[Any]) -> NDArray[Any]:
-    """Return slides as they were felt, (…, triangle, taxel, time), from the published arrangement; undoes `scramble`.
+    """Return slides as they were measured, (…, triangle, taxel, time), from the published arrangement; undoes `scramble`.
 
     >>> unscramble(np.array([[[0, 10, 1, 11]], [[2, 12, 3, 13]]])).tolist()
     [[[0, 1, 2, 3]], [[10, 11, 12, 13]]]

@@ -23,7 +23,7 @@ class Protocol:
     """What each slide of an experiment should be like."""
 
     speed_m_s: float
-    speed_tolerance: float  # share of it
+    speed_tolerance: float  # fraction of it
     min_s: float
     pressure_low: float  # counts
     pressure_high: float
@@ -92,12 +92,12 @@ def phases(rows: int, slide: Rows) -> NDArray[np.int8]:
     return (place >= slide[1]).astype(np.int8) - (place < slide[0]).astype(np.int8)
 
 
-def told(pressure: NDArray[Any], profile: Mapping[str, Floats]) -> dict[str, float]:
+def measured(pressure: NDArray[Any], profile: Mapping[str, Floats]) -> dict[str, float]:
     """Return what the kept rows of a slide were like: the means of pressure and force, the median of the speed.
 
     All are (time,). Speed and force are left out where they are not known in all rows.
 
-    >>> told(np.array([10, 20]), {"speed_m_s": np.array([0.02, 0.03]), "force_n": np.array([np.nan, 1.0])})
+    >>> measured(np.array([10, 20]), {"speed_m_s": np.array([0.02, 0.03]), "force_n": np.array([np.nan, 1.0])})
     {'pressure_mean_count': 15.0, 'speed_m_s': 0.025}
     """
     found = {"pressure_mean_count": round(float(pressure.mean()), 3)}
@@ -108,7 +108,7 @@ def told(pressure: NDArray[Any], profile: Mapping[str, Floats]) -> dict[str, flo
     return found
 
 
-def departures(protocol: Protocol, lasts_s: float, told: Mapping[str, float]) -> list[str]:
+def departures(protocol: Protocol, lasts_s: float, measured: Mapping[str, float]) -> list[str]:
     """Return in words each way in which a slide differs from its protocol; none where it does not.
 
     >>> wanted = Protocol(0.025, 0.1, 5.0, 2.0, 150.0)
@@ -116,7 +116,7 @@ def departures(protocol: Protocol, lasts_s: float, told: Mapping[str, float]) ->
     ['its speed is 30.0 mm/s and not 25.0', 'its mean pressure is 1.0 counts and not 2 to 150']
     """
     found = []
-    speed_m_s, pressure_count = told.get("speed_m_s", protocol.speed_m_s), told["pressure_mean_count"]
+    speed_m_s, pressure_count = measured.get("speed_m_s", protocol.speed_m_s), measured["pressure_mean_count"]
     if abs(speed_m_s - protocol.speed_m_s) > protocol.speed_tolerance * protocol.speed_m_s:
         found.append(f"its speed is {1e3 * speed_m_s:.1f} mm/s and not {1e3 * protocol.speed_m_s:.1f}")
     if lasts_s < protocol.min_s:

@@ -1,4 +1,4 @@
-"""When a held object slips, told from the distance between hand and object.
+"""When a held object slips, derived from the distance between hand and object.
 
 The proximity sensor at the wrist looks at the object: while the object is held its reading stays, and where it moves the
 object slips. How the label is made, and why:
@@ -65,7 +65,7 @@ class Limits:
 def filled(readings: NDArray[Any]) -> Floats:
     """Return ``readings`` (time,) with NaN replaced by the last number before it, at the start by the first one.
 
-    So no row is filled from its future but those before the first reading, where nothing can be told anyway.
+    So no row is filled from its future but those before the first reading, where nothing can be determined anyway.
     """
     values = readings.astype(np.float64)
     known = np.isfinite(values)
@@ -92,7 +92,7 @@ def rate_so_far(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
 
 
 def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Flags:
-    """Return where the object slips (time,), told with the whole of ``readings`` (time,) since the grasp at hand.
+    """Return where the object slips (time,), stated with the whole of ``readings`` (time,) since the grasp at hand.
 
     In the first ``still`` rows it is taken to rest; their rate sets the threshold.
     """
@@ -115,7 +115,7 @@ def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, 
 
 
 def dropped(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Flags:
-    """Return from where on (time,) the object is lost, told with the whole of ``readings`` (time,) since the grasp.
+    """Return from where on (time,) the object is lost, stated with the whole of ``readings`` (time,) since the grasp.
 
     That is after the first ``still`` rows, once the readings, smoothed by a median, are more than ``patch_count`` from the
     median of those rows, or at ``saturated_count`` or below, where the sensor sees no more.
@@ -143,7 +143,7 @@ def _noise(speed: Floats, limits: Limits) -> float:
 def _resting(smooth: Floats, rows: int, level_count: float) -> Flags:
     """Return which rows (time,) lie in ``rows`` or more in which ``smooth`` (time,) stays within ``level_count``.
 
-    Between two slips that follow at once the filtered rate does not come down; the readings tell that there are two.
+    Between two slips that follow at once the filtered rate does not come down; the readings state that there are two.
     """
     found = np.zeros(len(smooth), dtype=bool)
     if len(smooth) < rows:

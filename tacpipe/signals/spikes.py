@@ -16,7 +16,7 @@ TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in its median a
 
 
 def hampel(values: NDArray[Any], rows: int, deviations: float, floor: float) -> tuple[NDArray[np.bool_], NDArray[Any]]:
-    """Return which of ``values`` (time, channel) are spikes (time, channel), and the values with these mended.
+    """Return which of ``values`` (time, channel) are spikes (time, channel), and the values with these repaired.
 
     A spike is further than ``deviations`` scaled median absolute deviations, and than ``floor``, from the median of the
     ``rows`` (odd) around it, which takes its place; with one row there are none. Signals are
@@ -27,18 +27,18 @@ def hampel(values: NDArray[Any], rows: int, deviations: float, floor: float) -> 
     ([False, False, True, False, False], [3, 4, 4, 4, 5])
     """
     found = np.zeros(values.shape, dtype=bool)
-    mended = values.copy()
+    repaired = values.copy()
     half = rows // 2
     if not 0 < half < len(values):
-        return found, mended
+        return found, repaired
     wide = np.flatnonzero(values.max(axis=0).astype(np.float64) - values.min(axis=0) > floor)  # others have no spike
     if not len(wide):
-        return found, mended
+        return found, repaired
     padded = np.pad(values[:, wide].astype(np.float64), ((half, half), (0, 0)), mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)  # (time, channel, row)
     middle = np.median(windows, axis=-1)  # (time, channel)
     spread = TO_SIGMA * np.median(np.abs(windows - middle[..., None]), axis=-1)
     spikes = np.abs(padded[half:-half] - middle) > np.maximum(deviations * spread, floor)
     found[:, wide] = spikes
-    mended[:, wide] = np.where(spikes, middle, values[:, wide]).astype(values.dtype)
-    return found, mended
+    repaired[:, wide] = np.where(spikes, middle, values[:, wide]).astype(values.dtype)
+    return found, repaired

@@ -29,7 +29,7 @@ def grasped(
 ) -> Grasp | None:
     """Return a grasp of a body that is seen at points (point, xyz), metres; None if no line suits.
 
-    ``shift`` is the largest share of half the cloud's length by which the point is shifted; ``central`` takes the
+    ``shift`` is the largest fraction of half the cloud's length by which the point is shifted; ``central`` takes the
     body's origin instead. Finger 1, the one at ``g1``, comes from the camera's left, as on the published rig.
     """
     through = placed.origin_m if central else _within(placed, _shifted(seen_m, shift, rng))

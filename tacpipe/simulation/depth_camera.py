@@ -2,7 +2,7 @@
 
 The camera's frame: x to the right of the image, y down, z along the optical axis. Its rays run through the pixels of an
 Intel RealSense D415 at 640 x 480. Depth is noisy, the more the farther: 1.5 mm at 1 m, growing with the square, as
-stereo errors do. Colours are random and tell nothing of the object.
+stereo errors do. Colours are random and state nothing of the object.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def camera(rng: np.random.Generator, height_m: tuple[float, float], tilt_rad: fl
 
 
 def put(shape: Shape, rest: Rest, yaw_rad: float, at_m: tuple[float, float], up: Floats, height_m: float) -> Placed:
-    """Return a body lying on the table as ``rest`` says, turned by ``yaw_rad`` about the vertical.
+    """Return a body lying on the table as ``rest`` states, turned by ``yaw_rad`` about the vertical.
 
     ``at_m`` is where the camera sees its origin: x and y on the optical axis' plane at ``height_m``, metres.
     """

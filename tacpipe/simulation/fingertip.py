@@ -42,15 +42,15 @@ PLACES_M = 0.001 * np.array(  # (electrode, axis); x along the finger to its tip
         [-13.600, 0.000, -5.080],
     ]
 )
-ALONG_M = PLACES_M[:, 0]  # (electrode,), xi: by which an electrode feels the surface earlier
+ALONG_M = PLACES_M[:, 0]  # (electrode,), xi: by which an electrode measures the surface earlier
 APERTURE_M = 0.0006
 CENTRE_M = 0.001 * np.array([-1.0, 0.0, -5.08])  # where the finger touches
-REACH_M = 0.005  # standard deviation of the Gaussian by which electrodes feel what is there
+REACH_M = 0.005  # standard deviation of the Gaussian by which electrodes measure what is there
 GAIN_COUNT_N = (45.0, 3.0)  # of an electrode at the centre, and of all besides
-LEAN = 0.4  # share of the force, times friction, that shows more or less at 5 mm before or behind the centre
+LEAN = 0.4  # fraction of the force, times friction, that shows more or less at 5 mm before or behind the centre
 PRESSURE_COUNT_N = 28.0  # PDC
 TRIGGER_COUNT = 40  # PDC above which the slide starts
-VIBRATION_COUNT_S_N = 25.0  # PAC, by the derivative of what is felt
+VIBRATION_COUNT_S_N = 25.0  # PAC, by the derivative of what is measured
 NOISE_COUNT, PRESSURE_NOISE_COUNT, VIBRATION_NOISE_COUNT = 0.75, 1.0, 3.0
 DRIFT_COUNT = 0.3  # random walk of an electrode, counts after one second
 RATE_HZ = 100.0
@@ -69,7 +69,8 @@ def gains() -> Floats:
 
 
 def leans() -> Floats:
-    """Return the share of the friction that each electrode feels as pressure (electrode,): d, forward of the centre > 0."""
+    """Return the fraction of the friction that each electrode measures as pressure (electrode,): d, forward of the
+    centre > 0."""
     lean: Floats = LEAN * np.tanh((ALONG_M - CENTRE_M[0]) / 0.005)
     return lean
 
@@ -87,10 +88,10 @@ def pressure(force_n: Floats, noise_count: Floats) -> Counts:
     return tared(np.rint(PRESSURE_COUNT_N * force_n + noise_count))
 
 
-def vibration(felt_n: Floats, noise_scale: float, rng: np.random.Generator) -> Counts:
-    """Return PAC (time, reading) of what is felt at `VIBRATION_RATE_HZ` (time * reading,), N."""
-    noise = rng.normal(0, VIBRATION_NOISE_COUNT, len(felt_n))
-    change = np.diff(felt_n, prepend=felt_n[:1]) * VIBRATION_RATE_HZ
+def vibration(contact_n: Floats, noise_scale: float, rng: np.random.Generator) -> Counts:
+    """Return PAC (time, reading) of what is measured at `VIBRATION_RATE_HZ` (time * reading,), N."""
+    noise = rng.normal(0, VIBRATION_NOISE_COUNT, len(contact_n))
+    change = np.diff(contact_n, prepend=contact_n[:1]) * VIBRATION_RATE_HZ
     return counted(VIBRATION_COUNT_S_N * change + noise_scale * noise).reshape(-1, schema.VIBRATIONS)
 
 

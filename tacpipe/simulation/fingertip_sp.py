@@ -17,11 +17,11 @@ from tacpipe.channels import biotac_sp
 
 Floats = NDArray[np.float64]
 
-CHANNELS = biotac_sp.ELECTRODES + 1  # of a finger that touch is told by: the electrodes, then the fluid's pressure
+CHANNELS = biotac_sp.ELECTRODES + 1  # of a finger by which touch is measured: the electrodes, then the fluid's pressure
 GAIN_COUNT = 2600.0  # by which an electrode falls under a contact that squeezes all fluid out
 FLUID_M = 0.0006  # indentation at which 1 - 1/e of that is reached
 BREADTH = 1.1  # sigma of the pressed region over the contact's radius
-BULGE = 0.35  # share of what pressed electrodes fall by that the others rise by
+BULGE = 0.35  # fraction of what pressed electrodes fall by that the others rise by
 REST_COUNT = (2400.0, 3480.0)  # of an electrode
 NOISE_COUNT = (3.5, 6.4)  # of an electrode, standard deviation
 PRESSURE_NOISE_COUNT = (0.05, 0.25)

@@ -47,18 +47,20 @@ def _places() -> Floats:
 
 
 PLACES_M = _places()  # (taxel, axis)
-ALONG_M = PLACES_M[:, 0]  # (taxel,), xi: by which a taxel feels the surface earlier
+ALONG_M = PLACES_M[:, 0]  # (taxel,), xi: by which a taxel measures the surface earlier
 
 
-def shares(patch_m: Floats) -> Floats:
-    """Return how much of the patch's pressure each taxel feels (time, taxel), 1 at its centre ``patch_m`` (time, axis)."""
+def fractions(patch_m: Floats) -> Floats:
+    """Return how much of the patch's pressure each taxel measures (time, taxel), 1 at its centre ``patch_m`` (time,
+    axis)."""
     distance2 = ((PLACES_M - patch_m[:, None]) ** 2).sum(axis=2)
-    share: Floats = np.exp(-distance2 / (2 * SIGMA_M**2))
-    return share
+    fraction: Floats = np.exp(-distance2 / (2 * SIGMA_M**2))
+    return fraction
 
 
 def leans(patch_m: Floats) -> Floats:
-    """Return the share of the friction that each taxel feels as pressure (time, taxel): d, forward of the patch > 0."""
+    """Return the fraction of the friction that each taxel measures as pressure (time, taxel): d, forward of the patch >
+    0."""
     lean: Floats = LEAN * np.tanh((ALONG_M - patch_m[:, :1]) / SIGMA_M)
     return lean
 

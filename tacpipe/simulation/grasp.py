@@ -1,10 +1,10 @@
-"""Grasps of the simulated table: a camera sees an object, two fingers pinch it, and their sensors read what they feel.
+"""Grasps of the simulated table: a camera sees an object, two fingers pinch it, and their sensors read what they measure.
 
 Trial i is of object i mod n. What happens in one:
 
 1. an object comes to rest on the table in a random pose, and `tacpipe.simulation.depth_camera` sees it;
 2. `tacpipe.simulation.antipodal` plans where two fingers take it;
-3. the fingers, a little off, press as `tacpipe.simulation.pinch` tells;
+3. the fingers, a little off, press as `tacpipe.simulation.pinch` states;
 4. `tacpipe.simulation.fingertip_sp` reads that.
 
 Grasps of an object follow one another in sessions, over which the sensors drift.
@@ -20,7 +20,7 @@ from tacpipe.channels import biotac_sp, schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import fingertip_sp, grasp_truth, pinch, pinch_course, tabletop
-from tacpipe.simulation.grasp_scene import Felt, Rig, Scene, families, feel, perform, sensors, thing
+from tacpipe.simulation.grasp_scene import Readings, Rig, Scene, families, perform, read_sensors, sensors, thing
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
     scene = perform(seed, index, rig)
     t_ns = stamp_ns(index, rig)
     made = sensors(seed)
-    felt = feel(made, scene, t_ns, rig)
+    readings = read_sensors(made, scene, t_ns, rig)
     rng = np.random.default_rng([seed, NOISE, index])
     streams = {"grasp": scene.grasp.table(t_ns)}
     moments_ns: dict[str, int] = {}
@@ -50,14 +50,14 @@ def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
         other = thing(seed, index + 1 + int(rng.integers(1_000)), rig)
         view = tabletop.view(scene.placed, other.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
         streams |= tabletop.tables(view)
-        streams["biotac_sp"] = _felt_over_time(made, scene, felt, course, rig, rng)
+        streams["biotac_sp"] = _readings_over_time(made, scene, readings, course, rig, rng)
         moments_ns = course.moments_ns
     else:
         streams["cloud"] = scene.cloud.table()
         still = np.zeros((1, len(biotac_sp.FINGERS)))
-        streams["reading"] = _logged(np.array([t_ns + READ_NS]), made, felt.shown[None], still, rig, rng)
+        streams["reading"] = _logged(np.array([t_ns + READ_NS]), made, readings.shown[None], still, rig, rng)
     bound = grasp_truth.bound(made, scene, rig, np.random.default_rng([seed, BOUND, index]))
-    streams["truth"] = grasp_truth.table(t_ns, scene, felt, bound, moments_ns)
+    streams["truth"] = grasp_truth.table(t_ns, scene, readings, bound, moments_ns)
     return RecordingOutput(streams, _attributes(scene, session(index, rig)))
 
 
@@ -81,19 +81,19 @@ def _number(index: int, rig: Rig) -> int:
     return index // _objects(rig)
 
 
-def _felt_over_time(
+def _readings_over_time(
     made: fingertip_sp.Sensors,
     scene: Scene,
-    felt: Felt,
+    readings: Readings,
     course: pinch_course.Course,
     rig: Rig,
     rng: np.random.Generator,
 ) -> pa.Table:
     """Return the stream of both sensors while fingers close, hold and let go."""
-    force = course.share[:, None] * felt.touch.force_n  # (time, finger)
+    force = course.fraction[:, None] * readings.touch.force_n  # (time, finger)
     contact, skin = pinch.pressed(scene.situation, force)
-    centre = np.broadcast_to(felt.touch.centre_m, (len(force), *felt.touch.centre_m.shape[1:]))
-    shown = fingertip_sp.signal(made, force, contact, skin, centre) + felt.drift
+    centre = np.broadcast_to(readings.touch.centre_m, (len(force), *readings.touch.centre_m.shape[1:]))
+    shown = fingertip_sp.signal(made, force, contact, skin, centre) + readings.drift
     speed = np.gradient(force, course.t_ns / 1e9, axis=0)
     return _logged(course.t_ns, made, shown, speed, rig, rng)
 
@@ -129,6 +129,6 @@ def _check(rig: Rig) -> None:
         if getattr(rig, name) < 0:
             raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 0 or more.")
     if not 0 <= rig.shift <= 1:
-        raise TacpipeError(f"shift is {rig.shift}; it is a share of half the cloud's length, 0 to 1.")
+        raise TacpipeError(f"shift is {rig.shift}; it is a fraction of half the cloud's length, 0 to 1.")
     if rig.raw and rig.spheres:
         raise TacpipeError("raw and spheres are both set; spheres of all sizes have no table. Leave one of them out.")

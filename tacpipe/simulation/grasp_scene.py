@@ -1,7 +1,7 @@
 """The scene of a grasp on the simulated table: an object, what a camera sees of it, and how two fingers take it.
 
 What nobody sees of it, such as the effort of the hand, is part of the scene too: it is all that a trial needs for what
-the fingers then feel.
+the fingers then measure.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
 
 @dataclass(frozen=True)
 class Rig:
-    """Which objects are grasped, and how well the sensors tell; the fields are those of the stage's params.
+    """Which objects are grasped, and how well the sensors state; the fields are those of the stage's params.
 
     Controls: ``spheres`` makes all objects alike but for their size, ``one_pose`` leaves the cloud only the object to
-    tell, ``effort_spread=0`` makes the force one of the geometry alone.
+    state, ``effort_spread=0`` makes the force one of the geometry alone.
     """
 
     families: str = "all"
@@ -64,8 +64,8 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Felt:
-    """What both sensors feel at contact: truth, and what they show of it without noise (finger, channel), counts."""
+class Readings:
+    """What both sensors measure at contact: truth, and what they show of it without noise (finger, channel), counts."""
 
     touch: pinch.Touch
     drift: Floats
@@ -126,12 +126,12 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     raise TacpipeError(f"The object {of.name} could not be seen and grasped in {TRIES} poses; take another seed.")
 
 
-def feel(made: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Felt:
-    """Return what both sensors feel of a scene at ``t_ns``; where the camera is does not matter."""
+def read_sensors(made: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Readings:
+    """Return what both sensors measure of a scene at ``t_ns``; where the camera is does not matter."""
     touch = pinch.touch(scene.situation, scene.hidden)
     off = fingertip_sp.drift(made.phases_rad, rig.drift_count_day, t_ns)
     shown = fingertip_sp.signal(made, touch.force_n, touch.contact_m, touch.skin_m, touch.centre_m)[0]
-    return Felt(touch, off, shown + off)
+    return Readings(touch, off, shown + off)
 
 
 def _scaled(scene: Scene, scale: float) -> Scene:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tacpipe.channels import biotac_sp, schema
 from tacpipe.simulation import fingertip_sp, touch_bound
-from tacpipe.simulation.grasp_scene import Felt, Rig, Scene
+from tacpipe.simulation.grasp_scene import Readings, Rig, Scene
 
 Floats = NDArray[np.float64]
 
@@ -28,13 +28,15 @@ def bound(made: fingertip_sp.Sensors, scene: Scene, rig: Rig, rng: np.random.Gen
     return touch_bound.known(possible)
 
 
-def table(t_ns: int, scene: Scene, felt: Felt, known: tuple[Floats, Floats], moments_ns: Mapping[str, int]) -> pa.Table:
+def table(
+    t_ns: int, scene: Scene, sensed: Readings, known: tuple[Floats, Floats], moments_ns: Mapping[str, int]
+) -> pa.Table:
     """Return the stream ``truth``: of each finger, gt_mf_… and gt_th_…, then of the object.
 
     ``gt_expected_…`` is the mean and ``gt_variance_…`` the variance of a reading given the geometry, counts and counts
     squared; ``moments_ns`` are when fingers touch, hold and let go, in nanoseconds, each a column ``gt_…_ns``.
     """
-    columns = [found for finger in range(len(biotac_sp.FINGERS)) for found in _finger(finger, scene, felt)]
+    columns = [found for finger in range(len(biotac_sp.FINGERS)) for found in _finger(finger, scene, sensed)]
     columns += [(f"gt_position_{axis}_m", "m", "position", scene.placed.origin_m[i]) for i, axis in enumerate("xyz")]
     columns += [
         (f"gt_rotation_{axis}_{part}", "1", "orientation", scene.placed.rotation[i, j])
@@ -57,9 +59,9 @@ def table(t_ns: int, scene: Scene, felt: Felt, known: tuple[Floats, Floats], mom
     return schema.stream(np.array([t_ns]), values, [*fields, *moments])
 
 
-def _finger(finger: int, scene: Scene, felt: Felt) -> list[tuple[str, str, str, float]]:
+def _finger(finger: int, scene: Scene, sensed: Readings) -> list[tuple[str, str, str, float]]:
     """Return name, unit, quantity and value of what is true of a finger."""
-    touch, of = felt.touch, scene.situation
+    touch, of = sensed.touch, scene.situation
     found = [
         ("force_n", "N", "force", touch.force_n[0, finger]),
         ("effort", "1", "share", scene.hidden.effort[0, finger]),
@@ -71,6 +73,6 @@ def _finger(finger: int, scene: Scene, felt: Felt) -> list[tuple[str, str, str, 
         ("curvature2_1_m", "1/m", "curvature", of.curvatures_1_m[finger, 1]),
         ("lean_along_rad", "rad", "angle", of.lean_rad[finger, 0]),
         ("lean_around_rad", "rad", "angle", of.lean_rad[finger, 1]),
-        ("pdc_drift_count", "count", "static_pressure", felt.drift[finger, -1]),
+        ("pdc_drift_count", "count", "static_pressure", sensed.drift[finger, -1]),
     ]
     return [(f"gt_{biotac_sp.FINGERS[finger]}_{name}", unit, kind, float(value)) for name, unit, kind, value in found]

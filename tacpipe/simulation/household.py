@@ -16,8 +16,8 @@ SHARES = (0.6, 0.2, 0.2)  # of the objects, in the order of MODULI_PA
 TAPER, NARROW = (
     (0.08, 0.22),
     0.4,
-)  # of cones: slope, within what friction holds, and least share of the radius at the top
-REFERENCE_M = 0.04  # radius of the sphere that stands for spheres of all sizes
+)  # of cones: slope, within what friction holds, and least fraction of the radius at the top
+REFERENCE_M = 0.04  # radius of the sphere that represents spheres of all sizes
 SPHERES_M = (0.012, 0.058)  # radii of those
 
 

@@ -9,14 +9,14 @@ states, stepped with the velocity taken implicitly:
 - *slip*: friction of 2 mu_k N against the relative velocity. Where it would turn the velocity round, the object
   sticks again, and the anchor is set so that the spring carries the load of that moment.
 
-Not LuGre: its break-away force depends on how fast the load comes, and it creeps at rest. The spring stands for the
-stiffness of a contact at rest; its deflection (0.3 mm at 6 N) is no displacement here, which slip alone makes.
+Not LuGre: its break-away force depends on how fast the load comes, and it creeps at rest. The spring represents the
+stiffness of a contact at rest; its deflection (0.3 mm at 6 N) is not a displacement here, which slip alone makes.
 
 Along y the object is clamped: its acceleration is the difference of the two normal forces, and their sum stays 2 N.
 While the object stands on the table, the table bears its weight, and hands it over within `TABLE_M` of rise. Once it has
 moved by `DROP_M` the fingers have lost it: contact forces are zero, it falls, and lies where it lands.
 
-A grasp beside the centre of mass twists the object about y as well. The two soft fingers hold (2/3) mu N R each, as
+A grasp next to the centre of mass twists the object about y as well. The two soft fingers hold (2/3) mu N R each, as
 uniform pressure on a disc of radius R does. The twist has a friction limit of its own, not one in common with the shear.
 """
 
@@ -48,7 +48,7 @@ class Grasp:
     mass_kg: float
     friction: float  # mu_s
     grip_n: Floats  # (time,), N: the normal force of each finger while nothing accelerates along y
-    lever_m: float = 0.0  # how far the centre of mass lies beside the grasp, along x
+    lever_m: float = 0.0  # how far the centre of mass lies next to the grasp, along x
 
     @property
     def limit_n(self) -> Floats:
@@ -59,7 +59,7 @@ class Grasp:
     def demand_n(self, acceleration_m_s2: Floats, borne: Floats | float = 1.0) -> Floats:
         """Return the force (time, axis) in the hand's frame that moves the object as the hand moves.
 
-        ``acceleration_m_s2`` (time, axis) is that of the hand in its frame; ``borne`` (time,) is the share of the
+        ``acceleration_m_s2`` (time, axis) is that of the hand in its frame; ``borne`` (time,) is the fraction of the
         weight that the table has handed over.
         """
         pull: Floats = self.mass_kg * (acceleration_m_s2 + UPWARDS_M_S2)
@@ -201,7 +201,7 @@ def _fall(
 def _twist(grasp: Grasp, force_n: Floats, held: Flags, step_s: float) -> tuple[Floats, Floats]:
     """Return torque about y and rotation of the object against the fingers (time,).
 
-    The centre of mass hangs ``lever_m`` beside the grasp at angle 0 and swings down as the object turns; friction holds
+    The centre of mass hangs ``lever_m`` next to the grasp at angle 0 and swings down as the object turns; friction holds
     it up to the limit of the soft fingers, and brakes it beyond. Once the object is dropped, the angle stays.
     """
     rows = len(force_n)

@@ -3,8 +3,8 @@
 What happens, in order:
 
 1. the fingers close (0.6 to 1.2 s), then the grip force ramps up (0.4 s);
-2. the hand lifts the bottle and moves it, as `tacpipe.simulation.trajectory` tells;
-3. the bottle sticks, slips or is dropped, as `tacpipe.simulation.mechanics` tells;
+2. the hand lifts the bottle and moves it, as `tacpipe.simulation.trajectory` states;
+3. the bottle sticks, slips or is dropped, as `tacpipe.simulation.mechanics` states;
 4. what the fingers bring up shows on `tacpipe.simulation.taxels`, slip on `tacpipe.simulation.proximity` as well;
 5. each device logs it on its own clock, with the faults of `tacpipe.simulation.faults`.
 
@@ -152,14 +152,14 @@ def touch(scene: Scene, finger: int, true_ns: NDArray[np.int64], *, creep: float
     at = interpolation(scene, true_ns)
     displacement, torque = at(contact.displacement_m), at(contact.torque_nm)
     pressures = [
-        at(contact.normal_n[:, j])[:, None] * taxels.shares(one, displacement, torque)
+        at(contact.normal_n[:, j])[:, None] * taxels.fractions(one, displacement, torque)
         for j, one in enumerate(scene.skins)
     ]
     friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
     pulled = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
     late = at(taxels.lagged(contact.normal_n[:, finger], trajectory.RATE_HZ))
-    share = taxels.shares(scene.skins[finger], displacement, torque)
-    pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * share
+    fraction = taxels.fractions(scene.skins[finger], displacement, torque)
+    pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * fraction
     own = slice(finger * schema.TAXELS, (finger + 1) * schema.TAXELS)
     return np.concatenate([pulled[:, own] + taxels.bulge(pressed), pressed[:, :, None]], axis=2)
 
@@ -218,10 +218,10 @@ def interpolation(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
     """Return a function that interpolates values at 1 kHz (time,) or (time, axis) to ``true_ns``."""
     rows = np.clip(np.searchsorted(scene.path.t_ns, true_ns, side="right"), 1, len(scene.path.t_ns) - 1)
     before_ns = scene.path.t_ns[rows - 1]
-    share = (true_ns - before_ns) / (scene.path.t_ns[rows] - before_ns)
+    fraction = (true_ns - before_ns) / (scene.path.t_ns[rows] - before_ns)
 
     def at(values: Floats) -> Floats:
-        weight = share if values.ndim == 1 else share[:, None]
+        weight = fraction if values.ndim == 1 else fraction[:, None]
         found: Floats = values[rows - 1] * (1 - weight) + values[rows] * weight
         return found
 

@@ -1,6 +1,6 @@
 """A pinch: how hard two fingers press on what lies between them, and where and how widely each touches it.
 
-What a camera and a planned grasp tell is the `Situation`; what they do not is `Unseen`. Each finger presses as hard as
+What a camera and a planned grasp state is the `Situation`; what they do not is `Unseen`. Each finger presses as hard as
 the torque of its joints allows, the less the wider the hand is open, or, on soft objects, as the object resists:
 F = min(F_max, k s), with k = 2 E R of a flat punch as wide as the tip (K. L. Johnson, *Contact Mechanics*, Cambridge
 1985, section 3.8) and s by how much fingers close beyond touch. The two forces differ by what the table's friction and
@@ -26,7 +26,7 @@ SKIN_PA = 1.0e6  # modulus of its skin, an assumption
 FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # that the joints hold at the least and at the widest opening, by finger
 OPENING_M = (0.02, 0.12)
 SQUEEZE_M = (0.008, 0.012)  # by which fingers close beyond touch
-COMMON = 0.8  # share of the logarithm of the effort that both fingers have in common
+COMMON = 0.8  # fraction of the logarithm of the effort that both fingers have in common
 CENTRE_M = (
     (0.0038, 0.0),
     (-0.0013, 0.0),
@@ -38,7 +38,7 @@ SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's po
 
 @dataclass(frozen=True)
 class Situation:
-    """What geometry tells of a grasp; fingers are middle finger and thumb, axes along and around the finger."""
+    """What geometry reports on a grasp; fingers are middle finger and thumb, axes along and around the finger."""
 
     opening_m: float
     curvatures_1_m: Floats  # (finger, 2), principal ones of the object at the contact
@@ -69,7 +69,7 @@ class Touch:
 
 
 def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation:
-    """Return what geometry tells of a grasp whose wrist is known; the middle finger is at ``g1``, the thumb at ``g2``."""
+    """Return what geometry reports on a grasp whose wrist is known; the middle finger is at ``g1``, the thumb at ``g2``."""
     assert grasp.wrist is not None
     at_m = np.stack([grasp.g1_m, grasp.g2_m])
     normal, bending = placed.normal(at_m), placed.bending(at_m)
@@ -97,8 +97,8 @@ def unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen
 
 def limits_n(opening_m: float) -> Floats:
     """Return the force that the joints' torque allows each finger (finger,), N: it falls with the opening."""
-    share = (opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
-    return np.array([narrow + share * (wide - narrow) for narrow, wide in FORCE_N])
+    fraction = (opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    return np.array([narrow + fraction * (wide - narrow) for narrow, wide in FORCE_N])
 
 
 def touch(of: Situation, hidden: Unseen) -> Touch:
@@ -127,8 +127,8 @@ def centre(of: Situation, hidden: Unseen) -> Floats:
     A round tip touches where its normal is the object's. Tips that are shifted by e over a surface of curvature k roll
     to where the normal leans by e k / (1 + k R).
     """
-    share = (of.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
-    lean = of.lean_rad + np.array([BEND_RAD * (2 * share - 1), 0.0]) + hidden.tilt_rad
+    fraction = (of.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    lean = of.lean_rad + np.array([BEND_RAD * (2 * fraction - 1), 0.0]) + hidden.tilt_rad
     lean = lean + hidden.shift_m * of.bending_1_m / (1 + of.bending_1_m * TIP_M)
     at = np.array(CENTRE_M) + TIP_M * lean
     at[:, 1, 1] += hidden.side_m

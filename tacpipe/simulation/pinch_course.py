@@ -1,4 +1,4 @@
-"""How a pinch goes on: fingers move freely, close until the force is reached, hold it, and let go."""
+"""How a pinch continues: fingers move freely, close until the force is reached, hold it, and let go."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the h
 
 @dataclass(frozen=True)
 class Course:
-    """When readings arrive (time,), and which share of the full force fingers press with then (time,)."""
+    """When readings arrive (time,), and which fraction of the full force fingers press with then (time,)."""
 
     t_ns: NDArray[np.int64]
-    share: NDArray[np.float64]
+    fraction: NDArray[np.float64]
     moments_ns: dict[str, int]  # contact: first touch; hold: the force is reached; release: it begins to fall
 
 
@@ -28,11 +28,11 @@ def course(start_ns: int, rng: np.random.Generator) -> Course:
     free_s, closing_s, held_s = (float(rng.uniform(*limits)) for limits in (FREE_S, CLOSING_S, HELD_S))
     knots_s = np.cumsum([free_s, closing_s, held_s, RELEASE_S])
     true_s = np.arange(round((knots_s[-1] + AFTER_S) * RATE_HZ)) / RATE_HZ
-    share = np.interp(true_s, knots_s, (0.0, 1.0, 1.0, 0.0))
+    fraction = np.interp(true_s, knots_s, (0.0, 1.0, 1.0, 0.0))
     true_ns = np.rint(true_s * 1e9).astype(np.int64)
     moments = zip(("contact", "hold", "release"), knots_s, strict=False)
     return Course(
         start_ns + faults.arrivals(true_ns, JITTER_NS, rng),
-        share**2 * (3 - 2 * share),  # without a jerk
+        fraction**2 * (3 - 2 * fraction),  # without a jerk
         {name: start_ns + round(1e9 * float(at_s)) for name, at_s in moments},
     )

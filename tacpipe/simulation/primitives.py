@@ -1,6 +1,6 @@
 """Bodies with surfaces known by formula: where a ray meets one, its outward normal, and how it bends there.
 
-Each body lies about its own origin, z being its axis. Bending is told by a symmetric matrix B (3, 3): the normal
+Each body lies about its own origin, z being its axis. Bending is given by a symmetric matrix B (3, 3): the normal
 curvature along a unit tangent v is v' B v, positive where the body is convex (M. do Carmo, *Differential Geometry of
 Curves and Surfaces*, section 3.2).
 """
@@ -65,7 +65,7 @@ def principal_curvatures(bending: Floats, normal: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Box:
-    """A box, told by half its edges (3,), metres."""
+    """A box, stated by half its edges (3,), metres."""
 
     half_m: Floats
 
@@ -106,7 +106,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """An ellipsoid, told by its semi-axes (3,), metres; a sphere if they are equal."""
+    """An ellipsoid, stated by its semi-axes (3,), metres; a sphere if they are equal."""
 
     semi_m: Floats
 

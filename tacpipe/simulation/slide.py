@@ -9,10 +9,10 @@ BioTac, as on the published rig:
 
 A slide of RoboSkin is 75 frames in contact, at a speed and over triangles that are not well controlled.
 
-Both sensors feel ``gain share [F (1 + mu d) + texture(x + xi) + offset]`` in each channel: xi is where the channel lies,
-``texture`` is what `tacpipe.simulation.texture` tells of the surface, and the offset is nuisance. It is in part one of
+Both sensors measure ``gain share [F (1 + mu d) + texture(x + xi) + offset]`` in each channel: xi is where the channel lies,
+``texture`` is what `tacpipe.simulation.texture` reports on the surface, and the offset is nuisance. It is in part one of
 the session, common to all trials of a material in it and drifting from trial to trial, as is a gain: where each
-material has one session, as in the published recordings, such a fingerprint tells the material without any texture.
+material has one session, as in the published recordings, such a fingerprint states the material without any texture.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SENSORS = ("biotac", "roboskin")
 SPECTRA = ("shared", "independent")
 START_NS = 1_581_000_000_000_000_000  # UTC stamp of the first trial's start
 TRIAL_NS = 60_000_000_000
-FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a share of it
+FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a fraction of it
 HOVER_S = (0.2, 0.4)  # before the finger touches
 APPROACH_M_S = 0.0005
 SLIDE_S, SHORT_SLIDE_S, SHORT_MATERIAL = 8.0, 6.0, 1  # one published material was recorded for less time
@@ -48,7 +48,7 @@ SESSION_GAIN, SESSION_N = 0.08, 0.07  # standard deviation between sessions: gai
 DRIFT_N, DRIFT_TRIALS = 0.04, 50  # by which an offset moves, over so many trials of a session
 TRIAL_N = 0.10  # standard deviation of each channel's offset from trial to trial
 ARM_HZ = 150.0
-ARM_GAP = 0.12  # share of the arm's readings after which the link is silent
+ARM_GAP = 0.12  # fraction of the arm's readings after which the link is silent
 ARM_GAP_S = 0.04
 SPEED_NOISE_M_S, SPIKE_M_S, SPIKES = 0.0006, 0.02, 0.01
 FORCE_NOISE_N, TORQUE_NOISE_NM = 0.15, 0.02
@@ -57,10 +57,11 @@ MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
 
 @dataclass(frozen=True)
 class Rig:
-    """Which materials are slid over, and how well the sensors tell; the fields are those of the stage's params.
+    """Which materials are slid over, and how well the sensors state; the fields are those of the stage's params.
 
-    Controls: with ``identical_materials`` nothing but the session tells one class from another, with ``session_scale=0``
-    nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in common.
+    Controls: with ``identical_materials`` nothing but the session distinguishes one class from another, with
+    ``session_scale=0`` nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in
+    common.
     """
 
     materials: int = 20
@@ -89,7 +90,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Scene:
-    """What truly happens in a trial when the sensor takes its samples; arrays are (time,) unless told otherwise."""
+    """What truly happens in a trial when the sensor takes its samples; arrays are (time,) unless stated otherwise."""
 
     place: Place
     of: texture.Material
@@ -112,7 +113,7 @@ def place(index: int, rig: Rig) -> Place:
 
 
 def material(seed: int, sensor: str, number: int, rig: Rig = Rig()) -> texture.Material:
-    """Return material ``number`` as ``sensor`` feels it: the same for both sensors where they share their spectra."""
+    """Return material ``number`` as ``sensor`` measures it: the same for both sensors where they share their spectra."""
     source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
     known = 0 if rig.identical_materials else number
     return texture.material(np.random.default_rng([seed, MATERIAL, source, known]))
@@ -156,12 +157,12 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
 
 
 def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
-    """Return what each channel feels in a trial (time, channel), counts without noise."""
+    """Return what each channel measures in a trial (time, channel), counts without noise."""
     gain, lean, along_m, aperture_m = sensitivity(scene)
-    felt_n = texture.felt(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
+    contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
     factor, offset_n = nuisance(seed, index, gain.shape[1], rig)
     pressed_n = scene.force_n[:, None] * (1 + scene.of.friction * lean)
-    found: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (felt_n + offset_n))
+    found: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (contact_n + offset_n))
     return found
 
 
@@ -171,7 +172,7 @@ def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
         shape = (len(scene.true_ns), schema.ELECTRODES)
         gain, lean = (np.broadcast_to(known, shape) for known in (fingertip.gains(), fingertip.leans()))
         return gain, lean, fingertip.ALONG_M, fingertip.APERTURE_M
-    gain = forearm.GAIN_COUNT_N * forearm.shares(scene.patch_m)
+    gain = forearm.GAIN_COUNT_N * forearm.fractions(scene.patch_m)
     return gain, forearm.leans(scene.patch_m), forearm.ALONG_M, forearm.APERTURE_M
 
 
@@ -228,11 +229,11 @@ def _rolled(
 ) -> Scene:
     """Return a slide of RoboSkin: in contact from first to last frame, at a speed that wanders."""
     at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
-    share = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
+    variation = float(np.clip(WANDER * rng.normal(), -MOST_WANDER, MOST_WANDER))
     period_s, phase = rng.uniform(*WANDER_S), rng.uniform(0, 2 * np.pi)
     turn = 2 * np.pi / period_s
-    speed = rig.roboskin_speed_m_s * (1 + share * np.sin(turn * at_s + phase))
-    way = rig.roboskin_speed_m_s * (at_s - share / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
+    speed = rig.roboskin_speed_m_s * (1 + variation * np.sin(turn * at_s + phase))
+    way = rig.roboskin_speed_m_s * (at_s - variation / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
     start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
     return Scene(
         which,
@@ -268,7 +269,9 @@ def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) ->
     if rig.pac:
         rows = np.arange(pac.size) / schema.VIBRATIONS
         at, contact = (np.interp(rows, np.arange(len(signal)), known) for known in (scene.position_m, scene.contact))
-        pac = fingertip.vibration(contact * texture.felt(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng)
+        pac = fingertip.vibration(
+            contact * texture.contact_force(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng
+        )
     return [tdc, tac, scene.pressure_count, *pac.T, *electrodes.T]
 
 

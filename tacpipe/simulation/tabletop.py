@@ -1,4 +1,4 @@
-"""What the camera sees before anything is cut out: a table, the object that is grasped, and another one beside it."""
+"""What the camera sees before anything is cut out: a table, the object that is grasped, and another one next to it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class View:
 def view(
     placed: Placed, other: Shape, up: Floats, camera_m: float, noise_scale: float, rng: np.random.Generator
 ) -> View:
-    """Return the camera's view of a body on the table, with a body ``other`` set down beside it."""
+    """Return the camera's view of a body on the table, with a body ``other`` set down next to it."""
     through = depth_camera.rays(range(depth_camera.HEIGHT), range(depth_camera.WIDTH))
     depth = _table(through, up, camera_m)
     surface = np.full(len(depth), TABLE, np.int8)
@@ -69,7 +69,7 @@ def _table(through: Floats, up: Floats, camera_m: float) -> Floats:
 
 
 def _beside(placed: Placed, other: Shape, up: Floats, camera_m: float, rng: np.random.Generator) -> Placed:
-    """Return a body put down beside another, where the camera sees all of it if there is such a place."""
+    """Return a body put down next to another, where the camera sees all of it if there is such a place."""
     rests = other.rests()
     rest = rests[int(rng.integers(len(rests)))]
     centre = placed.origin_m[:2] / placed.origin_m[2] * camera_m
@@ -79,7 +79,7 @@ def _beside(placed: Placed, other: Shape, up: Floats, camera_m: float, rng: np.r
         x, y = centre + (placed.shape.bound_m + other.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
         found = depth_camera.put(other, rest, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m)
         rows, columns = depth_camera.window(found)
-        seen = len(rows) and len(columns)  # it may lie beside the picture
+        seen = len(rows) and len(columns)  # it may lie next to the picture
         if seen and min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < depth_camera.HEIGHT:
             break
     assert found is not None

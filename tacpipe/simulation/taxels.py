@@ -6,7 +6,7 @@ to mu times its pressure, and what the capped ones cannot bear the others do. So
 pressure is least, and is complete where the object slips. The history of partial slip (Cattaneo and Mindlin) is left out.
 Pressure also bulges the skin outwards, by forces that add up to nothing.
 
-A count is ``base + C (f + q |f| f)`` with the neighbours' cross-talk, drift and noise, rounded; a share of the pressure
+A count is ``base + C (f + q |f| f)`` with the neighbours' cross-talk, drift and noise, rounded; a fraction of the pressure
 in f follows late (creep). C (axis, axis) is a matrix a taxel. Without drift and noise `forces` gives f back.
 
 Axes: a taxel's x is the hand's x, its y the hand's z, its z the pressure. Taxels are numbered row by row.
@@ -33,9 +33,9 @@ CENTRE_M = 0.003  # largest distance of its centre from the pad's, along either 
 TWIST_M_NM = 0.02  # by which a torque shifts it
 GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)  # x, y, z; with `BULGE` set for the spread of the published recordings
 OFF_AXIS = 0.05  # of a force that shows on the other axes
-QUADRATIC_N = 0.03  # q as a share of the gain, at one newton
+QUADRATIC_N = 0.03  # q as a fraction of the gain, at one newton
 CROSSTALK = 0.08  # of a taxel's signal that its four neighbours see
-CREEP, CREEP_S = 0.03, 0.5  # share of the pressure that follows late, and how late
+CREEP, CREEP_S = 0.03, 0.5  # fraction of the pressure that follows late, and how late
 BULGE = 0.4  # of a taxel's pressure that pushes it outwards, for each pitch that it is off the centre
 BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)  # at rest, as the published recordings have it
 BASE_SPREAD_COUNT = 300.0
@@ -61,16 +61,16 @@ def skin(rng: np.random.Generator) -> Skin:
     return Skin(centre, float(rng.uniform(*SIGMA_M)), mixing * np.array(GAIN_COUNT_N)[:, None], base)
 
 
-def shares(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
-    """Return the share of the normal force that each taxel bears (time, taxel); they add up to one.
+def fractions(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
+    """Return the fraction of the normal force that each taxel bears (time, taxel); they add up to one.
 
     ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it.
     """
     moved = one.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
     centre = PAD_M * np.tanh(moved / PAD_M)
     distance2 = ((PLACES_M - centre[:, None]) ** 2).sum(axis=2)
-    share = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * one.sigma_m**2))
-    whole: Floats = share / share.sum(axis=1, keepdims=True)
+    fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * one.sigma_m**2))
+    whole: Floats = fraction / fraction.sum(axis=1, keepdims=True)
     return whole
 
 

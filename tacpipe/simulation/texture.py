@@ -1,7 +1,7 @@
-"""Materials as a sliding finger feels them: three gratings over a fractal background, seen through an aperture.
+"""Materials as a sliding finger measures them: three gratings over a fractal background, seen through an aperture.
 
-A surface is one-dimensional, along the way of the slide, and is told in newton: what it adds to the pressure on the
-skin. Skin does not feel a point but a Gaussian neighbourhood of it, so that a wave of length lambda keeps the share
+A surface is one-dimensional, along the way of the slide, and is given in newton: what it adds to the pressure on the
+skin. Skin does not measure a point but a Gaussian neighbourhood of it, so that a wave of length lambda keeps the share
 ``exp(-2 (pi sigma / lambda)^2)`` of its amplitude. As all waves are sines, that is exact.
 
 The same material under two unlike sensors: the spectrum over wave numbers is the same up to the aperture, and speed turns
@@ -20,11 +20,14 @@ Floats = NDArray[np.float64]
 
 GRATINGS = 3
 WAVELENGTH_M = (0.0025, 0.014)
-BACKGROUND_M = (0.0015, 0.040)  # wavelengths of the background; longer ones would be slope, shorter ones nobody feels
+BACKGROUND_M = (
+    0.0015,
+    0.040,
+)  # wavelengths of the background; longer ones would be slope, shorter ones nobody measures
 ROUGHNESS_N = (0.15, 0.35)  # standard deviation of all that a surface adds
 AMPLITUDE = (0.15, 1.0)  # of one grating over that of the others
 EXPONENT = (0.8, 1.8)  # of the background: its power falls with the wave number to this power
-BACKGROUND = (0.05, 0.25)  # its share of the variance
+BACKGROUND = (0.05, 0.25)  # its fraction of the variance
 FRICTION = (0.3, 0.9)
 STIFFNESS_N_M = (1000.0, 4000.0)
 WEAR = 0.2  # standard deviation of the logarithm of a grating's amplitude from trial to trial
@@ -56,13 +59,13 @@ class Waves:
 
 def material(rng: np.random.Generator) -> Material:
     """Return a random material."""
-    share, roughness = rng.uniform(*BACKGROUND), rng.uniform(*ROUGHNESS_N)
+    fraction, roughness = rng.uniform(*BACKGROUND), rng.uniform(*ROUGHNESS_N)
     amplitude = rng.uniform(*AMPLITUDE, GRATINGS)
-    amplitude *= roughness * np.sqrt((1 - share) / (amplitude**2 / 2).sum())
+    amplitude *= roughness * np.sqrt((1 - fraction) / (amplitude**2 / 2).sum())
     return Material(
         wavelength_m=rng.uniform(*WAVELENGTH_M, GRATINGS),
         amplitude_n=amplitude,
-        background_n=float(roughness * np.sqrt(share)),
+        background_n=float(roughness * np.sqrt(fraction)),
         exponent=float(rng.uniform(*EXPONENT)),
         friction=float(rng.uniform(*FRICTION)),
         stiffness_n_m=float(rng.uniform(*STIFFNESS_N_M)),
@@ -83,17 +86,17 @@ def track(of: Material, rng: np.random.Generator) -> Waves:
 
 
 def passed(number_per_m: Floats, aperture_m: float) -> Floats:
-    """Return the share of a wave's amplitude that a Gaussian aperture lets through, of the shape of ``number_per_m``.
+    """Return the fraction of a wave's amplitude that a Gaussian aperture lets through, of the shape of ``number_per_m``.
 
     >>> passed(np.array([0.0, 125.0, 250.0]), 0.0018).round(3).tolist()
     [1.0, 0.368, 0.018]
     """
-    share: Floats = np.exp(-2 * (np.pi * aperture_m * number_per_m) ** 2)
-    return share
+    fraction: Floats = np.exp(-2 * (np.pi * aperture_m * number_per_m) ** 2)
+    return fraction
 
 
-def felt(surface: Waves, position_m: Floats, aperture_m: float) -> Floats:
-    """Return what is felt of a surface at ``position_m`` (any shape), N, of the same shape."""
+def contact_force(surface: Waves, position_m: Floats, aperture_m: float) -> Floats:
+    """Return what is measured of a surface at ``position_m`` (any shape), N, of the same shape."""
     low, high = float(position_m.min()), float(position_m.max())
     grid = low + GRID_M * np.arange(int((high - low) / GRID_M) + 2)
     amplitude = surface.amplitude_n * passed(surface.number_per_m, aperture_m)
@@ -104,10 +107,10 @@ def felt(surface: Waves, position_m: Floats, aperture_m: float) -> Floats:
 
 
 def spectrum(of: Material, aperture_m: float, parts: int = 400) -> tuple[Floats, Floats]:
-    """Return wave numbers, per m, and the expected power at each, N^2, of a material felt through an aperture.
+    """Return wave numbers, per m, and the expected power at each, N^2, of a material measured through an aperture.
 
     The gratings come first, then ``parts`` pieces of the background; both arrays are (grating + part,). The powers add
-    up to the variance of what is felt.
+    up to the variance of what is measured.
     """
     edges = _edges(parts)
     number = np.concatenate([1 / of.wavelength_m, np.sqrt(edges[:-1] * edges[1:])])

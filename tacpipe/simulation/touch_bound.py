@@ -33,8 +33,8 @@ def readings(
 
     Channels are the electrodes, then the pressure; times of drift are drawn too.
     """
-    felt = pinch.touch(of, pinch.unseen(rng, draws, effort_spread))
-    shown = fingertip_sp.signal(made, felt.force_n, felt.contact_m, felt.skin_m, felt.centre_m)
+    contact = pinch.touch(of, pinch.unseen(rng, draws, effort_spread))
+    shown = fingertip_sp.signal(made, contact.force_n, contact.contact_m, contact.skin_m, contact.centre_m)
     phases = rng.uniform(0, 2 * np.pi, (draws, *made.phases_rad.shape))
     off = fingertip_sp.drift(phases, drift_count_day) + noise_scale * made.noise * rng.normal(size=shown.shape)
     return fingertip_sp.counted(shown + off)

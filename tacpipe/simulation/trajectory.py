@@ -121,9 +121,9 @@ def kinaesthetic(rows: int, first: int, rng: np.random.Generator) -> Floats:
 
 
 def minimum_jerk(progress: Floats) -> Floats:
-    """Return the share of the way that a minimum-jerk movement has covered when ``progress`` of its time is over."""
-    share: Floats = progress**3 * (10 - 15 * progress + 6 * progress**2)
-    return share
+    """Return the fraction of the way that a minimum-jerk movement has covered when ``progress`` of its time is over."""
+    fraction: Floats = progress**3 * (10 - 15 * progress + 6 * progress**2)
+    return fraction
 
 
 def smooth(acceleration: Floats) -> Floats:

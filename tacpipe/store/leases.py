@@ -23,7 +23,7 @@ from tacpipe.io.files import read_json, readable_errors, write_all
 from tacpipe.store import layout
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
-TELL_AFTER_S = 2.0  # a shorter wait is no news
+REPORT_AFTER_S = 2.0  # a shorter wait is not news
 LEASE_BYTES = 1 << 30  # the largest lease that is read: it names 16 million objects
 _POLL_S = 0.02
 _UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts where the file system has no locks
@@ -32,7 +32,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 @dataclass
 class Run:
-    """A process at work on a store, as it told in its lease."""
+    """A process at work on a store, as it stated in its lease."""
 
     path: Path
     note: dict[str, Any]
@@ -54,8 +54,8 @@ class Leases:
     def hold(self, key: str, what: str = "", timeout_s: float | None = None) -> Iterator[None]:
         """Hold the key alone while in the block, so that two processes do not make ``what`` both.
 
-        The kernel frees the lease of a process that dies. Who is waited for is told on stderr. Raises `LockedError` after
-        ``timeout_s``.
+        The kernel frees the lease of a process that dies. Who is waited for is reported on stderr. Raises `LockedError`
+        after ``timeout_s``.
         """
         path = self.folder / f"{key}.lock"
         handle = _try_lock(path)
@@ -71,7 +71,7 @@ class Leases:
 
     @contextlib.contextmanager
     def running(self, manifests: Iterable[str] = ()) -> Iterator[Announcing]:
-        """Tell ``gc`` while in the block that a run reads these manifests; yield what it announces objects with."""
+        """Announce to ``gc`` while in the block that a run reads these manifests; yield what it announces objects with."""
         path = self.folder / f"run-{uuid.uuid4().hex}.lock"
         handle = None
         while handle is None:  # gc may look at the file between its creation and the lock
@@ -88,7 +88,7 @@ class Leases:
     def runs(self) -> list[Run]:
         """Return the running processes with what they announced so far; forget dead ones.
 
-        A run that began and told nothing yet has made no use of anything yet.
+        A run that began and stated nothing yet has made no use of anything yet.
         """
         found = []
         for path in self._files():
@@ -97,10 +97,10 @@ class Leases:
             try:
                 handle = _try_lock(path, create=False)
                 if handle is None:
-                    found.append(_told(path))
+                    found.append(_parsed(path))
                     continue
                 if not _has_locks(handle) and _seems_alive(path):
-                    found.append(_told(path))
+                    found.append(_parsed(path))
                 else:
                     path.unlink(missing_ok=True)
                 os.close(handle)
@@ -137,7 +137,7 @@ class Leases:
 
 
 class Announcing:
-    """Where the processes of one run tell which objects they use, before they look whether these are there.
+    """Where the processes of one run state which objects they use, before they look whether these are there.
 
     Whoever collects garbage moves objects away first and reads the announcements then: so of the two one sees the other.
     """
@@ -145,11 +145,11 @@ class Announcing:
     def __init__(self, path: Path | str) -> None:
         self.path = str(path)
         self._handle = -1
-        self._told: set[str] = set()
+        self._parsed: set[str] = set()
 
     def announce(self, names: Iterable[str]) -> None:
-        """Tell that objects are used. Raises `TacpipeError` if the process that began the run is gone."""
-        new = [name for name in names if name not in self._told]
+        """Announce that objects are used. Raises `TacpipeError` if the process that began the run is gone."""
+        new = [name for name in names if name not in self._parsed]
         if not new:
             return
         with readable_errors(Path(self.path).parent):
@@ -159,7 +159,7 @@ class Announcing:
                 except FileNotFoundError:
                     raise TacpipeError("The process that began this run is gone; nothing more is written.") from None
             write_all(self._handle, "".join(f"{name}\n" for name in new).encode())
-        self._told.update(new)
+        self._parsed.update(new)
 
     def close(self) -> None:
         """Announce nothing more."""
@@ -176,7 +176,7 @@ def _release(path: Path, handle: int) -> None:
         os.close(handle)
 
 
-def _told(path: Path) -> Run:
+def _parsed(path: Path) -> Run:
     first, _, rest = regular.content(path, LEASE_BYTES, follow=False).decode("latin-1").partition("\n")
     try:
         note = json.loads(first)
@@ -186,7 +186,7 @@ def _told(path: Path) -> Run:
 
 
 def _note(**more: Any) -> bytes:
-    """Return what a lease says of who holds it."""
+    """Return what a lease states of who holds it."""
     command = shlex.join(["tacpipe", *sys.argv[1:]])
     value = {"host": platform.node(), "pid": os.getpid(), "command": command[:500], "since_s": int(time.time()), **more}
     return json.dumps(value).encode()
@@ -201,9 +201,9 @@ def _timeout_s() -> float:
 
 
 def _wait(path: Path, what: str, timeout_s: float) -> int:
-    """Return the handle once the lock is free; tell on stderr who is waited for."""
+    """Return the handle once the lock is free; state on stderr who is waited for."""
     began_s = time.monotonic()
-    told = False
+    reported = False
     while True:
         waited_s = time.monotonic() - began_s
         if waited_s >= timeout_s:
@@ -211,9 +211,9 @@ def _wait(path: Path, what: str, timeout_s: float) -> int:
                 f"{_holder(path)} has held {what} for over {timeout_s:g} s. Wait for it or stop it; "
                 f"TACPIPE_LOCK_TIMEOUT_S sets how long to wait."
             )
-        if not told and waited_s >= TELL_AFTER_S:
-            told = True
-            progress.say(f"waiting for {_holder(path, 'another process')}, which is at work on {what}.")
+        if not reported and waited_s >= REPORT_AFTER_S:
+            reported = True
+            progress.report(f"waiting for {_holder(path, 'another process')}, which is at work on {what}.")
         time.sleep(_POLL_S)
         handle = _try_lock(path)
         if handle is not None:
@@ -225,7 +225,7 @@ def _holder(path: Path, unknown: str = "Another process") -> str:
     note = read_json(path)
     if not note or "pid" not in note:
         return unknown
-    stopped = ", which is stopped: `kill -CONT` lets it go on," if _stopped(note) else ""
+    stopped = ", which is stopped: `kill -CONT` lets it continue," if _stopped(note) else ""
     prefix = "process" if unknown[0].islower() else "Process"
     return f"{prefix} {note['pid']} on {note.get('host')} ({note.get('command')}){stopped}"
 
@@ -241,7 +241,7 @@ def _stopped(note: dict[str, Any]) -> bool:
 
 def _seems_alive(path: Path) -> bool:
     """Return whether a run may be at work on a file system that knows no locks."""
-    note = _told(path).note
+    note = _parsed(path).note
     if note.get("host") == platform.node() and "pid" in note:
         try:
             os.kill(note["pid"], 0)

@@ -22,7 +22,7 @@ _NAME_LETTERS = 60
 
 @dataclass(frozen=True)
 class Project:
-    """What tells a project from all others, and what people call it: its folder's name."""
+    """What distinguishes a project from all others, and what people call it: its folder's name."""
 
     id: str  # hex digits
     name: str

@@ -16,10 +16,10 @@ from tacpipe.io.hashing import DIGEST, digest
 if TYPE_CHECKING:
     from tacpipe.store.store import Store
 
-BESIDE_NAME = ".tacpipe"  # of a store that lies beside its project
+BESIDE_NAME = ".tacpipe"  # of a store that lies next to its project
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
 # {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach. "pushed" are
-# manifests of this path that went to other stores, newest first; of what was pushed here, "project" says whose it is
+# manifests of this path that went to other stores, newest first; of what was pushed here, "project" states whose it is
 Root = dict[str, Any]
 ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
 HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
@@ -84,7 +84,7 @@ class Roots:
                     file.unlink(missing_ok=True)
 
     def write(self, root: Mapping[str, Any]) -> None:
-        """Replace a root, as `all` gave it or with more to say."""
+        """Replace a root, as `all` gave it or with more to state."""
         kind, name = root["kind"], str(root["path"])
         if kind == BESIDE and Path(name).is_absolute():
             name = os.path.relpath(name, self.store.root.parent)
@@ -114,16 +114,16 @@ class Roots:
         return {**root, "path": str(self.store.root.parent / root["path"])} if beside else root
 
     def damaged(self) -> list[str]:
-        """Return the names of roots that were damaged and not written anew: nobody knows which datasets they stood for."""
+        """Return the names of roots that were damaged and not written anew: nobody knows which datasets they represented."""
         names = {path.name[len("root-") :].partition(".")[0] for path in self.store.listed("quarantine", "root-*")}
         return sorted(name for name in names if not (self.store.root / "roots" / f"{name}.json").exists())
 
     def is_of(self, name: str, path: Path) -> bool:
-        """Return whether the root of this name stands for the dataset at ``path``."""
+        """Return whether the root of this name represents the dataset at ``path``."""
         return self._file(*self.named(path)).stem == name
 
     def named(self, path: Path) -> tuple[str, str]:
-        """Return kind and name of a root: relative where the dataset lies beside its store, so that both can move."""
+        """Return kind and name of a root: relative where the dataset lies next to its store, so that both can move."""
         beside = self.store.root.parent
         if self.store.root.name == BESIDE_NAME and path.is_relative_to(beside):
             return BESIDE, str(path.relative_to(beside))
@@ -140,7 +140,7 @@ def project_id(root: Mapping[str, Any]) -> str:
 
 
 def _succeeding(known: Root | None, manifest: str, *, lasting: bool) -> Root:
-    """Return what a root says of ``manifest`` and of those before it, the newest of which is that of ``known``."""
+    """Return what a root states of ``manifest`` and of those before it, the newest of which is that of ``known``."""
     history = [] if known is None else _history(known, manifest, lasting=lasting)
     previous = None if known is None else known["manifest"]
     return {"manifest": manifest, "previous": previous, "written_s": int(time.time()), "history": history}

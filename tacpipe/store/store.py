@@ -28,12 +28,12 @@ class MissingError(DamagedError):
 
 
 class AbsentError(MissingError):
-    """An object or a record is not in the store, which is no sign of damage: it may have been collected."""
+    """An object or a record is not in the store, which is not a sign of damage: it may have been collected."""
 
 
 @dataclass(frozen=True)
 class Object:
-    """What a manifest says of stored content."""
+    """What a manifest states of stored content."""
 
     digest: str
     bytes: int
@@ -57,10 +57,12 @@ class Store:
     def object_path(self, name: str) -> str:
         """Return where the object ``name`` lies, whether or not it is there.
 
-        Raises `DamagedError` for a name that is no digest: it would lead out of the store.
+        Raises `DamagedError` for a name that is not a digest: it would lead out of the store.
         """
         if not DIGEST.fullmatch(name):
-            raise DamagedError(f"{name[:80]!r} is no digest (64 hex digits): what names it is damaged or was made up.")
+            raise DamagedError(
+                f"{name[:80]!r} is not a digest (64 hex digits): what names it is damaged or was made up."
+            )
         return f"{self._root}/objects/{name[:2]}/{name}"
 
     def record_path(self, key: str) -> str:
@@ -99,7 +101,7 @@ class Store:
 
     @property
     def run(self) -> str:
-        """The lease of the run at work, for the processes that work for it; empty where nobody said so."""
+        """The lease of the run at work, for the processes that work for it; empty where nobody stated so."""
         return "" if self._run is None else self._run.path
 
     def announce(self, names: Iterable[str]) -> None:
@@ -126,7 +128,7 @@ class Store:
         """Store ``content`` and return its digest and size.
 
         An object that is there already is kept, after a look at its size: a damaged one is found on reading. What cannot
-        be made again is ``durable``: the folders above it are synced too, and a copy that is there already is read and
+        be recomputed is ``durable``: the folders above it are synced too, and a copy that is there already is read and
         replaced if it is damaged.
         """
         name = bytes_digest(content)
@@ -191,7 +193,7 @@ class Store:
         return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
 
     def _unreadable(self, name: str, error: Exception) -> MissingError:
-        """Return what to say of an object that cannot be read; what is not a regular file is moved to quarantine."""
+        """Return what to state of an object that cannot be read; what is not a regular file is moved to quarantine."""
         with contextlib.suppress(TacpipeError):
             self.has(name)
         why = (error.strerror if isinstance(error, OSError) else None) or str(error)
@@ -218,7 +220,7 @@ class Store:
         return True
 
     def quarantined(self, name: str) -> bool:
-        """Return whether an object of this digest was damaged, lies in quarantine, and was not made again."""
+        """Return whether an object of this digest was damaged, lies in quarantine, and was not recomputed."""
         return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
 
     def aside(self, name: str) -> str:
@@ -286,7 +288,7 @@ class Store:
                 return record
         except FileNotFoundError:
             raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
-        except StorageError:  # the disk failed, which says nothing of the record
+        except StorageError:  # the disk failed, which states nothing of the record
             raise
         except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
             pass
@@ -345,7 +347,7 @@ def _most(size: int) -> int:
 
 
 def locate(start: Path | None = None) -> Store:
-    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` beside the project that ``start`` lies in.
+    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` next to the project that ``start`` lies in.
 
     Raises `UsageError` where something else lies there, as `layout.check` does.
     """

@@ -69,8 +69,8 @@ def log_likelihoods(seed: int, index: int, rig: slide.Rig) -> Floats:
     for one in range(1, rig.materials + 1):
         wave, power = texture.spectrum(slide.material(seed, sensor, one, rig), aperture_m)
         apart = np.rint((number[kept, None] - wave) * FINE * size * STEP_M).astype(int) % len(window)
-        felt = window[apart] @ power / 2 + MISFIT * power.sum()
-        expected = np.outer(np.square(GAINS), felt) + floor  # (gain, wave number)
+        passed = window[apart] @ power / 2 + MISFIT * power.sum()
+        expected = np.outer(np.square(GAINS), passed) + floor  # (gain, wave number)
         found.append(-(np.log(expected) + observed / expected).sum(axis=1).min() / 2)
     return np.array(found)
 
@@ -103,7 +103,7 @@ def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
     total, summed, enough = total[span], summed[span], enough[span]
     whole = np.where(enough, total, 1.0)
     taper = np.hanning(len(whole) + 2)[1:-1] * enough
-    felt_n = np.where(enough, summed / whole, 0.0)
-    felt_n -= (taper * felt_n).sum() / taper.sum()
+    contact_n = np.where(enough, summed / whole, 0.0)
+    contact_n -= (taper * contact_n).sum() / taper.sum()
     noise_n2 = ((rig.noise_scale * noise) ** 2 + rounding) / whole
-    return Track(felt_n, noise_n2, taper / np.sqrt((taper**2).sum()))
+    return Track(contact_n, noise_n2, taper / np.sqrt((taper**2).sum()))

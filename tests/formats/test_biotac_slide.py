@@ -129,7 +129,7 @@ def test_slides_are_found_at_any_depth_with_the_streams_of_the_arm_that_are_ther
 def test_a_folder_without_slides_and_a_slide_that_is_there_twice_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="holds no slide: no file in it is named"):
         discover(Params(), tmp_path)
-    with pytest.raises(TacpipeError, match="is no folder"):
+    with pytest.raises(TacpipeError, match="is not a folder"):
         discover(Params(), write_biotac(tmp_path / "a"))
     write_biotac(tmp_path / "b")
     with pytest.raises(TacpipeError, match="are the same slide"):

@@ -148,7 +148,7 @@ def test_files_that_are_missing_doubled_or_damaged_are_told(tmp_path: Path) -> N
     with pytest.raises(TacpipeError, match="holds no block of slides"):
         discover(Params(), tmp_path)
     path = write_roboskin(tmp_path, felt(1))
-    with pytest.raises(TacpipeError, match="is no folder"):
+    with pytest.raises(TacpipeError, match="is not a folder"):
         discover(Params(), path)
     np.save(tmp_path / "icub_val_0.npy", felt(1))
     with pytest.raises(TacpipeError, match="are the same block"):

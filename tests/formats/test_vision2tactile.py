@@ -136,11 +136,14 @@ def test_a_hit_of_an_ingest_of_grasps_imports_nothing_heavy(tmp_path: Path) -> N
         (",".join(["7"] * 59), "there are 59 fields with '7' as the first one"),
         (",".join(["7"] * 58), "there are 58 fields with '7' as the first one"),
         ("," + ",".join(["7"] * 58) + "\n," + ",".join(["8"] * 58), "has 2 rows; a grasp has one reading"),
-        ("," + ",".join(["7"] * 57 + ["4096"]), "row 1, field 59: '4096' is no count; .* from 0 to 4095"),
-        ("," + ",".join(["-1"] + ["7"] * 57), "row 1, field 2: '-1' is no count"),
-        ("," + ",".join(["7"] * 9 + ["20.5"] + ["7"] * 48), "row 1, field 11: '20.5' is no count; it must be a whole"),
-        ("," + ",".join(["7"] * 57 + [""]), "row 1, field 59: '' is no count"),
-        ("," + ",".join(["nan"] * 58), "'nan' is no count"),
+        ("," + ",".join(["7"] * 57 + ["4096"]), "row 1, field 59: '4096' is not a count; .* from 0 to 4095"),
+        ("," + ",".join(["-1"] + ["7"] * 57), "row 1, field 2: '-1' is not a count"),
+        (
+            "," + ",".join(["7"] * 9 + ["20.5"] + ["7"] * 48),
+            "row 1, field 11: '20.5' is not a count; it must be a whole",
+        ),
+        ("," + ",".join(["7"] * 57 + [""]), "row 1, field 59: '' is not a count"),
+        ("," + ",".join(["nan"] * 58), "'nan' is not a count"),
         ("," + ",".join(["7"] * 57 + ["٣"]), "cannot be read as text"),
     ],
 )
@@ -206,7 +209,7 @@ def test_folders_and_files_that_are_missing_doubled_or_misnamed_are_told(tmp_pat
     with pytest.raises(TacpipeError, match=r"cloud-object\.pcd"):
         discover(Params(), tmp_path)
     folder = write_grasp(tmp_path / "set")
-    with pytest.raises(TacpipeError, match="is no folder"):
+    with pytest.raises(TacpipeError, match="is not a folder"):
         discover(Params(), folder / "tactile.tac")
     for name in ("cloud-object.pcd", "tactile.tac"):
         content = (folder / name).read_bytes()

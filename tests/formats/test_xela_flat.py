@@ -103,7 +103,7 @@ def test_a_trial_folder_may_itself_be_the_source(flat_trial: Trial) -> None:
 def test_a_source_without_trials_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="holds no trial"):
         discover(Params(), tmp_path)
-    with pytest.raises(TacpipeError, match="is no folder"):
+    with pytest.raises(TacpipeError, match="is not a folder"):
         discover(Params(), tmp_path / "absent")
 
 

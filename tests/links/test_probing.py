@@ -81,7 +81,7 @@ def played(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[byte
 def test_a_device_that_streams_is_found_at_its_rate_of_baud_without_a_word_to_it() -> None:
     steps: list[str] = []
     with played(*flexitac()) as (path, heard):
-        report = probing.probe(parse(f"serial:{path}"), tell=steps.append)
+        report = probing.probe(parse(f"serial:{path}"), progress=steps.append)
 
     first = report.findings[0]
     assert (first.name, dict(first.candidate.options)) == ("flexitac", {"rows": 16, "columns": 16})

@@ -58,7 +58,7 @@ def read(params: Read, files: Files) -> RecordingOutput:
     try:
         values = [int(line) for line in path.read_text().split()]
     except ValueError as error:
-        raise TacpipeError(f"{path} holds {error.args[0].rpartition(':')[2].strip()}, which is no number.") from None
+        raise TacpipeError(f"{path} holds {error.args[0].rpartition(':')[2].strip()}, which is not a number.") from None
     return RecordingOutput({"left": pa.table({"x": pa.array(values, pa.uint16())})})
 
 

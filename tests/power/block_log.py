@@ -32,7 +32,7 @@ def read(path: Path) -> list[Entry]:
     """Return the entries of a log."""
     with path.open("rb") as log:
         magic, _, count, sector_bytes = _SUPER.unpack(log.read(_SUPER.size))
-        assert magic == MAGIC, f"{path} is no log of dm-log-writes"
+        assert magic == MAGIC, f"{path} is not a log of dm-log-writes"
         found, place = [], sector_bytes
         for _ in range(count):
             log.seek(place)

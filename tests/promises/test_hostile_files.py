@@ -98,7 +98,7 @@ def test_a_page_that_claims_to_unpack_to_gigabytes_is_held_against_the_memory(
     assert told in footer_of(content)
     bomb = with_footer(bomb, footer_of(content).replace(told, b"\x16" + varint(_size(content) + shift)))
     monkeypatch.setattr(memory, "available", lambda: 10**8)
-    refused(lambda: from_parquet(bomb), "claims to be", DamagedError)
+    refused(lambda: from_parquet(bomb), "declares", DamagedError)
 
 
 def _size(content: bytes) -> int:
@@ -121,7 +121,7 @@ def bomb() -> bytes:
 
 def test_a_file_that_unpacks_to_more_than_the_memory_is_refused_before_it_is_unpacked(bomb: bytes) -> None:
     assert len(bomb) < 800_000
-    refused(lambda: from_parquet(bomb), r"claims to be 0\.6 GB of data.*do not trust it", DamagedError)
+    refused(lambda: from_parquet(bomb), r"declares 0\.6 GB of data.*do not use it", DamagedError)
 
 
 def test_a_long_recording_that_held_still_is_read_where_there_is_memory_for_it(bomb: bytes) -> None:
@@ -143,7 +143,7 @@ def test_texts_that_stand_for_a_million_long_ones_are_refused(encoding: str) -> 
             for _ in range(8):
                 writer.write_table(short)
     assert len(sink.getvalue()) < 40_000_000
-    refused(lambda: from_parquet(sink.getvalue()), "claims to be", DamagedError)
+    refused(lambda: from_parquet(sink.getvalue()), "declares", DamagedError)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_sizes_of_compressed_points_that_lie_are_refused(
     tmp_path: Path, packed: int, unpacked: int, points: int
 ) -> None:
     head = f"{PCD}WIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA binary_compressed\n".encode()
-    refused(cloud(tmp_path, "a.pcd", head + struct.pack("<II", packed, unpacked) + bytes(5)), r"a\.pcd tells")
+    refused(cloud(tmp_path, "a.pcd", head + struct.pack("<II", packed, unpacked) + bytes(5)), r"a\.pcd declares")
 
 
 @pytest.mark.parametrize("points", ["1000000000000", "-5", "1e9", "9" * 5000, ""])

@@ -228,4 +228,4 @@ def test_every_stream_that_is_wrong_has_a_sentence(lab: Lab, served: Emulator, t
     )
 
     assert [line.split()[1] for line in told] == ["one", "two", "three"]
-    assert f"{tmp_path} is no serial port" in told[2]
+    assert f"{tmp_path} is not a serial port" in told[2]

@@ -55,7 +55,7 @@ def sent(case: str, count: int, seed: int = 0) -> Sent:
     frames = sensor.encode(samples)
     rows = made.rows(understood(sensor, frames))
     numbers = {row: number for number, row in enumerate(rows)}
-    assert len(numbers) == len(rows) == count, "two samples are the same, and cannot be told apart"
+    assert len(numbers) == len(rows) == count, "two samples are the same, and cannot be distinguished"
     return Sent(sensor, samples, frames, made.pieces(sensor, frames), numbers)
 
 

@@ -75,14 +75,14 @@ def test_phases_are_minus_one_before_zero_within_and_one_behind() -> None:
 
 def test_a_slide_is_told_by_its_mean_pressure_and_force_and_its_median_speed() -> None:
     profile = {"speed_m_s": np.array([0.02, 0.025, 0.1]), "force_n": np.array([1.0, 2.0, 6.0])}
-    assert slides.told(np.array([1, 2, 4]), profile) == {
+    assert slides.measured(np.array([1, 2, 4]), profile) == {
         "pressure_mean_count": 2.333,
         "speed_m_s": 0.025,
         "force_n": 3.0,
     }
-    assert slides.told(np.array([1, 2, 3]), {}) == {"pressure_mean_count": 2.0}
+    assert slides.measured(np.array([1, 2, 3]), {}) == {"pressure_mean_count": 2.0}
     profile["force_n"][1] = np.nan
-    assert "force_n" not in slides.told(np.array([1, 2, 4]), profile)
+    assert "force_n" not in slides.measured(np.array([1, 2, 4]), profile)
 
 
 @pytest.mark.parametrize(

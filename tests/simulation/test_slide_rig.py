@@ -82,7 +82,7 @@ def peak(sensor: str, number: int, rig: Rig) -> tuple[float, float]:
         if sensor == "roboskin":  # what the patch does as it moves on is known, and taken off
             truth = simulate_trial(0, index, rig).streams["truth"]
             patch = np.column_stack([column(truth, f"gt_patch_{axis}_m") for axis in ("along", "across")])
-            share = forearm.shares(patch)
+            share = forearm.fractions(patch)
             counts = ((counts + forearm.DEAD_COUNT) / share)[:, (share > 0.3).all(axis=0)]
         at = np.linspace(-1, 1, len(counts))
         counts = counts - polynomial.polyval(at, polynomial.polyfit(at, counts, 3)).T

@@ -16,14 +16,14 @@ def one() -> taxels.Skin:
 
 def test_the_shares_of_the_pressure_add_up_to_one_wherever_the_object_is() -> None:
     displacement = RNG.uniform(-0.3, 0.3, (50, 2))
-    share = taxels.shares(one(), displacement, RNG.uniform(-1, 1, 50))
+    share = taxels.fractions(one(), displacement, RNG.uniform(-1, 1, 50))
     np.testing.assert_allclose(share.sum(axis=1), 1.0)
     assert (share >= 0).all()
 
 
 def test_an_object_that_slips_down_takes_the_pressure_with_it() -> None:
     displacement = np.column_stack([np.zeros(3), [0.0, -0.002, -0.020]])
-    centre = taxels.shares(one(), displacement, np.zeros(3)) @ taxels.PLACES_M
+    centre = taxels.fractions(one(), displacement, np.zeros(3)) @ taxels.PLACES_M
     assert (np.diff(centre[:, 1]) < -0.0005).all()
     np.testing.assert_allclose(centre[:, 0], centre[0, 0], atol=1e-9)
 

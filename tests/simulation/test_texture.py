@@ -34,7 +34,7 @@ def test_an_aperture_is_the_convolution_with_a_gaussian(sigma_m: float, waveleng
     reach = np.linspace(-6, 6, 4001) * sigma_m
     bell = np.exp(-(reach**2) / (2 * sigma_m**2))
     expected = (bell * 0.3 * np.cos(2 * np.pi * (0.05 + reach) / wavelength_m + phase)).sum() / bell.sum()
-    assert texture.felt(wave, np.array([0.05]), sigma_m)[0] == pytest.approx(expected, abs=1e-3)
+    assert texture.contact_force(wave, np.array([0.05]), sigma_m)[0] == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("sigma_m", [0.0006, 0.0018])
@@ -42,7 +42,7 @@ def test_the_power_that_is_felt_over_many_tracks_is_that_of_the_spectrum(sigma_m
     of = one(3)
     rng = np.random.default_rng(0)
     at_m = np.arange(0, 0.3, 0.0005)
-    power = [np.mean(texture.felt(texture.track(of, rng), at_m, sigma_m) ** 2) for _ in range(100)]
+    power = [np.mean(texture.contact_force(texture.track(of, rng), at_m, sigma_m) ** 2) for _ in range(100)]
     _, expected = texture.spectrum(of, sigma_m)
     worn = np.exp(2 * texture.WEAR**2)  # mean square of what is log-normal
     assert np.mean(power) == pytest.approx(expected[:3].sum() * worn + expected[3:].sum(), rel=0.12)
@@ -61,8 +61,8 @@ def test_the_power_of_a_background_falls_with_the_wave_number_to_the_exponent() 
 def test_two_tracks_of_a_material_differ_and_the_same_numbers_give_the_same_track() -> None:
     at_m = np.arange(0, 0.1, 0.001)
     rng = np.random.default_rng(7)
-    first, second = (texture.felt(texture.track(one(), rng), at_m, 0.0006) for _ in range(2))
-    again = texture.felt(texture.track(one(), np.random.default_rng(7)), at_m, 0.0006)
+    first, second = (texture.contact_force(texture.track(one(), rng), at_m, 0.0006) for _ in range(2))
+    again = texture.contact_force(texture.track(one(), np.random.default_rng(7)), at_m, 0.0006)
     assert np.abs(first - second).mean() > 0.1 * first.std()
     np.testing.assert_array_equal(first, again)
 

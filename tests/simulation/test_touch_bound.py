@@ -9,7 +9,7 @@ import pytest
 
 from tacpipe.simulation import fingertip_sp, pinch, touch_bound
 from tacpipe.simulation.grasp import stamp_ns
-from tacpipe.simulation.grasp_scene import Rig, feel, perform, sensors
+from tacpipe.simulation.grasp_scene import Rig, perform, read_sensors, sensors
 from tests.simulation.grasp_datasets import SEED, grasps, readings
 
 RIG = Rig()
@@ -49,7 +49,7 @@ def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_t
     for _ in range(3_000):
         hidden = pinch.unseen(rng, 1, RIG.effort_spread)
         t_ns = stamp_ns(int(rng.integers(200_000)), RIG)
-        again = feel(made, replace(scene, hidden=hidden), t_ns, RIG)
+        again = read_sensors(made, replace(scene, hidden=hidden), t_ns, RIG)
         made_again.append(fingertip_sp.counted(again.shown + made.noise * rng.normal(size=(2, 25))))
     mean, variance = touch_bound.known(np.array(made_again))
     found, spread = touch_bound.known(touch_bound.readings(scene.situation, made, rng, draws=3_000))

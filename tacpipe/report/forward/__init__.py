@@ -1,4 +1,4 @@
-"""The part of the page that tells of forecasts: how all compare, then single results in full."""
+"""The part of the page that reports on forecasts: how all compare, then single results in full."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from tacpipe.report.forward.overview import Overview
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-IN_FULL = 2  # results that are told in full where there are no more
+IN_FULL = 2  # results that are given in full where there are no more
 
 TITLE = "forecasts of tactile signals"
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset that is no result helps to tell of forecasts: those of ``tacpipe compress`` do."""
+    """Return whether a dataset that is not a result helps to report on forecasts: those of ``tacpipe compress`` do."""
     return sweep.FILE in dataset.files
 
 
 def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> str:
-    """Return what ``results`` of this task tell, with ``traces`` recordings of each drawn that is told in full.
+    """Return what ``results`` of this task state, with ``traces`` recordings of each drawn that is given in full.
 
-    Several results that can be compared are, and of more than two only a few are told in full. ``others`` are datasets
-    that `reads` takes: they tell of their codecs.
+    Several results that can be compared are, and of more than two only a few are given in full. ``others`` are datasets
+    that `reads` takes: they report on their codecs.
     """
     read = [methods.Run.read(one) for one in results if methods.comparable(one)]
     runs = [run for run in read if run.errors.recordings]  # others have nothing to compare
-    told, parts = list(results), []
+    described, parts = list(results), []
     if len(runs) > 1:
         found = Overview(runs)
         simulated = any(provenance.simulated(run.dataset) for run in runs)
         parts.append(overview.render(found, sweep.read([*results, *others]), simulated))
         if len(runs) > IN_FULL:
             compared = {id(run.dataset) for run in runs}
-            chosen = [run.dataset for run in found.told_apart()]
-            told = [*chosen, *(one for one in results if id(one) not in compared)]
-            parts.append(markup.note(f"Below, {len(told)} of the {len(results)} results in full."))
+            chosen = [run.dataset for run in found.representative_runs()]
+            described = [*chosen, *(one for one in results if id(one) not in compared)]
+            parts.append(markup.note(f"Below, {len(described)} of the {len(results)} results in full."))
     elif others:
         published = all(provenance.published(one, overview.PAPERS_SETS) for one in results)
         parts.append(representations.section(sweep.read([*results, *others]), published))
-    parts += [section.render(one, number, len(told), traces) for number, one in enumerate(told, 1)]
+    parts += [section.render(one, number, len(described), traces) for number, one in enumerate(described, 1)]
     return "".join(parts)

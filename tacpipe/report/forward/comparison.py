@@ -1,6 +1,6 @@
-"""Methods and baselines beside each other: errors, skill over persistence, and how sure both are.
+"""Methods and baselines next to each other: errors, skill over persistence, and how sure both are.
 
-Runs of a method are pooled: the sums of a recording that several runs were judged on are added and stay together, and
+Runs of a method are pooled: the sums of a recording that several runs were evaluated on are added and stay together, and
 intervals come from drawing whole recordings anew (`tacpipe.metrics.forecast`).
 """
 
@@ -31,7 +31,7 @@ _draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 @dataclass(frozen=True)
 class Pool:
-    """The error sums of one predictor over runs, beside those of persistence on the same windows."""
+    """The error sums of one predictor over runs, next to those of persistence on the same windows."""
 
     recordings: tuple[str, ...]
     windows: NDArray[np.int64]  # (recording,), those of several runs added
@@ -69,9 +69,9 @@ class Pool:
         """Return the pool of these of its recordings alone."""
         rows = [self.recordings.index(name) for name in recordings]
         parts = {name: getattr(self, name)[rows] for name in ("windows", "squared", "absolute", "baseline")}
-        told = (self.distinct_windows, self.runs, self.steps, self.channels)
+        described = (self.distinct_windows, self.runs, self.steps, self.channels)
         windows, squared, absolute, baseline = parts.values()
-        return Pool(tuple(recordings), windows, *told, squared, absolute, baseline)
+        return Pool(tuple(recordings), windows, *described, squared, absolute, baseline)
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Row:
 
     name: str
     predictor: str
-    method: Method  # whose runs tell of it
+    method: Method  # whose runs report on it
     pool: Pool  # counts, both sensors
     standard: Pool | None  # all channels in units of their training standard deviation
     skill: Interval  # of each shown step, then of their mean
@@ -105,7 +105,7 @@ class Represented:
 
 
 def shown_steps(runs: Sequence[Run]) -> tuple[int, ...]:
-    """Return the steps to tell of, those that all runs predict."""
+    """Return the steps to report on, those that all runs predict."""
     return headlines.shown(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
 
 
@@ -143,7 +143,7 @@ def skill(pooled: Pool, steps: Sequence[int]) -> Interval:
 def difference(one: Pool, other: Pool, steps: Sequence[int]) -> Interval | None:
     """Return by how much the skill of ``one`` exceeds that of ``other``, each resample drawing the same recordings.
 
-    Only recordings that both were judged on count; None where there is none.
+    Only recordings that both were evaluated on count; None where there is none.
     """
     common = [name for name in one.recordings if name in set(other.recordings)]
     if not common:
@@ -183,9 +183,9 @@ def _sums(runs: Sequence[Run], predictor: str, steps: Sequence[int], known: bool
         squared, absolute, still = (one.at(values, steps) for values in (one.squared, one.absolute, one.baseline))
         for at, name in enumerate(one.recordings):
             values = float(one.windows[at]) * one.channels
-            told = headlines.sums(squared[at], absolute[at], still[at], values)
+            described = headlines.sums(squared[at], absolute[at], still[at], values)
             key = run.config["params"].get("seed"), name
-            found[key] = found[key] + told if key in found else told
+            found[key] = found[key] + described if key in found else described
     return found
 
 
@@ -193,7 +193,7 @@ def rows(methods: Sequence[Method], steps: Sequence[int], known: bool | None) ->
     """Return every method and every baseline, the highest mean skill first.
 
     Baselines are those of the runs of one method (`tacpipe.report.forward.methods.reference`), because a split has the
-    same for all; those that go through a codec are told for each codec.
+    same for all; those that go through a codec are given for each codec.
     """
     found = [_row(one.name, MODEL, one, steps, known) for one in methods]
     source = by_method.reference(methods)
@@ -210,17 +210,17 @@ def rows(methods: Sequence[Method], steps: Sequence[int], known: bool | None) ->
 
 
 def represented(method: Method) -> Represented | None:
-    """Return a method's errors in its own scaled space; None where the results do not tell them."""
+    """Return a method's errors in its own scaled space; None where the results do not state them."""
     pooled = [found for run in method.runs if (found := pool([run], MODEL, "feature")) is not None]
     if not pooled:
         return None
     known = [found for run in method.runs if (found := pool([run], MODEL, "feature", known=True)) is not None]
-    # the recurrent model is trained by this very error, so its loss tells it too
+    # the recurrent model is trained by this very error, so its loss states it too
     validation = [run.config.get("validation", {}) for run in method.runs]
-    told = [one.get("mse_feature", one.get("loss") if method.recurrent else None) for one in validation]
+    described = [one.get("mse_feature", one.get("loss") if method.recurrent else None) for one in validation]
     return Represented(
         method,
-        spread([float(one) for one in told if one is not None]),
+        spread([float(one) for one in described if one is not None]),
         spread([float(one.mse.mean()) for one in pooled]),
         spread([float(one.mse.mean()) for one in known]) if known else None,
         spread([float(one.baseline_mse.mean()) for one in pooled]),
@@ -229,8 +229,8 @@ def represented(method: Method) -> Represented | None:
 
 def anticipation(method: Method, predictor: str) -> dict[str, float] | None:
     """Return recall, leads and false alarms of a predictor, averaged over runs by their numbers of events."""
-    told = [run.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
-    held = [one for one in told if one and one.get("events")]
+    described = [run.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
+    held = [one for one in described if one and one.get("events")]
     if not held:
         return None
     found: dict[str, float] = {"events": sum(float(one["events"]) for one in held)}
@@ -250,12 +250,12 @@ def _part(run: Run, predictor: str, group: str, known: bool | None) -> Pool | No
         return None
     names = tuple(name for name, kept in zip(errors.recordings, held, strict=True) if kept)
     windows = errors.windows[held]
-    told = (int(windows.sum()), 1, errors.steps, errors.channels[group])
-    return Pool(names, windows, *told, sums[0][held], sums[1][held], baseline[0][held])
+    described = (int(windows.sum()), 1, errors.steps, errors.channels[group])
+    return Pool(names, windows, *described, sums[0][held], sums[1][held], baseline[0][held])
 
 
 def _skills(weights: NDArray[Any], pooled: Pool, steps: Sequence[int]) -> Floats:
-    """Return skill at ``steps`` and its mean, (draw, step + 1), each recording counted as ``weights`` (draw, it) say."""
+    """Return skill at ``steps`` and its mean, (draw, step + 1), each recording counted as ``weights`` (draw, it) state."""
     found = forecast.skill(
         weights @ pooled.at(pooled.squared, steps), weights @ pooled.at(pooled.baseline, steps)
     )  # (draw, step)
@@ -275,12 +275,12 @@ def _row(name: str, predictor: str, method: Method, steps: Sequence[int], known:
     each = [found for run in method.runs if (found := pool([run], predictor, known=known)) is not None]
     scores = [float(_skills(np.ones((1, len(one.recordings))), one, steps)[0, -1]) for one in each]
     standard = pool(method.runs, predictor, "standard", known)
-    told = skill(standard, steps) if standard else None
-    return Row(name, predictor, method, pooled, standard, skill(pooled, steps), spread(scores).sd, told)
+    described = skill(standard, steps) if standard else None
+    return Row(name, predictor, method, pooled, standard, skill(pooled, steps), spread(scores).sd, described)
 
 
 def own(predictor: str) -> bool:
-    """Say whether a predictor is a model's or a codec's own, and not a baseline that is the same for all of a split."""
+    """Return whether a predictor is a model's or a codec's own, and not a baseline that is the same for all of a split."""
     return not headlines.legitimate(predictor)
 
 

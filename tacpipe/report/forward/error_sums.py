@@ -59,7 +59,7 @@ class ErrorSums:
 def read(content: bytes) -> ErrorSums:
     """Return the sums that a file holds, without those of recordings that the model was trained on.
 
-    Raises `TacpipeError` where a column is missing, or where predictors were not judged on the same windows.
+    Raises `TacpipeError` where a column is missing, or where predictors were not evaluated on the same windows.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -83,7 +83,7 @@ def read(content: bytes) -> ErrorSums:
     uneven = np.flatnonzero(windows[recording] != table["windows"].to_numpy())
     if len(uneven):
         raise TacpipeError(
-            f"In {FILE}, predictors were judged on different windows of {recordings[recording[uneven[0]]]}, so they "
+            f"In {FILE}, predictors were evaluated on different windows of {recordings[recording[uneven[0]]]}, so they "
             f"cannot be compared. Evaluate the model again."
         )
     known = np.zeros(len(recordings), dtype=np.bool_)

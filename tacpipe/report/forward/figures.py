@@ -89,8 +89,8 @@ def skill_of_methods(
             axes[0].plot(
                 ahead, mean, color=COLOURS[colour], linestyle=line, marker="o", markersize=3, linewidth=1.8, label=name
             )
-        told = [value for found in skill.values() for part in ("mean", "low", "high") for value in found[part]]
-        highest, lowest = np.nanmax([0.05, *told]), max(floor, np.nanmin([0.0, *told]))
+        described = [value for found in skill.values() for part in ("mean", "low", "high") for value in found[part]]
+        highest, lowest = np.nanmax([0.05, *described]), max(floor, np.nanmin([0.0, *described]))
         room = 0.05 * (highest - lowest)
         axes[0].set_ylim(lowest - (room if lowest > floor else 0), highest + room)
         axes[0].set_xlabel(f"time ahead ({unit})")
@@ -102,7 +102,7 @@ def skill_of_methods(
 
 
 def explained_variance(ratio: Sequence[float], kept: int) -> str:
-    """Return bars of the share of variance that each principal component holds; those that are ``kept`` stand out."""
+    """Return bars of the fraction of variance that each principal component holds; those that are ``kept`` stand out."""
 
     def draw(axes: list[Axes]) -> None:
         numbers = np.arange(1, len(ratio) + 1)
@@ -113,7 +113,7 @@ def explained_variance(ratio: Sequence[float], kept: int) -> str:
         axes[0].grid(axis="y")
         axes[0].set_axisbelow(True)
 
-    return svg(draw, "Share of variance by principal component", size=(5.4, 3.4))
+    return svg(draw, "Fraction of variance by principal component", size=(5.4, 3.4))
 
 
 def covariance(matrix: Floats) -> str:
@@ -124,7 +124,7 @@ def covariance(matrix: Floats) -> str:
 
         largest = float(np.abs(matrix).max()) or 1.0
         for (row, column), value in np.ndenumerate(matrix):
-            # the square root shows what is small beside the first component; cells of nothing are left out
+            # the square root shows what is small next to the first component; cells of nothing are left out
             strength = round(float(np.sqrt(abs(value) / largest)), 2)
             if strength >= 0.01:
                 colour = COLOURS["model" if value > 0 else "persistence"]
@@ -174,7 +174,7 @@ def traces(time_s: Floats, truth: Mapping[str, Floats], ahead: Mapping[str, Mapp
         axes[0].legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
         axes[-1].set_xlabel("time at which the prediction is known (s)")
 
-    return svg(draw, "Predictions beside the truth", size=(11, 1.9 * len(truth)), panels=len(truth))
+    return svg(draw, "Predictions next to the truth", size=(11, 1.9 * len(truth)), panels=len(truth))
 
 
 def losses(history: Sequence[Mapping[str, Any]]) -> str:

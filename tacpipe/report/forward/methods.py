@@ -20,13 +20,13 @@ Tree = Mapping[str, Any]
 
 ACTIONS = ("planned", "none", "shuffled")
 _PAPER_WIDTH = {"pca": 20, "autoencoder": 8}  # latents the paper keeps
-_NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are fitted beside the model
+_NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are fitted next to the model
 _PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
 
 
 @dataclass(frozen=True)
 class Run:
-    """One result: a model trained once and judged once."""
+    """One result: a model trained once and evaluated once."""
 
     dataset: Dataset
     config: Tree
@@ -60,12 +60,12 @@ class Method:
 
     @property
     def actions(self) -> str:
-        """What the model is told of the motion to come: ``planned``, ``none`` or ``shuffled``."""
+        """What the model is informed of the motion to come: ``planned``, ``none`` or ``shuffled``."""
         return _actions(self.config)
 
     @property
     def timeline(self) -> str:
-        """What rows stand for: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
+        """What rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
         return _timeline(self.config)
 
     @property
@@ -79,14 +79,14 @@ class Method:
 
 
 def comparable(dataset: Dataset) -> bool:
-    """Say whether a result holds what a comparison reads: only those of the task ``forward`` do."""
+    """Return whether a result holds what a comparison reads: only those of the task ``forward`` do."""
     return all(name in dataset.files for name in ("metrics.json", "config.json", error_sums.FILE))
 
 
 def grouped(runs: Sequence[Run]) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
-    A method is architecture, representation, actions, timeline and all params but the seed. Its name tells a timeline
+    A method is architecture, representation, actions, timeline and all params but the seed. Its name states a timeline
     that is not that of most runs, and the params in which it differs from others that are the same but for these.
     """
     found: dict[str, list[Run]] = {}
@@ -99,8 +99,8 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     made = []
     for same in found.values():
         config = same[0].config
-        told = _differing(_params(config), alike[_key(config, params=False)])
-        made.append(Method(_name(config, usual, told), tuple(same)))
+        described = _differing(_params(config), alike[_key(config, params=False)])
+        made.append(Method(_name(config, usual, described), tuple(same)))
     return sorted(made, key=lambda method: method.name)
 
 
@@ -133,7 +133,7 @@ def paper_row(codec: Tree) -> str | None:
 
 
 def reference(methods: Sequence[Method]) -> Method:
-    """Return the method whose runs tell of the baselines: with most baselines, then most runs, better with a plan."""
+    """Return the method whose runs report on the baselines: with most baselines, then most runs, better with a plan."""
 
     def place(one: Method) -> tuple[int, int, int, str]:
         baselines = {
@@ -167,14 +167,14 @@ def _params(config: Tree) -> dict[str, Any]:
 
 def _key(config: Tree, *, params: bool, without: str = "") -> str:
     """Return what names a method, seed and split left out."""
-    told = {
+    described = {
         "architecture": config["architecture"],
         "codec": config["codec"]["name"],
         "actions": _actions(config),
         "timeline": _timeline(config),
         "params": _params(config) if params else {},
     }
-    return json.dumps({name: value for name, value in told.items() if name != without}, sort_keys=True)
+    return json.dumps({name: value for name, value in described.items() if name != without}, sort_keys=True)
 
 
 def _differing(params: Tree, alike: Sequence[Tree]) -> dict[str, Any]:

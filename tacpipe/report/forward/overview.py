@@ -1,4 +1,4 @@
-"""Many results beside each other: the part of the page that comes before single ones."""
+"""Many results next to each other: the part of the page that comes before single ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAPERS_SETS = ("xela-flat",)  # whose paper's tables and figures stand next to o
 
 
 class Overview:
-    """What the results of one page have in common, sorted for telling."""
+    """What the results of one page have in common, sorted for reporting."""
 
     def __init__(self, runs: Sequence[Run]) -> None:
         self.methods = by_method.grouped(runs)
@@ -54,12 +54,12 @@ class Overview:
         found = {}
         for part in self.parts:
             row = comparison.best(self.rows[part])
-            told = comparison.headline(row.method, self.main, self.steps, part) if row else None
-            if told:
-                found[part] = told
+            described = comparison.headline(row.method, self.main, self.steps, part) if row else None
+            if described:
+                found[part] = described
         return found
 
-    def told_apart(self) -> list[Run]:
+    def representative_runs(self) -> list[Run]:
         """Return the runs that are worth a section of their own: of the best method and the paper's, a median one."""
         chosen = dict.fromkeys(one.name for one in (self.best(), self.paper) if one)
         return [self.median(method) for name in chosen for method in self.methods if method.name == name]
@@ -101,21 +101,25 @@ def render(overview: Overview, codecs: Sequence[sweep.Tree], simulated: bool) ->
 
 def headline(overview: Overview) -> list[tuple[str, str]]:
     """Return how the best method compares with the best baseline and persistence, a sentence a part, and its verdict."""
-    said = []
+    statements = []
     averaged = _steps(overview.steps)
     for part, found in overview.headlines().items():
         row = comparison.best(overview.rows[part])
         assert row is not None  # it is what the headline is of
-        told = f"{headline_of.sentence(found)} Over persistence it has {_told(row)}, averaged over {averaged}"
+        described = (
+            f"{headline_of.sentence(found)} Over persistence it has {_skill_text(row)}, averaged over {averaged}"
+        )
         paper = overview.row_of(overview.paper, part) if overview.paper else None
         if paper is row:
-            told += "; it is the paper's method"
+            described += "; it is the paper's method"
         elif paper:
-            told += f"; the paper's method, {paper.name}, has {_told(paper)}"
+            described += f"; the paper's method, {paper.name}, has {_skill_text(paper)}"
         if row.standard_skill is not None:
-            told += f". With every channel in units of its standard deviation in training, {_skill(row.standard_skill)}"
-        said.append((f"{told}.", found.verdict))
-    return said
+            described += (
+                f". With every channel in units of its standard deviation in training, {_skill(row.standard_skill)}"
+            )
+        statements.append((f"{described}.", found.verdict))
+    return statements
 
 
 def _basis(overview: Overview, simulated: bool) -> str:
@@ -146,7 +150,7 @@ def _basis(overview: Overview, simulated: bool) -> str:
         "The best of several methods was picked on these very recordings, which flatters it a little."
         if len(overview.methods) > 1
         else "",
-        "The recorded motion stands for the plan: errors of methods that read it hold for an arm that follows its plan "
+        "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows its plan "
         "perfectly."
         if any(method.actions == "planned" for method in overview.methods)
         else "",
@@ -163,7 +167,7 @@ def _representations(overview: Overview) -> str:
     text = (
         "Each row is in its own representation's space, scaled to ±1 on the training recordings. Rows of different spaces "
         "cannot be compared: a space that leaves out what is hard to predict has the lower error. Persistence in the same "
-        "space says what a row is worth: below 1 in the column beside it, the model is better."
+        "space states what a row is worth: below 1 in the column next to it, the model is better."
     )
     if overview.published:
         text += " The paper's own recordings are not public; its numbers are given as printed."
@@ -171,7 +175,7 @@ def _representations(overview: Overview) -> str:
     return f"<h3>{title}</h3>{found}{markup.note(text)}"
 
 
-def _told(row: Row) -> str:
+def _skill_text(row: Row) -> str:
     """Return a row's mean skill and its interval in words."""
     return _skill(row.skill)
 
@@ -209,7 +213,9 @@ def _skill_figures(overview: Overview) -> str:
             if float(np.nanmin(found.mean)) < FLOOR:
                 cut.append(row.name)
         steps = min((row.pool.steps for row in rows), key=len)
-        short = {name: {key: values[: len(steps)] for key, values in told.items()} for name, told in lines.items()}
+        short = {
+            name: {key: values[: len(steps)] for key, values in described.items()} for name, described in lines.items()
+        }
         rate_hz = float(rows[0].method.config.get("rate_hz") or 0)
         ahead = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
         caption = f"Skill on {tables.OBJECTS[part]} over the time ahead, with 95 % intervals over recordings."
@@ -266,11 +272,11 @@ def _ablations(overview: Overview) -> str:
         tables.actions(overview.methods, overview.steps, overview.parts),
         tables.timelines(overview.methods, overview.steps, overview.parts),
     ]
-    told = (
-        "Differences are paired: each resample draws the same recordings for both. An interval above 0 says that the "
+    described = (
+        "Differences are paired: each resample draws the same recordings for both. An interval above 0 states that the "
         "plan helps."
     )
-    return f"<h3>Ablations</h3>{markup.note(told)}{''.join(found)}" if any(found) else ""
+    return f"<h3>Ablations</h3>{markup.note(described)}{''.join(found)}" if any(found) else ""
 
 
 def _paper_traces(overview: Overview) -> str:
@@ -300,9 +306,9 @@ def _paper_traces(overview: Overview) -> str:
 def _median_recording(result: Dataset) -> str | None:
     """Return the recording of median skill among those that the model has not seen."""
     trials: list[dict[str, Any]] = list(csv.DictReader(io.StringIO(result.files.get("trials.csv", b"").decode())))
-    judged = sorted(
+    ranked = sorted(
         (float(one["skill"]), one["recording"])
         for one in trials
         if one["seen"] == "false" and one["skill"] and one["recording"] in result.recordings
     )
-    return judged[len(judged) // 2][1] if judged else None
+    return ranked[len(ranked) // 2][1] if ranked else None

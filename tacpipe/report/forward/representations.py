@@ -15,7 +15,7 @@ COMPONENTS = 40  # bars of the explained variance
 def section(codecs: Sequence[sweep.Tree], published: bool) -> str:
     """Return what codecs hold and lose: variance, covariance, and loss by number of latents; empty without codecs.
 
-    Where the data are ``published``, next to what the paper says of them.
+    Where the data are ``published``, next to what the paper states of them.
     """
     found = sweep.losses(codecs)
     if not codecs:

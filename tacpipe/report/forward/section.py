@@ -28,11 +28,11 @@ EXPLAINED = {
     "persistence": "nothing changes: the last frame is held",
     "codec_persistence": "the last frame is held after going through the codec",
     "codec": "the true future through the codec, which is what compression alone costs",
-    "model_anchored": "the model's forecast, moved so that it goes on from the last frame",
-    "codec_anchored": "the true future through the codec, moved so that it goes on from the last frame",
+    "model_anchored": "the model's forecast, moved so that it continues from the last frame",
+    "codec_anchored": "the true future through the codec, moved so that it continues from the last frame",
     "context_mean": "the mean of the frames the model reads",
     "train_mean": "the mean of the training recordings",
-    "damped_trend": "the last frames' trend goes on and fades",
+    "damped_trend": "the last frames' trend continues and fades",
     "last_value_linear": "a linear map of the frames the model reads, the last frame taken off them",
     "ridge": "ridge regression of the changes to come on those of the frames the model reads",
     "ridge_actions": "the same with the planned motion",
@@ -62,21 +62,21 @@ def sentences(found: Sequence[Headline], metrics: Tree) -> list[tuple[str, str]]
     if found:
         return [(headline_of.sentence(one), one.verdict) for one in found]
     if "skill" not in metrics:
-        told = (
+        described = (
             "No recording was left to evaluate the model on: it has seen all that were given, or none holds a window."
         )
-        return [(told, "")]
+        return [(described, "")]
     errors = {name: float(_both(metrics[name]["mse_counts"])["mean"]) for name in _predictors(metrics)}
     others = {name: error for name, error in errors.items() if name in EXPLAINED and legitimate(name)}
     if not others or "model" not in errors:
         return [("The model was evaluated without a baseline.", "")]
     best = min(others, key=lambda name: others[name])
-    told = (
+    described = (
         f"Mean squared error over all steps: {markup.number(errors['model'])} counts² for the model, "
         f"{markup.number(others[best])} for {best}, the best of {len(others)} baselines. This result holds no sums by "
         f"recording, so there is no interval: evaluate the model again."
     )
-    return [(told, "")]
+    return [(described, "")]
 
 
 def render(result: Dataset, number: int, of: int, drawn: int) -> str:
@@ -178,9 +178,9 @@ def _horizon_figures(metrics: Tree, rate_hz: float) -> str:
             "Error over all channels and unseen recordings. Lower is better.",
         )
     ]
-    told = metrics["skill"]["mse_counts"]
-    if all("low" in told.get(f"t{step}", {}) for step in steps):
-        skill = {part: [told[f"t{step}"][part] for step in steps] for part in ("mean", "low", "high")}
+    described = metrics["skill"]["mse_counts"]
+    if all("low" in described.get(f"t{step}", {}) for step in steps):
+        skill = {part: [described[f"t{step}"][part] for step in steps] for part in ("mean", "low", "high")}
         caption = "Skill over persistence, with its 95 % interval over recordings."
         parts.append(markup.figure(figures.skill_by_horizon(skill, ahead_ms), caption))
     return f'<div class="pair">{"".join(parts)}</div>'
@@ -201,8 +201,8 @@ def _error_tables(metrics: Tree) -> str:
     ):
         rows = [[name, *(markup.number(_both(metrics[name][measure])[step]) for step in shown)] for name in names]
         parts.append(markup.table(title, ["", *heads], rows))
-    told = [name for name in names if "mse_feature" in metrics[name]]
-    rows = [[name, *(markup.number(metrics[name]["mse_feature"][step]) for step in shown)] for name in told]
+    described = [name for name in names if "mse_feature" in metrics[name]]
+    rows = [[name, *(markup.number(metrics[name]["mse_feature"][step]) for step in shown)] for name in described]
     parts.append(markup.table("Mean squared error (latents scaled to ±1)", ["", *heads], rows))
     rows = []
     for measure, skill in metrics["skill"].items():
@@ -220,7 +220,7 @@ def _error_tables(metrics: Tree) -> str:
 
 
 def _objects(metrics: Tree) -> str:
-    """Return errors and skill on objects that the model was trained on beside those on others, where it is told."""
+    """Return errors and skill on objects that the model was trained on next to those on others, where it is given."""
     parts = {name: metrics[name] for name in ("known", "unseen") if "skill" in metrics.get(name, {})}
     if not parts:
         return ""
@@ -231,18 +231,18 @@ def _objects(metrics: Tree) -> str:
         for predictor in _predictors(part)[:2]:
             errors = _both(part[predictor]["mae_counts"])
             rows.append([f"{objects}, {predictor} (counts)", *(markup.number(errors[step]) for step in steps)])
-        told = part["skill"]["mse_counts"]
-        rows.append([f"{objects}, skill", *(markup.interval(told.get(step, {})) for step in steps)])
+        described = part["skill"]["mse_counts"]
+        rows.append([f"{objects}, skill", *(markup.interval(described.get(step, {})) for step in steps)])
     heads = [step.replace("t", "t+") if step != "mean" else step for step in steps]
     return markup.table("Known objects and unseen ones: mean absolute error, and skill", ["", *heads], rows)
 
 
 def _trials(trials: Sequence[Mapping[str, str]]) -> str:
     """Return the skill on each unseen recording."""
-    judged = [one for one in trials if one["seen"] == "false" and one["skill"]]
-    if not judged:
+    ranked = [one for one in trials if one["seen"] == "false" and one["skill"]]
+    if not ranked:
         return ""
-    skill, windows = [float(one["skill"]) for one in judged], [int(one["windows"]) for one in judged]
+    skill, windows = [float(one["skill"]) for one in ranked], [int(one["windows"]) for one in ranked]
     better = sum(value > 0 for value in skill)
     caption = (
         f"Skill on each recording; better than persistence on {better} of {len(skill)}. Larger dots: more windows."
@@ -255,7 +255,7 @@ def _trials(trials: Sequence[Mapping[str, str]]) -> str:
             *(markup.number(float(one[key])) for key in keys),
             markup.skill(float(one["skill"])),
         ]
-        for one in sorted(judged, key=lambda one: float(one["skill"]))
+        for one in sorted(ranked, key=lambda one: float(one["skill"]))
     ]
     heads = ["recording", "windows", "model (counts²)", "persistence (counts²)", "skill"]
     return (
@@ -267,13 +267,13 @@ def _trials(trials: Sequence[Mapping[str, str]]) -> str:
 
 def _traces(result: Dataset, trials: Sequence[Mapping[str, str]], count: int) -> str:
     """Return example predictions of the recordings of median, lowest and highest skill."""
-    judged = sorted(
+    ranked = sorted(
         (one for one in trials if one["seen"] == "false" and one["skill"] and one["recording"] in result.recordings),
         key=lambda one: float(one["skill"]),
     )
-    if not judged or not count:
+    if not ranked or not count:
         return ""
-    chosen = {"median": judged[len(judged) // 2], "lowest": judged[0], "highest": judged[-1]}
+    chosen = {"median": ranked[len(ranked) // 2], "lowest": ranked[0], "highest": ranked[-1]}
     drawn: dict[str, str] = {}
     for rank, one in list(chosen.items())[:count]:
         name = one["recording"]
@@ -286,13 +286,13 @@ def _traces(result: Dataset, trials: Sequence[Mapping[str, str]], count: int) ->
 def _seen(metrics: Tree) -> str:
     """Return the errors on recordings that the model was trained on, which prove nothing."""
     seen = metrics.get("seen", {})
-    told = seen.get("skill", {}).get("mse_counts", {}).get("mean", {})
-    if "mean" not in told:
+    described = seen.get("skill", {}).get("mse_counts", {}).get("mean", {})
+    if "mean" not in described:
         return ""
     count = headline_of.counted(seen["counts"]["recordings"], "recordings")
     text = (
         f"Left out of all above: {count} that the model was trained or stopped on. "
-        f"Its skill on these is {markup.skill(told['mean'])}, averaged over all steps."
+        f"Its skill on these is {markup.skill(described['mean'])}, averaged over all steps."
     )
     return f'<h3>Recordings the model has seen</h3><p class="note">{escape(text)}</p>'
 

@@ -46,19 +46,19 @@ def series(codec: Tree) -> str:
 
 
 def losses(codecs: Sequence[Tree]) -> list[Loss]:
-    """Return what codecs lose by series and width, on held-out recordings if all tell of these, or else on the fit's."""
+    """Return what codecs lose by series and width, on held-out recordings if all report on these, or else on the fit's."""
     part = "val" if all("val" in one["reconstruction"] for one in codecs if one.get("reconstruction")) else "train"
     found: dict[tuple[str, int], list[Tree]] = {}
     for codec in codecs:
         if codec.get("reconstruction"):
             found.setdefault((series(codec), int(codec["latents"])), []).append(codec["reconstruction"])
     made = []
-    for (name, latents), told in sorted(found.items()):
+    for (name, latents), described in sorted(found.items()):
         errors = {
-            measure: float(np.mean([one[part][measure] for one in told]))
+            measure: float(np.mean([one[part][measure] for one in described]))
             for measure in ("mse_standardised", "mae_counts")
         }
-        made.append(Loss(name, latents, len(told), part, **errors))
+        made.append(Loss(name, latents, len(described), part, **errors))
     return made
 
 

@@ -1,4 +1,4 @@
-"""The tables in which methods stand beside each other."""
+"""The tables in which methods are next to each other."""
 
 from __future__ import annotations
 
@@ -44,18 +44,22 @@ def representations(methods: Sequence[Method], published: bool) -> str:
     heads = [head for head in HEADS if named or head != KNOWN]
     rows = []
     for method in sorted(found, key=place):
-        told = comparison.represented(method)
-        if told is None:
+        described = comparison.represented(method)
+        if described is None:
             continue
         printed = PRINTED.get(by_method.paper_row(method.codec) or "") if published else None
         rows.append(
             [
                 method.name.split(" · ", 1)[1],
-                markup.with_sd(told.validation.mean, told.validation.sd),
-                markup.with_sd(told.test.mean, told.test.sd),
-                *([markup.with_sd(told.known.mean, told.known.sd) if told.known else NONE] if named else []),
-                markup.with_sd(told.persistence.mean, told.persistence.sd),
-                f"{told.test.mean / told.persistence.mean:.3g}" if told.persistence.mean else NONE,
+                markup.with_sd(described.validation.mean, described.validation.sd),
+                markup.with_sd(described.test.mean, described.test.sd),
+                *(
+                    [markup.with_sd(described.known.mean, described.known.sd) if described.known else NONE]
+                    if named
+                    else []
+                ),
+                markup.with_sd(described.persistence.mean, described.persistence.sd),
+                f"{described.test.mean / described.persistence.mean:.3g}" if described.persistence.mean else NONE,
                 *([f"{value:.4f}" for value in printed] if printed else [NONE, NONE] if published else []),
                 str(len(method.runs)),
             ]
@@ -124,8 +128,8 @@ def channel_groups(chosen: Sequence[Row], steps: Sequence[int], known: bool | No
         for row in chosen:
             pooled = comparison.pool(row.method.runs, row.predictor, group, known)
             if pooled:
-                told = _skills(comparison.skill(pooled, steps))
-                rows.append([f"{group}, {row.name}", told[-1], *_mae(pooled, steps), *told[:-1]])
+                described = _skills(comparison.skill(pooled, steps))
+                rows.append([f"{group}, {row.name}", described[-1], *_mae(pooled, steps), *described[:-1]])
         still = comparison.pool(chosen[0].method.runs, BASELINE, group, known)
         if still:
             rows.append([f"{group}, {BASELINE}", NONE, *_mae(still, steps), *[NONE] * len(steps)])
@@ -135,7 +139,7 @@ def channel_groups(chosen: Sequence[Row], steps: Sequence[int], known: bool | No
 
 
 def actions(methods: Sequence[Method], steps: Sequence[int], parts: Sequence[bool | None]) -> str:
-    """Return what the plan is worth: models that were told it, none, and a wrong one; empty where none was left out."""
+    """Return what the plan is worth: models that were given it, none, and a wrong one; empty where none was left out."""
     rows = []
     for family in _families(methods, "actions"):
         planned = next((one for one in family if one.actions == "planned"), None)
@@ -175,15 +179,15 @@ def timelines(methods: Sequence[Method], steps: Sequence[int], parts: Sequence[b
 
 
 def anticipation(methods: Sequence[Method]) -> str:
-    """Return how often and how early a method sees a change come; empty where no result tells."""
+    """Return how often and how early a method sees a change come; empty where no result states."""
     source = by_method.reference(methods)
-    told = [(one.name, comparison.anticipation(one, MODEL)) for one in methods]
+    described = [(one.name, comparison.anticipation(one, MODEL)) for one in methods]
     names = sorted({name for run in source.runs for name in run.metrics.get("anticipation", {}) if name != MODEL})
-    told += [(name, comparison.anticipation(source, name)) for name in names]
+    described += [(name, comparison.anticipation(source, name)) for name in names]
     measures = ("median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
     rows = [
         [name, f"{found['events']:,.0f}", _plain(100 * found["recall"]), *(_plain(found[key]) for key in measures)]
-        for name, found in sorted(told, key=lambda one: -one[1]["recall"] if one[1] else 0.0)
+        for name, found in sorted(described, key=lambda one: -one[1]["recall"] if one[1] else 0.0)
         if found
     ]
     if not rows:
@@ -229,8 +233,8 @@ def _lost(planned: Method | None, other: Method, steps: Sequence[int], known: bo
     found = comparison.difference(one, two, steps) if one and two else None
     if found is None:
         return [NONE, NONE]
-    told = _skills(found)
-    return [told[-1], told[-2]]
+    described = _skills(found)
+    return [described[-1], described[-2]]
 
 
 def _families(methods: Sequence[Method], what: str) -> list[list[Method]]:

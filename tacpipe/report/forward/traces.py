@@ -41,6 +41,6 @@ def draw(shard: Recording, latents: Sequence[int], steps: Sequence[int]) -> str:
         column[broken] = np.nan
         return column[: len(shown_s)]
 
-    told = [step for step in steps if f"{chosen[0]}_t{step}" in table.column_names]
-    ahead = {name: {f"t+{step}": values(f"{name}_t{step}") for step in told} for name in chosen}
+    described = [step for step in steps if f"{chosen[0]}_t{step}" in table.column_names]
+    ahead = {name: {f"t+{step}": values(f"{name}_t{step}") for step in described} for name in chosen}
     return figures.traces(shown_s, {name: values(name) for name in chosen}, ahead)

@@ -1,4 +1,4 @@
-"""The part of the page that tells of materials: which method names them, and what joint learning is worth."""
+"""The part of the page that reports on materials: which method names them, and what joint learning is worth."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ TITLE = "recognition of materials by touch"
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset that is no result helps to tell of materials: one of slides does."""
+    """Return whether a dataset that is not a result helps to report on materials: one of slides does."""
     return profiles.reads(dataset)
 
 
 def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> str:
-    """Return what ``results`` of this task tell, pooled by method; ``others`` are datasets that `reads` takes.
+    """Return what ``results`` of this task state, pooled by method; ``others`` are datasets that `reads` takes.
 
-    A result without predictions of unseen slides has nothing to compare and is told as its metrics name it. Nothing is
+    A result without predictions of unseen slides has nothing to compare and is given as its metrics name it. Nothing is
     drawn by recording, so ``traces`` is of no effect.
     """
     runs = [Run.read(one) for one in results if "predictions" in one.recordings]

@@ -19,7 +19,7 @@ _draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 @dataclass(frozen=True)
 class Difference:
-    """What the first method has over the second, in shares of the slides that both were judged on."""
+    """What the first method has over the second, in fractions of the slides that both were evaluated on."""
 
     slides: int
     mean: float
@@ -28,7 +28,7 @@ class Difference:
     first_only: int  # slides that the first alone names right
     second_only: int
     mcnemar: float  # p
-    unit: str  # what is paired beside: ``folds``, or ``seeds`` where there is one fold
+    unit: str  # what is paired next to: ``folds``, or ``seeds`` where there is one fold
     units: int
     paired: float  # p of the paired t test over units, NaN below two and where all differ by as much
 
@@ -52,18 +52,18 @@ def difference(
 ) -> Difference | None:
     """Return what ``first`` has over ``second`` on slides of a sensor; None where they share none.
 
-    A slide that several runs of a method were judged on counts as the share of runs that name it right; McNemar's test
+    A slide that several runs of a method were evaluated on counts as the fraction of runs that name it right; McNemar's test
     takes it for right where at least half of them do.
     """
     one, other = (accuracy.verdicts(runs, sensor, name) for runs, name in zip((first, second), predictors, strict=True))
     common = [name for name in one.recordings if name in set(other.recordings)]
     if not common:
         return None
-    places = [dict(zip(found.recordings, found.share, strict=True)) for found in (one, other)]
-    shares = np.array([[place[name] for name in common] for place in places])  # (method, slide)
-    gain = shares[0] - shares[1]
+    places = [dict(zip(found.recordings, found.fraction, strict=True)) for found in (one, other)]
+    fractions = np.array([[place[name] for name in common] for place in places])  # (method, slide)
+    gain = fractions[0] - fractions[1]
     low, high = forecast.bounds((_draws(len(common)) @ gain / len(common))[:, None])
-    right = shares >= 0.5
+    right = fractions >= 0.5
     unit, pairs = _paired(first, second, sensor, predictors)
     return Difference(
         len(common),
@@ -80,7 +80,7 @@ def difference(
 
 
 def pairs(methods: Sequence[Method]) -> list[Pair]:
-    """Return which methods a table compares: what is told to help, against the same without it."""
+    """Return which methods a table compares: what is asked to help, against the same without it."""
     plain = [one for one in methods if one.plain]
     found = []
     for joint in (one for one in plain if one.kind == "RAEC joint"):
@@ -92,12 +92,12 @@ def pairs(methods: Sequence[Method]) -> list[Pair]:
 
 
 def control(method: Method) -> bool:
-    """Say whether a method is the negative control: trained jointly like others, its pairs of permuted materials."""
+    """Return whether a method is the negative control: trained jointly like others, its pairs of permuted materials."""
     return method.kind == "RAEC joint" and method.settings["pairing"] == "permuted" and method.differs_only("pairing")
 
 
 def main(methods: Sequence[Method], kind: str = "RAEC joint") -> Method | None:
-    """Return the plain method of a kind that stands for it where one is told: that with most runs."""
+    """Return the plain method of a kind that represents it where one is given: that with most runs."""
     return max((one for one in methods if one.plain and one.kind == kind), key=lambda one: len(one.runs), default=None)
 
 
@@ -150,5 +150,5 @@ def _by_unit(
     for run in runs:
         if (key := rule(run)) is not None:
             units.setdefault(key, []).append(run)
-    told = {key: accuracy.accuracy(same, sensor, predictor) for key, same in units.items()}
-    return {key: found.mean for key, found in told.items() if found}
+    described = {key: accuracy.accuracy(same, sensor, predictor) for key, same in units.items()}
+    return {key: found.mean for key, found in described.items() if found}

@@ -13,8 +13,8 @@ from tacpipe.report.material.figures import Integers
 from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import MODEL, NOTHING
 
-TOLD = 3  # pairs of materials in words
-NOTE = "Blue: named right; orange: wrong, with how often. The stronger, the larger the share of a material's slides."
+MOST_PAIRS = 3  # pairs of materials in words
+NOTE = "Blue: named right; orange: wrong, with how often. The stronger, the larger the fraction of a material's slides."
 
 
 def section(methods: Sequence[Method]) -> str:
@@ -32,13 +32,13 @@ def section(methods: Sequence[Method]) -> str:
 
 def counted(method: Method, sensor: str) -> tuple[Integers, list[int]]:
     """Return how often each material was taken for each, pooled over runs, (material, named), and the materials."""
-    truth, said = [], []
+    truth, predicted = [], []
     for run in method.of(sensor):
         rows = run.predictions.of(sensor)
-        told = rows.said[MODEL] != NOTHING
-        truth.append(rows.materials[told])
-        said.append(rows.said[MODEL][told])
-    materials, codes = np.unique(np.concatenate([*truth, *said]), return_inverse=True)
+        described = rows.predicted[MODEL] != NOTHING
+        truth.append(rows.materials[described])
+        predicted.append(rows.predicted[MODEL][described])
+    materials, codes = np.unique(np.concatenate([*truth, *predicted]), return_inverse=True)
     pairs = codes.reshape(2, -1)
     counts = np.zeros((len(materials), len(materials)), dtype=np.int64)
     np.add.at(counts, (pairs[0], pairs[1]), 1)
@@ -48,13 +48,13 @@ def counted(method: Method, sensor: str) -> tuple[Integers, list[int]]:
 def worst(counts: Integers, materials: Sequence[int]) -> str:
     """Return the materials most often taken for another, in words."""
     wrong = counts - np.diag(np.diag(counts))
-    order = np.argsort(-wrong, axis=None, kind="stable")[:TOLD]
-    told = []
+    order = np.argsort(-wrong, axis=None, kind="stable")[:MOST_PAIRS]
+    described = []
     for place in order:
         row, column = np.unravel_index(place, wrong.shape)
         if wrong[row, column]:
-            told.append(f"{materials[row]} for {materials[column]} ({wrong[row, column]} of {counts[row].sum()})")
-    return f"Most often it takes {listed(told)}." if told else "It takes none for another."
+            described.append(f"{materials[row]} for {materials[column]} ({wrong[row, column]} of {counts[row].sum()})")
+    return f"Most often it takes {listed(described)}." if described else "It takes none for another."
 
 
 def _figure(method: Method, sensor: str) -> str:

@@ -42,7 +42,7 @@ def convergence(methods: Sequence[Method]) -> str:
 
 
 def alignment(methods: Sequence[Method]) -> str:
-    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; empty where none is told."""
+    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; empty where none is given."""
     chosen = [one for one in methods if (one.plain or comparison.control(one)) and one.settings["joint"]]
     curves = {one.name: [curve for run in one.runs if (curve := aligned(run))] for one in chosen}
     held = {name: found for name, found in curves.items() if found}
@@ -57,9 +57,13 @@ def alignment(methods: Sequence[Method]) -> str:
 
 
 def aligned(run: Run) -> list[float]:
-    """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not tell it."""
-    told = [line.get("alignment") for line in run.history]
-    return [float("nan") if one is None else float(one) for one in told] if any(one is not None for one in told) else []
+    """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not state it."""
+    described = [line.get("alignment") for line in run.history]
+    return (
+        [float("nan") if one is None else float(one) for one in described]
+        if any(one is not None for one in described)
+        else []
+    )
 
 
 def few_slides(methods: Sequence[Method]) -> str:
@@ -94,19 +98,23 @@ def few_slides(methods: Sequence[Method]) -> str:
 
 
 def _add(points: dict[str, _Points], line: str, method: Method, sensor: str) -> None:
-    """Add what a method says to a line."""
+    """Add what a method states to a line."""
     found = accuracy(method.of(sensor), sensor)
     if found is None:
         return
-    told = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
-    if told:
-        points.setdefault(line, _Points()).found[max(told)] = (found.share, found.low, found.high)
+    described = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
+    if described:
+        points.setdefault(line, _Points()).found[max(described)] = (found.fraction, found.low, found.high)
 
 
 def _validation(run: Run, sensor: str) -> list[float]:
-    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is told."""
-    told = [line.get("val", {}).get(sensor, {}).get("accuracy") for line in run.history]
-    return [float("nan") if one is None else 100 * one for one in told] if any(one is not None for one in told) else []
+    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is given."""
+    described = [line.get("val", {}).get(sensor, {}).get("accuracy") for line in run.history]
+    return (
+        [float("nan") if one is None else 100 * one for one in described]
+        if any(one is not None for one in described)
+        else []
+    )
 
 
 def _pair(drawn: Sequence[str]) -> str:

@@ -50,8 +50,8 @@ def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Seque
             low, high = (100 * np.array(bound) for bound in (band.low, band.high))
             axes[0].fill_between(band.slides, low, high, color=COLOURS[colour], alpha=0.15, linewidth=0)
             marks: dict[str, Any] = {"marker": "o", "markersize": 4, "linewidth": 1.8}
-            shares = 100 * np.array(band.mean)
-            axes[0].plot(band.slides, shares, color=COLOURS[colour], linestyle=line, label=name, **marks)
+            fractions = 100 * np.array(band.mean)
+            axes[0].plot(band.slides, fractions, color=COLOURS[colour], linestyle=line, label=name, **marks)
         shown = sorted({count for band in bands.values() for count in band.slides})
         axes[0].set_xscale("log")
         axes[0].set_xticks(_apart(shown), labels=[str(count) for count in _apart(shown)])
@@ -76,7 +76,7 @@ def confusion(counts: Integers, materials: Sequence[int], title: str) -> str:
             if not count:
                 continue
             right = row == column
-            # the square root shows a single mistake beside many right ones
+            # the square root shows a single mistake next to many right ones
             strength = round(float(np.sqrt(count / totals[row])) * (0.75 if right else 0.85), 2)
             colour = COLOURS["model" if right else "persistence"]
             place = (column - 0.5, row - 0.5)

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tacpipe.report.material.methods import Method, Run, Tree, base_name, ordered, shown
-from tacpipe.report.naming import told_apart
+from tacpipe.report.naming import distinct_names
 
-# In these, runs of one method may differ; setting and quantities are told as split and vibration.
+# In these, runs of one method may differ; setting and quantities are given as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "setting", "quantities")
 _CLOSED = {  # all that has an effect on what is fitted in closed form
     "minirocket": ("features", "use_validation", "labels"),
@@ -17,7 +17,7 @@ _CLOSED = {  # all that has an effect on what is fitted in closed form
 }
 _RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
 _PAIRS = ("alignment_weight", "align_from", "agreement")  # of no effect where sensors learn alone
-_USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be said
+_USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be stated
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
@@ -25,7 +25,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
     A method is architecture, joint or not, number of training slides, layout and split of the slides, and all params but
-    the seed. Its name tells what keeps it from being plain, and the settings in which it differs from others that would
+    the seed. Its name states what keeps it from being plain, and the settings in which it differs from others that would
     have the same name.
     """
     places = [_place(run) for run in runs]
@@ -36,7 +36,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
         whole = _whole([one for one, other in zip(runs, places, strict=True) if other == place])
         settings: Tree = {**_settings(run), "elsewhere": place != main, **_few(run, whole, few)}
         found.setdefault(json.dumps(settings, sort_keys=True), (settings, []))[1].append(run)
-    names = told_apart([(base_name(settings), settings) for settings, _ in found.values()], _USUAL)
+    names = distinct_names([(base_name(settings), settings) for settings, _ in found.values()], _USUAL)
     made = [
         Method(name, settings, marks, tuple(same))
         for (name, marks), (settings, same) in zip(names, found.values(), strict=True)
@@ -63,7 +63,7 @@ def _settings(run: Run) -> dict[str, Any]:
         **{name: value for name, value in params.items() if (name in closed if closed else name not in idle)},
         "architecture": architecture,
         "joint": joint,
-        "known": bool(known),  # each run tells of the sensor that was mapped, so both are one method
+        "known": bool(known),  # each run reports on the sensor that was mapped, so both are one method
         "pairing": str(params.get("pairing", "random")) if joint or known else "random",
         "labels": str(params.get("labels", "true")),
         "reduce": str(params.get("reduce", "")) if ratio < 100 else "",
@@ -77,11 +77,11 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def _place(run: Run) -> tuple[str, str]:
-    """Return the split and the layout of a run's slides: what is told together of results is of one of each."""
+    """Return the split and the layout of a run's slides: what is given together of results is of one of each."""
     split = run.config.get("split", "")
     layouts = {one.get("layout", "time") for one in run.config.get("sensors", {}).values()}
-    told = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
-    return told, "authors" if "authors" in layouts else "time"
+    described = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
+    return described, "authors" if "authors" in layouts else "time"
 
 
 def _whole(runs: Sequence[Run]) -> dict[str, int]:
@@ -93,21 +93,21 @@ def _whole(runs: Sequence[Run]) -> dict[str, int]:
     return whole
 
 
-def _few(run: Run, whole: Mapping[str, int], told: list[float]) -> dict[str, str]:
+def _few(run: Run, whole: Mapping[str, int], described: list[float]) -> dict[str, str]:
     """Return the number of training slides of a run where it has not all, and the sensor that this is so for if not all.
 
-    Numbers are rounded to those of other runs that have about as many; ``told`` has the shares of before. A sensor that
-    learns from some batches alone has all slides: that is a setting.
+    Numbers are rounded to those of other runs that have about as many; ``described`` has the fractions of before. A
+    sensor that learns from some batches alone has all slides: that is a setting.
     """
     fewer = {}
     for sensor in ordered(set(run.trained)):
-        share = run.trained[sensor] / max(whole[sensor], 1)
-        if share > _SAME:
+        fraction = run.trained[sensor] / max(whole[sensor], 1)
+        if fraction > _SAME:
             continue
-        same = [one for one in told if _SAME < one / share < 1 / _SAME]
+        same = [one for one in described if _SAME < one / fraction < 1 / _SAME]
         if not same:
-            told.append(share)
-        fewer[sensor] = str(round((same or [share])[0] * whole[sensor]))
+            described.append(fraction)
+        fewer[sensor] = str(round((same or [fraction])[0] * whole[sensor]))
     if set(fewer) == set(run.trained) and len(set(fewer.values())) == 1:
         return {"few": next(iter(fewer.values())), "few_of": ""}
     few = ", ".join(f"{shown(sensor)} {count}" for sensor, count in fewer.items())

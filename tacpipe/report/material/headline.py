@@ -32,34 +32,39 @@ def headlines(methods: Sequence[Method]) -> list[Headline]:
 
 
 def sentences(methods: Sequence[Method]) -> list[tuple[str, str]]:
-    """Return the best method of each sensor with its verdict, what joint learning does, and what controls say.
+    """Return the best method of each sensor with its verdict, what joint learning does, and what controls state.
 
     Only the first are about baselines, so the others have no verdict.
     """
     plain = [one for one in methods if one.plain]
     found = [_best(plain, sensor) for sensor in tables.sensors_of(plain)]
-    told = []
+    described = []
     main = comparison.main(plain)
     if main:
-        told += _joint(main, [one for one in plain if one.kind == "RAEC independent"])
-        told.append(control(main, [one for one in methods if comparison.control(one)]))
-    told += zero_shot.sentences(methods)
-    return [*(one for one in found if one[0]), *((" ".join(told), "") for told in [list(filter(None, told))] if told)]
+        described += _joint(main, [one for one in plain if one.kind == "RAEC independent"])
+        described.append(control(main, [one for one in methods if comparison.control(one)]))
+    described += zero_shot.sentences(methods)
+    return [
+        *(one for one in found if one[0]),
+        *((" ".join(described), "") for described in [list(filter(None, described))] if described),
+    ]
 
 
 def control(joint: Method, controls: Sequence[Method]) -> str:
-    """Return what training on pairs of permuted materials says of the alignment of real ones, as far as there is one."""
+    """Return what training on pairs of permuted materials states of the alignment of real ones, as far as there is one."""
     permuted = comparison.nearest(joint, controls)
     if permuted is None:
         return NO_CONTROL
     apart = [_last_alignment(one) for one in (joint, permuted)]
     swaps = [_swapped(one) for one in (joint, permuted)]
     if any(math.isnan(one) for one in apart) or not swaps[0] or set(swaps[0]) - set(swaps[1]):
-        return (
-            "A run with permuted materials is there, but no latent difference or exchanged classifier to judge it by."
-        )
+        return "A run with permuted materials is there, but no latent difference or exchanged classifier to evaluate it by."
     costs = [
-        {name: found.share - swaps[at][name].share for name in swaps[0] if (found := accuracy(one.of(name), name))}
+        {
+            name: found.fraction - swaps[at][name].fraction
+            for name in swaps[0]
+            if (found := accuracy(one.of(name), name))
+        }
         for at, one in enumerate((joint, permuted))
     ]
     if max(costs[0].values()) > APART:
@@ -72,7 +77,7 @@ def control(joint: Method, controls: Sequence[Method]) -> str:
     numbers = (
         f"latent difference {markup.number(apart[1])} against {markup.number(apart[0])}; classifiers exchanged: "
         + ", ".join(
-            f"{shown(sensor)} {wording.percent(swaps[1][sensor].share)} % against {wording.percent(one.share)} %"
+            f"{shown(sensor)} {wording.percent(swaps[1][sensor].fraction)} % against {wording.percent(one.fraction)} %"
             for sensor, one in swaps[0].items()
         )
     )
@@ -95,8 +100,10 @@ def _best(methods: Sequence[Method], sensor: str) -> tuple[str, str]:
     assert found is not None and compared is not None  # the leader was evaluated
     several = len([one for one in methods if one.of(sensor)]) > 1
     best = "is the best method and " if several else ""
-    told = f"{shown(sensor)}: {method.name} {best}names {_share(found)} of unseen slides right; it {clause(compared)}."
-    return told, compared.verdict
+    described = (
+        f"{shown(sensor)}: {method.name} {best}names {_fraction(found)} of unseen slides right; it {clause(compared)}."
+    )
+    return described, compared.verdict
 
 
 def _headline(methods: Sequence[Method], sensor: str) -> Headline | None:
@@ -107,7 +114,7 @@ def _headline(methods: Sequence[Method], sensor: str) -> Headline | None:
     runs = method.of(sensor)
     right: dict[str, dict[tuple[object, str], tuple[int, int]]] = {}
     for run in runs:
-        for predictor in run.predictions.said:
+        for predictor in run.predictions.predicted:
             for name, one in named_right(run, sensor, predictor).items():
                 key = run.params.get("seed"), name
                 times, asked = right.setdefault(predictor, {}).get(key, (0, 0))
@@ -121,7 +128,7 @@ def _joint(joint: Method, others: Sequence[Method]) -> list[str]:
     alone = comparison.nearest(joint, others)
     if alone is None:
         return ["No independently trained RAEC is among the results, so what joint learning does was not tested."]
-    told = []
+    described = []
     for sensor in joint.sensors:
         found = comparison.difference(joint.of(sensor), alone.of(sensor), sensor)
         if found:
@@ -130,8 +137,8 @@ def _joint(joint: Method, others: Sequence[Method]) -> list[str]:
                 "worse": f"hurts RAEC on {shown(sensor)}",
                 "unclear": f"makes no difference to RAEC on {shown(sensor)} that these slides could show",
             }[found.word]
-            told.append(f"Joint learning {verb}: {_difference(found)}.")
-    return told
+            described.append(f"Joint learning {verb}: {_difference(found)}.")
+    return described
 
 
 def _difference(found: Difference) -> str:
@@ -144,10 +151,10 @@ def _difference(found: Difference) -> str:
     )
 
 
-def _share(found: Accuracy) -> str:
+def _fraction(found: Accuracy) -> str:
     runs = f" in {found.runs} runs" if found.runs > 1 else ""
     return (
-        f"{wording.percent(found.share)} % ({found.correct} of {found.judged}{runs}; 95 % interval "
+        f"{wording.percent(found.fraction)} % ({found.correct} of {found.evaluated}{runs}; 95 % interval "
         f"{wording.percent(found.low)} to {wording.percent(found.high)} %)"
     )
 
@@ -159,5 +166,5 @@ def _last_alignment(method: Method) -> float:
 
 
 def _swapped(method: Method) -> dict[str, Accuracy]:
-    told = {sensor: accuracy(method.of(sensor), sensor, SWAPPED) for sensor in method.sensors}
-    return {sensor: found for sensor, found in told.items() if found}
+    described = {sensor: accuracy(method.of(sensor), sensor, SWAPPED) for sensor in method.sensors}
+    return {sensor: found for sensor, found in described.items() if found}

@@ -16,7 +16,7 @@ NOTE = (
     "Latents of unseen slides on their first two principal components, both sensors together: a colour is a material, whose "
     "number stands at the mean of the first sensor's slides. A line leads from there to the mean of the other sensor's "
     "slides of the material that it was paired with, so short lines are what alignment makes. Where permuted pairs have "
-    "lines as short, that sensors lie together is no evidence that they feel the same."
+    "lines as short, that sensors lie together is not evidence that they measure the same."
 )
 
 

@@ -33,7 +33,7 @@ _PLAIN = {
 
 @dataclass(frozen=True)
 class Run:
-    """One result: a model trained once and judged once."""
+    """One result: a model trained once and evaluated once."""
 
     dataset: Dataset
     config: Tree
@@ -58,7 +58,7 @@ class Run:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """The sensors whose slides the model was judged on."""
+        """The sensors whose slides the model was evaluated on."""
         return ordered(set(self.predictions.sensors.tolist()))
 
     @property
@@ -101,8 +101,8 @@ class Method:
     """Runs that differ in seed or fold alone."""
 
     name: str
-    settings: Tree  # what makes it this method, as `grouped` tells
-    marks: tuple[str, ...]  # what tells it from others of its kind
+    settings: Tree  # what makes it this method, as `grouped` states
+    marks: tuple[str, ...]  # what distinguishes it from others of its kind
     runs: tuple[Run, ...]
 
     @property
@@ -128,7 +128,7 @@ class Method:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """The sensors that any of its runs was judged on."""
+        """The sensors that any of its runs was evaluated on."""
         return ordered({sensor for run in self.runs for sensor in run.sensors})
 
     @property
@@ -142,11 +142,11 @@ class Method:
         return all(run.published for run in self.runs)
 
     def differs_only(self, *names: str) -> bool:
-        """Say whether, but for these settings, it is as `plain` asks."""
+        """Return whether, but for these settings, it is as `plain` asks."""
         return all(name in names or self.settings[name] in usual for name, usual in _PLAIN.items())
 
     def of(self, sensor: str) -> list[Run]:
-        """Return the runs that were judged on slides of ``sensor``."""
+        """Return the runs that were evaluated on slides of ``sensor``."""
         return [run for run in self.runs if sensor in run.sensors]
 
     def key_without(self, *names: str) -> str:
@@ -185,7 +185,7 @@ def kept(slides: int, batch: int, ratio: int) -> int:
 
 
 def base_name(settings: Tree, variants: bool = True) -> str:
-    """Return the name that a method has before it is told from others like it."""
+    """Return the name that a method has before it is derived from others like it."""
     architecture = str(settings["architecture"])
     name = _ARCHITECTURES.get(architecture, architecture)
     if settings["known"]:

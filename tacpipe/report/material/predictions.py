@@ -1,4 +1,4 @@
-"""What a result's model and baselines said of each slide that the model has not seen."""
+"""What a result's model and baselines stated of each slide that the model has not seen."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.floating[Any]]
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
 PREDICTORS = (MODEL, LEVEL, SHUFFLED, SWAPPED, LAST)
-NOTHING = -1  # stands where a predictor said nothing of a slide
+NOTHING = -1  # stands where a predictor stated nothing of a slide
 
 
 @dataclass(frozen=True)
@@ -27,21 +27,24 @@ class Predictions:
     recordings: NDArray[np.str_]  # (slide,)
     sensors: NDArray[np.str_]  # (slide,)
     materials: NDArray[np.int64]  # (slide,), the truth
-    said: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
+    predicted: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
     latents: Floats | None  # (slide, latent); None where the model has none
-    sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that tell of none
+    sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
 
     def of(self, sensor: str) -> Predictions:
         """Return the rows of one sensor."""
         rows = self.sensors == sensor
-        said = {name: values[rows] for name, values in self.said.items()}
+        predicted = {name: values[rows] for name, values in self.predicted.items()}
         latents = None if self.latents is None else self.latents[rows]
         sessions = None if self.sessions is None else self.sessions[rows]
-        return Predictions(self.recordings[rows], self.sensors[rows], self.materials[rows], said, latents, sessions)
+        return Predictions(
+            self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, sessions
+        )
 
     @property
     def one_session_each(self) -> bool:
-        """Whether all slides of a material that a sensor felt are of one session, so that both cannot be told apart."""
+        """Whether all slides of a material that a sensor measured are of one session, so that both cannot be
+        distinguished."""
         if self.sessions is None or not len(self.sessions) or (self.sessions == "").any():
             return False
         sessions: dict[tuple[str, int], set[str]] = {}
@@ -51,7 +54,7 @@ class Predictions:
 
 
 def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
-    """Return what the table ``predictions`` of a result says of slides that its model has not seen.
+    """Return what the table ``predictions`` of a result states of slides that its model has not seen.
 
     As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
     of the last batch where the model's ``config`` leaves it out, nor those of a sensor whose network was only taken over.

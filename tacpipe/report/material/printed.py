@@ -1,4 +1,4 @@
-"""What the paper printed, in percent: it stands beside our numbers and is never averaged with them."""
+"""What the paper printed, in percent: it is next to our numbers and is never averaged with them."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ SLIDE, PROFILE = "slide", "profile"
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset holds slides."""
+    """Return whether a dataset holds slides."""
     return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.recordings.values())
 
 
@@ -58,8 +58,8 @@ def _counts(shards: Sequence[Recording], sensor: str) -> str:
         return f"{some} of {shown(sensor)}."
     text = f"{some} of {shown(sensor)}, {len(outside):,} of them outside the protocol"
     reasons = Counter(str(one.attributes.get("outside_protocol_why", "")) for one in outside)
-    told = [f"{count} {reason}" for reason, count in reasons.most_common() if reason]
-    return text + (f" ({listed(told)})." if told else ".")
+    described = [f"{count} {reason}" for reason, count in reasons.most_common() if reason]
+    return text + (f" ({listed(described)})." if described else ".")
 
 
 def _figures(shard: Recording, sensor: str, published: bool) -> str:

@@ -19,14 +19,14 @@ JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 def tables(methods: Sequence[Method]) -> str:
     """Return a table a reduced sensor, in the paper's form; empty where no sensor was reduced or other data are shown.
 
-    A sensor is reduced where it learns from a share of the batches, as in the paper, or where a split gave it fewer
+    A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
     """
     chosen = [one for one in methods if one.differs_only("reduce", "few")]
     if not all(one.published for one in chosen):
         return ""
-    told = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("reduce", "few_of")}
-    return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in told)
+    described = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("reduce", "few_of")}
+    return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in described)
 
 
 def _table(methods: Sequence[Method], reduced: str) -> str:
@@ -57,10 +57,10 @@ def _cell(methods: Sequence[Method], sensor: str) -> str:
     """Return the accuracy of that of some methods that has most runs."""
     held = [one for one in methods if one.of(sensor)]
     chosen = max(held, key=lambda one: len(one.of(sensor)), default=None)
-    return wording.share(accuracy(chosen.of(sensor), sensor)) if chosen else NONE
+    return wording.fraction(accuracy(chosen.of(sensor), sensor)) if chosen else NONE
 
 
 def _as_many(method: Method, slides: int, sensor: str) -> bool:
-    """Say whether a method learned from about so many slides of a sensor."""
-    told = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
-    return bool(told) and SAME < max(told) / slides < 1 / SAME
+    """Return whether a method learned from about so many slides of a sensor."""
+    described = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
+    return bool(described) and SAME < max(described) / slides < 1 / SAME

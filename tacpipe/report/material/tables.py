@@ -1,4 +1,4 @@
-"""The tables in which methods stand beside each other."""
+"""The tables in which methods are next to each other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def accuracies(methods: Sequence[Method]) -> str:
     """Return accuracy and skill of each method and baseline; where the slides are the paper's, as its Table I has them."""
     plain = [one for one in methods if one.plain]
     published = all(one.published for one in plain)
-    last = published or any(LAST in run.predictions.said for one in plain for run in one.runs)
+    last = published or any(LAST in run.predictions.predicted for one in plain for run in one.runs)
     parts = ["", *(["last epoch"] if last else []), "skill", *(["paper"] if published else [])]
     sensors = sensors_of(plain)
     rows: list[list[str]] = []
@@ -41,8 +41,8 @@ def accuracies(methods: Sequence[Method]) -> str:
         cells = []
         for sensor in sensors:
             found = accuracy(source.of(sensor), sensor, predictor)
-            told = markup.decimals(skill(source.of(sensor), sensor, predictor)) if found else NONE
-            values = {"": wording.share(found), "skill": told.replace("+nan", NONE)}
+            described = markup.decimals(skill(source.of(sensor), sensor, predictor)) if found else NONE
+            values = {"": wording.fraction(found), "skill": described.replace("+nan", NONE)}
             cells += [values.get(part, NONE) for part in parts]
         kinds[len(rows)] = "quiet"
         rows.append([name, *cells, str(len(source.runs))])
@@ -59,13 +59,13 @@ def elsewhere(methods: Sequence[Method]) -> str:
     sensors = sensors_of(others)
     rows = []
     for method in others:
-        told = [method.of(sensor) for sensor in sensors]
+        described = [method.of(sensor) for sensor in sensors]
         cells = [
             cell
-            for sensor, runs in zip(sensors, told, strict=True)
+            for sensor, runs in zip(sensors, described, strict=True)
             for cell in (
-                wording.share(accuracy(runs, sensor)),
-                wording.share(accuracy(runs, sensor, LEVEL)),
+                wording.fraction(accuracy(runs, sensor)),
+                wording.fraction(accuracy(runs, sensor, LEVEL)),
                 markup.decimals(skill(runs, sensor)).replace("+nan", NONE),
             )
         ]
@@ -79,16 +79,16 @@ def elsewhere(methods: Sequence[Method]) -> str:
 
 def swaps(methods: Sequence[Method]) -> str:
     """Return Table II: accuracy before and after classifiers are exchanged; empty where none were."""
-    held = [one for one in methods if any(SWAPPED in run.predictions.said for run in one.runs)]
+    held = [one for one in methods if any(SWAPPED in run.predictions.predicted for run in one.runs)]
     held = [one for one in held if (one.plain or comparison.control(one)) and not one.settings["known"]]
     sensors = sensors_of(held)
     rows = []
     for method in held:
         row = [method.name]
         for sensor in sensors:
-            runs = [run for run in method.of(sensor) if SWAPPED in run.predictions.said]
+            runs = [run for run in method.of(sensor) if SWAPPED in run.predictions.predicted]
             lost = comparison.difference(runs, runs, sensor, (SWAPPED, MODEL))
-            row += [wording.share(accuracy(runs, sensor, name)) for name in (MODEL, SWAPPED)]
+            row += [wording.fraction(accuracy(runs, sensor, name)) for name in (MODEL, SWAPPED)]
             row.append(wording.points(lost.mean) if lost else NONE)
         rows.append([*row, str(len(method.runs))])
     if not rows:
@@ -102,8 +102,10 @@ def swaps(methods: Sequence[Method]) -> str:
     cells = []
     for sensor in sensors:
         before, after = printed.ACCURACIES["RAEC joint"].get(sensor), printed.SWAPPED.get(sensor)
-        told = [NONE] * 3 if before is None or after is None else [f"{before:.2f}", f"{after:.2f}"]
-        cells += told if len(told) == 3 else [*told, wording.points(((after or 0) - (before or 0)) / 100)]
+        described = [NONE] * 3 if before is None or after is None else [f"{before:.2f}", f"{after:.2f}"]
+        cells += (
+            described if len(described) == 3 else [*described, wording.points(((after or 0) - (before or 0)) / 100)]
+        )
     rows.append(["paper: RAEC joint", *cells, NONE])
     return markup.table(title, heads, rows, {len(rows) - 1: "quiet"})
 
@@ -152,50 +154,50 @@ def every_run(methods: Sequence[Method]) -> str:
                     f"{float(run.config['seconds']):,.0f}" if "seconds" in run.config else NONE,
                 ]
             )
-    judged = [f"{shown(sensor)} {part}" for sensor in sensors for part in ("(%)", "slides")]
-    heads = ["", "fold", "seed", "slides learned from", *judged, "kept epoch", "epochs", "seconds"]
+    evaluated = [f"{shown(sensor)} {part}" for sensor in sensors for part in ("(%)", "slides")]
+    heads = ["", "fold", "seed", "slides learned from", *evaluated, "kept epoch", "epochs", "seconds"]
     return f"<details><summary>All {len(rows)} runs</summary>{markup.table('Each run', heads, rows)}</details>"
 
 
 def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
-    """Return the sensors that any of some methods was judged on."""
+    """Return the sensors that any of some methods was evaluated on."""
     return ordered({sensor for method in methods for sensor in method.sensors})
 
 
 def leader(methods: Sequence[Method], sensor: str) -> Method | None:
     """Return the method that names most slides of a sensor right; of two that name as many, the first."""
-    scores = [(found.share, one) for one in methods if (found := accuracy(one.of(sensor), sensor))]
+    scores = [(found.fraction, one) for one in methods if (found := accuracy(one.of(sensor), sensor))]
     return max(scores, key=lambda score: score[0])[1] if scores else None
 
 
 def reference(methods: Sequence[Method]) -> Method:
-    """Return the method whose runs tell of the baselines, which are nearly the same for all of a split.
+    """Return the method whose runs report on the baselines, which are nearly the same for all of a split.
 
     It has most baselines, and if it can be it is the one whose shuffled labels went through the strongest readout.
     """
 
     def place(one: Method) -> tuple[int, bool, int]:
-        said = {(name, sensor) for run in one.runs for name in run.predictions.said for sensor in run.sensors}
-        return sum(name in BASELINES for name, _ in said), one.kind == "MiniRocket", len(one.runs)
+        predicted = {(name, sensor) for run in one.runs for name in run.predictions.predicted for sensor in run.sensors}
+        return sum(name in BASELINES for name, _ in predicted), one.kind == "MiniRocket", len(one.runs)
 
     return max(methods, key=place)
 
 
 def _row(method: Method, sensors: Sequence[str], kind: str, parts: Sequence[str]) -> list[str]:
-    """Return what the table of accuracies says of a method, a cell a sensor and part."""
+    """Return what the table of accuracies states of a method, a cell a sensor and part."""
     cells = []
     for sensor in sensors:
         runs = method.of(sensor)
         found = accuracy(runs, sensor)
         last = accuracy(runs, sensor, LAST)
         worth = skill(runs, sensor)
-        told = {
-            "": wording.share(found),
-            "last epoch": wording.percent(last.share) if last else NONE,
+        described = {
+            "": wording.fraction(found),
+            "last epoch": wording.percent(last.fraction) if last else NONE,
             "skill": NONE if np.isnan(worth) else markup.decimals(worth),
             "paper": _paper(kind, sensor) if found else NONE,
         }
-        cells += [told[part] for part in parts]
+        cells += [described[part] for part in parts]
     return cells
 
 
@@ -208,7 +210,7 @@ def _accuracies_of(run: Run, sensors: Sequence[str]) -> list[str]:
     cells = []
     for sensor in sensors:
         found = accuracy([run], sensor)
-        cells += [wording.percent(found.share), str(found.judged)] if found else [NONE, NONE]
+        cells += [wording.percent(found.fraction), str(found.evaluated)] if found else [NONE, NONE]
     return cells
 
 
@@ -217,5 +219,5 @@ def _epochs(run: Run) -> list[str]:
     if not run.history:
         return [NONE, NONE]
     kept = run.config.get("validation", {}).get("epoch", {})
-    told = dict.fromkeys(kept[sensor] for sensor in ordered(set(kept)))  # one where sensors were learned jointly
-    return [" / ".join(str(epoch) for epoch in told) or NONE, str(len(run.history))]
+    described = dict.fromkeys(kept[sensor] for sensor in ordered(set(kept)))  # one where sensors were learned jointly
+    return [" / ".join(str(epoch) for epoch in described) or NONE, str(len(run.history))]

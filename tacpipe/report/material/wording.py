@@ -1,4 +1,4 @@
-"""How numbers of this task are written: percentages, points, p values, and what must be said beside an accuracy."""
+"""How numbers of this task are written: percentages, points, p values, and what must be stated next to an accuracy."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from tacpipe.report.material.accuracy import Accuracy
 from tacpipe.report.material.methods import Method
 
 SESSIONS = (
-    "Each material was recorded in one session, so texture cannot be told apart from session in these data: a model that "
+    "Each material was recorded in one session, so texture cannot be distinguished from session in these data: a model that "
     "recognises a session by its drift or its mean level is right as well."
 )
 SIMULATED = "These slides were simulated: nothing here is evidence about a real sensor."
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these slides cannot show, beside every table of accuracies; empty where nothing is known against them."""
+    """Return what these slides cannot show, next to every table of accuracies; empty where nothing is known against them."""
     if any(one.simulated for one in methods):
         return SIMULATED
     runs = [run for one in methods for run in one.runs]
@@ -33,22 +33,22 @@ def form(what: str, text: str, published: bool) -> str:
     return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
 
 
-def percent(share: float) -> str:
+def percent(fraction: float) -> str:
     """Return a share in percent.
 
     >>> percent(0.995), percent(float("nan"))
     ('99.5', '–')
     """
-    return NONE if math.isnan(share) else f"{100 * share:.1f}"
+    return NONE if math.isnan(fraction) else f"{100 * fraction:.1f}"
 
 
-def points(share: float) -> str:
+def points(fraction: float) -> str:
     """Return a difference of shares in percentage points, with its sign.
 
     >>> points(-0.0245), points(0.0)
     ('−2.5', '+0.0')
     """
-    return f"{100 * share + 0.0:+.1f}".replace("-", "−")
+    return f"{100 * fraction + 0.0:+.1f}".replace("-", "−")
 
 
 def p_value(p: float) -> str:
@@ -60,12 +60,12 @@ def p_value(p: float) -> str:
     return NONE if math.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
 
 
-def share(found: Accuracy | None) -> str:
+def fraction(found: Accuracy | None) -> str:
     """Return an accuracy and its standard deviation over runs, above what it rests on and its interval."""
-    return counted(found.correct, found.judged, found.low, found.high, found.sd) if found else NONE
+    return counted(found.correct, found.evaluated, found.low, found.high, found.sd) if found else NONE
 
 
-def counted(correct: int, judged: int, low: float, high: float, sd: float) -> Markup:
+def counted(correct: int, evaluated: int, low: float, high: float, sd: float) -> Markup:
     """Return a share in percent, with its standard deviation where there is one, above what it rests on.
 
     >>> counted(190, 200, 0.91, 0.97, float("nan"))
@@ -73,7 +73,7 @@ def counted(correct: int, judged: int, low: float, high: float, sd: float) -> Ma
     """
     spread = "" if math.isnan(sd) else f" ± {percent(sd)}"
     return Markup(
-        f"{percent(correct / judged)}{spread}<br><small>{correct}/{judged} · {percent(low)} to {percent(high)}</small>"
+        f"{percent(correct / evaluated)}{spread}<br><small>{correct}/{evaluated} · {percent(low)} to {percent(high)}</small>"
     )
 
 

@@ -30,7 +30,7 @@ class Untold:
     kind: str
     main: bool  # whether nothing else sets them apart
     sensor: str
-    trees: tuple[Tree, ...]  # what metrics tell of the held-out materials, one a run
+    trees: tuple[Tree, ...]  # what metrics report on the held-out materials, one a run
     materials: int  # that a run held out
 
 
@@ -47,26 +47,26 @@ def table(methods: Sequence[Method]) -> str:
         return ""
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
     caution = wording.caution(methods)
-    told = markup.table("Zero shot: accuracy on held-out materials", heads, rows)
-    return f"<h3>Materials that one sensor never saw</h3>{told}{markup.note(NOTE + caution)}"
+    described = markup.table("Zero shot: accuracy on held-out materials", heads, rows)
+    return f"<h3>Materials that one sensor never saw</h3>{described}{markup.note(NOTE + caution)}"
 
 
 def sentences(methods: Sequence[Method]) -> list[str]:
     """Return whether one sensor's classifier names what the other never learned, a sentence a method and sensor."""
-    told = []
+    described = []
     for one in untold(methods):
-        correct, judged, low, high = _counts(one.trees, one.sensor, one.materials)
-        if not judged or not one.main:
+        correct, evaluated, low, high = _counts(one.trees, one.sensor, one.materials)
+        if not evaluated or not one.main:
             continue
         chance = _at(one.trees[0], "chance", one.sensor)
-        unsure = "which cannot be told from chance"
+        unsure = "which cannot be distinguished from chance"
         word = "above chance" if low > chance else "below chance" if high < chance else unsure
-        told.append(
+        described.append(
             f"Of {shown(one.sensor)} slides of materials that it never learned, the other sensor's classifier names "
-            f"{wording.percent(correct / judged)} % right ({one.kind}, {correct} of {judged}; 95 % interval "
+            f"{wording.percent(correct / evaluated)} % right ({one.kind}, {correct} of {evaluated}; 95 % interval "
             f"{wording.percent(low)} to {wording.percent(high)} %), {word} ({wording.percent(chance)} %)."
         )
-    return told
+    return described
 
 
 def untold(methods: Sequence[Method]) -> list[Untold]:
@@ -95,33 +95,35 @@ def _counts(trees: Sequence[Tree], sensor: str, materials: int) -> tuple[int, in
     Slides of one material lie together and are right or wrong together, also by chance; so a run counts as no more trials
     than it has held-out ``materials``.
     """
-    correct, judged = (sum(int(_at(tree, name, sensor)) for tree in trees) for name in ("correct", "n"))
-    if not judged:
+    correct, evaluated = (sum(int(_at(tree, name, sensor)) for tree in trees) for name in ("correct", "n"))
+    if not evaluated:
         return 0, 0, float("nan"), float("nan")
     trials = materials * len(trees)
-    return correct, judged, *wilson(round(correct / judged * trials), trials)
+    return correct, evaluated, *wilson(round(correct / evaluated * trials), trials)
 
 
 def _held_out(method: Method, sensor: str) -> int:
     """Return how many materials were held out of a sensor's labels, from a setting like ``roboskin=17,18``."""
     parts = (part.strip().partition("=") for part in str(method.settings["hold_out"]).split(";"))
-    return max(sum(bool(one.strip()) for name, _, told in parts if name == sensor for one in told.split(",")), 1)
+    return max(
+        sum(bool(one.strip()) for name, _, described in parts if name == sensor for one in described.split(",")), 1
+    )
 
 
 def _cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str]:
-    """Return what runs say of the held-out materials of one sensor."""
-    correct, judged, low, high = _counts(trees, sensor, materials)
-    if not judged:
+    """Return what runs state of the held-out materials of one sensor."""
+    correct, evaluated, low, high = _counts(trees, sensor, materials)
+    if not evaluated:
         return [NONE, NONE, str(len(trees))]
     spread = (
         float(np.std([_at(tree, "accuracy", sensor) for tree in trees], ddof=1)) if len(trees) > 1 else float("nan")
     )
     chance = float(np.mean([_at(tree, "chance", sensor) for tree in trees]))
-    told = wording.counted(correct, judged, low, high, spread)
-    return [told, wording.percent(chance), str(len(trees))]
+    described = wording.counted(correct, evaluated, low, high, spread)
+    return [described, wording.percent(chance), str(len(trees))]
 
 
 def _at(tree: Tree, name: str, sensor: str) -> float:
-    """Return a number of a result, told for all sensors or by sensor."""
+    """Return a number of a result, stated for all sensors or by sensor."""
     value = tree.get(name, float("nan"))
     return float(value[sensor] if isinstance(value, Mapping) else value)

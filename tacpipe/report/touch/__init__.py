@@ -1,4 +1,4 @@
-"""The part of the page that tells of touch: how well a cloud and a grasp foretell what fingers feel."""
+"""The part of the page that reports on touch: how well a cloud and a grasp predict what fingers measure."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ TITLE = "prediction of fingertip readings from point clouds"
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset that is no result helps to tell of touch: one of clouds and grasps does."""
+    """Return whether a dataset that is not a result helps to report on touch: one of clouds and grasps does."""
     return clouds.reads(dataset)
 
 
 def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> str:
-    """Return what ``results`` of this task tell, pooled by method; ``others`` are datasets that `reads` takes.
+    """Return what ``results`` of this task state, pooled by method; ``others`` are datasets that `reads` takes.
 
-    A result without predictions of unseen grasps has nothing to compare and is told as its metrics name it. Nothing is
+    A result without predictions of unseen grasps has nothing to compare and is given as its metrics name it. Nothing is
     drawn over time, so ``traces`` is of no effect.
     """
     runs = [Run.read(one) for one in results if PREDICTIONS in one.recordings]

@@ -1,4 +1,4 @@
-"""Clouds with the grasps made on them, drawn where a dataset of grasps is given beside results."""
+"""Clouds with the grasps made on them, drawn where a dataset of grasps is given next to results."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ SHOWN = 3
 
 
 def reads(dataset: Dataset) -> bool:
-    """Say whether a dataset holds clouds with grasps."""
+    """Return whether a dataset holds clouds with grasps."""
     return any(_whole(shard) for shard in dataset.recordings.values())
 
 
 def section(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> str:
-    """Return the clouds of ``chosen`` grasps, told with the words beside their names; empty without any dataset.
+    """Return the clouds of ``chosen`` grasps, stated with the words next to their names; empty without any dataset.
 
     Where none of them is there, the first grasps are drawn.
     """
     shards = {name: shard for one in datasets for name, shard in one.recordings.items() if _whole(shard)}
     if not shards:
         return ""
-    told = {name: words for name, words in chosen.items() if name in shards} or dict.fromkeys(
+    described = {name: words for name, words in chosen.items() if name in shards} or dict.fromkeys(
         sorted(shards)[:SHOWN], ""
     )
-    drawn = [_figure(shards[name], words) for name, words in told.items()]
+    drawn = [_figure(shards[name], words) for name, words in described.items()]
     note = (
         "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the "
         "cloud, though a finger may touch it."

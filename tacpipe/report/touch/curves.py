@@ -10,8 +10,10 @@ from tacpipe.report import epochs, markup
 from tacpipe.report.touch import forms, wording
 from tacpipe.report.touch.methods import PAPERS, Group, Method, Run
 
-ALL = "all"  # stands where one network foretells all targets
-UNWATCHED = " Where no grasps were kept for validation, it is the loss on those of training, judged after each epoch."
+ALL = "all"  # stands where one network predicts all targets
+UNWATCHED = (
+    " Where no grasps were kept for validation, it is the loss on those of training, evaluated after each epoch."
+)
 
 
 def section(group: Group) -> str:
@@ -39,8 +41,8 @@ def figure_8(methods: Sequence[Method]) -> str:
         return ""
     method, target = max(found, key=lambda one: (len(_curves(one[0], one[1], "train_loss")[0]), len(one[0].runs)))
     named = {"training": "train_loss", "validation": "val_loss"}
-    curves = {name: told for name, loss in named.items() if (told := _curves(method, target, loss))}
-    quantity = "loss (RMSE, share of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
+    curves = {name: described for name, loss in named.items() if (described := _curves(method, target, loss))}
+    quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
     svg = epochs.by_epoch(curves, quantity, "Training and validation loss by epoch", log=True)
     simulated = " Simulated." if method.simulated else ""
     text = f"training and validation loss by epoch, {method.name}, {wording.TARGETS.get(target, 'all targets')}."
@@ -53,15 +55,15 @@ def figure_8(methods: Sequence[Method]) -> str:
 
 
 def losses(run: Run, target: str, name: str) -> list[float]:
-    """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none tells it.
+    """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none states it.
 
-    The mean ends where the first network does. NaN stands where an epoch does not tell the loss.
+    The mean ends where the first network does. NaN stands where an epoch does not state the loss.
     """
     networks: dict[object, list[float]] = {}
     for line in run.history:
         if line.get("target", ALL) == target:
-            told = line.get(name)
-            networks.setdefault(line.get("network"), []).append(float("nan") if told is None else float(told))
+            described = line.get(name)
+            networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
     length = min(map(len, networks.values()), default=0)
     mean = [sum(values) / len(values) for values in zip(*(one[:length] for one in networks.values()), strict=True)]
     return mean if any(not math.isnan(value) for value in mean) else []
@@ -72,6 +74,6 @@ def _curves(method: Method, target: str, name: str) -> list[list[float]]:
 
 
 def _unwatched(methods: Sequence[Method]) -> str:
-    """Return what must be said where some runs had no validation grasps."""
+    """Return what must be stated where some runs had no validation grasps."""
     runs = [run for one in methods for run in one.runs if run.history]
     return UNWATCHED if any(run.config.get("counts", {}).get("val") == 0 for run in runs) else ""

@@ -1,4 +1,4 @@
-"""Which electrodes are foretold, and how true readings lie beside predicted ones on the fingertips."""
+"""Which electrodes are predicted, and how true readings lie next to predicted ones on the fingertips."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Chosen:
     place: str
     row: int  # among the grasps that were chosen from
     recording: str
-    error: float  # RMSE over the electrodes of both fingers, share of the range
+    error: float  # RMSE over the electrodes of both fingers, fraction of the range
 
 
 def section(method: Method) -> str:
-    """Return the electrodes' R² and some grasps; empty where the method foretells no electrodes."""
+    """Return the electrodes' R² and some grasps; empty where the method predicts no electrodes."""
     fingers = [target for target in FINGERS if target in method.targets]
     if not fingers:
         return ""
@@ -59,12 +59,12 @@ def chosen(runs: Sequence[Run]) -> list[Chosen]:
     if not fingers or not len(rows.recordings):
         return []
     squared = [
-        np.square(biotac_sp.normalised(one, rows.said[MODEL][one]) - biotac_sp.normalised(one, rows.true[one]))
+        np.square(biotac_sp.normalised(one, rows.predicted[MODEL][one]) - biotac_sp.normalised(one, rows.true[one]))
         for one in fingers
     ]
     error = np.sqrt(np.hstack(squared).mean(axis=1))
     order = np.lexsort((rows.recordings, error))
-    found = [(place, int(order[round(share * (len(order) - 1))])) for place, share in PLACES.items()]
+    found = [(place, int(order[round(place_fraction * (len(order) - 1))])) for place, place_fraction in PLACES.items()]
     return [Chosen(place, row, str(rows.recordings[row]), float(error[row])) for place, row in found]
 
 
@@ -83,21 +83,21 @@ def _explained(method: Method, fingers: Sequence[str], known: bool) -> str:
 
 
 def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> str:
-    """Return true beside predicted electrodes of one grasp."""
+    """Return true next to predicted electrodes of one grasp."""
     tips, errors = [], []
     for target in fingers:
         finger = wording.FINGERS[target]
-        true, said = (touch[target][one.row] for touch in (rows.true, rows.said[MODEL]))
-        constant = rows.said.get(CONSTANT, {}).get(target)
+        true, predicted = (touch[target][one.row] for touch in (rows.true, rows.predicted[MODEL]))
+        constant = rows.predicted.get(CONSTANT, {}).get(target)
         usual = rows.true[target].mean(axis=0) if constant is None else constant[one.row]
         widest = float(np.abs(true - usual).max()) or 1.0
-        for title, values in (("true", true), ("predicted", said)):
+        for title, values in (("true", true), ("predicted", predicted)):
             texts = [f"{value:.0f}" for value in values]
             tips.append(Fingertip(f"{finger}, {title}", (usual - values) / widest, texts))
-        errors.append(f"{finger} {regression.rmse(true[None], said[None]):.0f} counts")
+        errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
     known = wording.OBJECTS[bool(rows.known[one.row])].removesuffix("s")
     caption = (
         f"{one.place.capitalize()} by error: {one.recording}, {rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of "
         f"the range; {', '.join(errors)}."
     )
-    return markup.figure(fingertip.draw(tips, f"True beside predicted electrodes of {one.recording}"), caption)
+    return markup.figure(fingertip.draw(tips, f"True next to predicted electrodes of {one.recording}"), caption)

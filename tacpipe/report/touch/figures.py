@@ -1,4 +1,4 @@
-"""The figures of touch: true beside predicted readings, errors of settings, and clouds with their grasps."""
+"""The figures of touch: true next to predicted readings, errors of settings, and clouds with their grasps."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def settings(errors: Mapping[str, Spread], levels: Mapping[str, float], title: s
         marks: dict[str, Any] = {"fmt": "o", "markersize": 6, "capsize": 4, "linewidth": 1.6}
         axes[0].errorbar(places, means, sds, color=COLOURS["model"], label="mean ± sd over runs", **marks)
         axes[0].set_xticks(places, labels=list(errors))
-        axes[0].set(ylim=(0, None), ylabel="RMSE (share of the range)")
+        axes[0].set(ylim=(0, None), ylabel="RMSE (fraction of the range)")
         axes[0].grid(axis="y")
         legend_below(axes[0])
 

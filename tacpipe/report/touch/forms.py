@@ -51,7 +51,7 @@ FORMS = (
     ),
     Form(
         "Figure 9",
-        "what the network is told",
+        "what the network is given",
         "inputs",
         {
             "xyz": "XYZ",
@@ -87,21 +87,21 @@ ORDER = (
 
 ESTIMATED = (
     "How the wrist was turned was not recorded: where it is read here, it is estimated from the two contacts and the "
-    "line of sight, and tells nothing that these do not."
+    "line of sight, and states nothing that these do not."
 )
 
 
 def section(methods: Sequence[Method]) -> str:
     """Return the tables of which at least two rows were run; empty where there is none."""
-    told = "".join(_table(form, methods) for form in FORMS)
+    described = "".join(_table(form, methods) for form in FORMS)
     published = all(one.published for one in methods)
-    return f"{told}{markup.note(printed.SCALES if published else '')}" if told else ""
+    return f"{described}{markup.note(printed.SCALES if published else '')}" if described else ""
 
 
 def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
     """Return the methods of a table by their setting: of the paper's network, alike but for it.
 
-    Of several such families the one with most rows is told, then that with most runs.
+    Of several such families the one with most rows is given, then that with most runs.
     """
     alike: dict[str, dict[object, Method]] = {}
     for method in methods:
@@ -120,11 +120,13 @@ def _table(form: Form, methods: Sequence[Method]) -> str:
     if len(found) < 2:
         return ""
     published = all(one.published for one in found.values())
-    told = {value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names}
-    least = min((one.each.mean, name) for value, name in form.names.items() if (one := told[value]))[1]
-    shown = {value: name for value, name in form.names.items() if published or told[value]}
+    described = {
+        value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names
+    }
+    least = min((one.each.mean, name) for value, name in form.names.items() if (one := described[value]))[1]
+    shown = {value: name for value, name in form.names.items() if published or described[value]}
     rows = [
-        [name, *tables.cells(told[value]), *(_printed(form, value) if published else [])]
+        [name, *tables.cells(described[value]), *(_printed(form, value) if published else [])]
         for value, name in shown.items()
     ]
     kinds = {number: "best" for number, name in enumerate(shown.values()) if name == least}
@@ -141,7 +143,7 @@ def _table(form: Form, methods: Sequence[Method]) -> str:
         ORDER if form.drawn and published else "",
     ]
     notes += [ESTIMATED] if any(one.settings.get("wrist") == "estimated" for one in found.values()) else []
-    drawn = _figure(form, told, dict(baselines)) if form.drawn else ""
+    drawn = _figure(form, described, dict(baselines)) if form.drawn else ""
     table = markup.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)
     return f"{table}{drawn}{markup.note(' '.join(one for one in notes if one))}"
 
@@ -150,8 +152,8 @@ def _printed(form: Form, value: object) -> list[str]:
     return [markup.with_sd(*form.printed[value], digits=5)] if form.printed else []
 
 
-def _figure(form: Form, told: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> str:
-    errors = {form.names[value]: one.each for value, one in told.items() if one}
+def _figure(form: Form, described: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> str:
+    errors = {form.names[value]: one.each for value, one in described.items() if one}
     levels = {name: one.each.mean for name, one in baselines.items() if one}
-    svg = figures.settings(errors, levels, "Error by what the network is told")
+    svg = figures.settings(errors, levels, "Error by what the network is given")
     return markup.figure(svg, "Mean and standard deviation over runs; lines are baselines on the same grasps.")

@@ -1,4 +1,4 @@
-"""Figures 10 and 11 of the paper: errors on known objects beside those on novel ones, of each target."""
+"""Figures 10 and 11 of the paper: errors on known objects next to those on novel ones, of each target."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ PARTS = ("RMSE over runs", "R²", "skill")
 
 
 def section(methods: Sequence[Method]) -> str:
-    """Return the table of the paper's network and that of the default method, where they foretold two targets or more."""
-    told = []
+    """Return the table of the paper's network and that of the default method, where they predicted two targets or more."""
+    described = []
     for architecture in (PAPERS, DEFAULT):
         pairs = _pairs([one for one in methods if one.architecture == architecture])
-        told.append(max(pairs, key=_weight, default=None))
-    return "".join(_table(*pair) for pair in told if pair)
+        described.append(max(pairs, key=_weight, default=None))
+    return "".join(_table(*pair) for pair in described if pair)
 
 
 def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
-    """Return pairs of methods, one judged on known objects and one on novel ones, that are the same or differ in split.
+    """Return pairs of methods, one evaluated on known objects and one on novel ones, that are the same or differ in split.
 
     The paper trains anew, on all grasps of known objects, for novel ones.
     """
@@ -33,7 +33,7 @@ def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
 
 
 def _weight(pair: tuple[Method, Method]) -> tuple[int, int, bool]:
-    """Return how much a pair tells: targets, then runs; of two that tell as much, one method on both."""
+    """Return how much a pair states: targets, then runs; of two that state as much, one method on both."""
     known, novel = pair
     common = set(_targets(known, True)) & set(_targets(novel, False))
     return len(common), len(known.runs) + len(novel.runs), known is novel
@@ -64,7 +64,7 @@ def _table(known: Method, novel: Method) -> str:
     heads += ["paper: test", "paper: novel", "change (%)"] if published else []
     simulated = known.simulated or novel.simulated
     chosen = [known] if known is novel else [known, novel]
-    counted = [max(one.grasps for one in told if one) for told in zip(*pairs, strict=True)]
+    counted = [max(one.grasps for one in described if one) for described in zip(*pairs, strict=True)]
     evaluated = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
     note = f"{wording.basis(chosen)} {evaluated} {printed.FOUND_ON if published else ''} {wording.caution(chosen)}"
     title = f"{wording.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known.name}"
@@ -87,7 +87,7 @@ def _part(found: Score | None) -> list[str]:
 def _printed(target: str) -> list[str]:
     one = printed.FINAL[target]
     pairs = ((one.test, one.test_counts), (one.novel, one.novel_counts))
-    return [*(_above_counts(f"{share:.5f}", str(counts)) for share, counts in pairs), f"+{one.change}"]
+    return [*(_above_counts(f"{percentage:.5f}", str(counts)) for percentage, counts in pairs), f"+{one.change}"]
 
 
 def _above_counts(error: str, counts: str) -> Markup:

@@ -30,18 +30,20 @@ def headlines(groups: Sequence[Group]) -> list[Headline]:
 
 def sentences(groups: Sequence[Group]) -> list[tuple[str, str]]:
     """Return how the default method does on known objects and on novel ones, for each split, with the verdict of each."""
-    told = []
+    described = []
     # splits on which variants of another network were compared, on one target, have their tables and no sentence
     first = [one for one in groups if one.default.architecture == DEFAULT or len(one.targets) > 1] or groups
     for group in first:
         where = f" ({wording.place(group.split, group.simulated)})" if len(groups) > 1 else ""
-        told += [_known(group, where), _novel(group, where)]
-    return [one for one in told if one[0]]
+        described += [_known(group, where), _novel(group, where)]
+    return [one for one in described if one[0]]
 
 
 def beating(methods: Sequence[Method], target: str, known: bool) -> list[Method]:
     """Return the methods whose gain over their best baseline has an interval above 0."""
-    return [one for one in methods if (told := scores.headline(one, target, known)) and told.verdict == BETTER]
+    return [
+        one for one in methods if (described := scores.headline(one, target, known)) and described.verdict == BETTER
+    ]
 
 
 def _known(group: Group, where: str) -> tuple[str, str]:
@@ -49,15 +51,15 @@ def _known(group: Group, where: str) -> tuple[str, str]:
     found = _compared(group, True)
     if not found:
         return "", ""
-    told = f"Known objects{where}: {_against(group.default, found)}."
+    described = f"Known objects{where}: {_against(group.default, found)}."
     others = {}
     for target, name in wording.TARGETS.items():
         best = scores.best(group.methods, target, True)
         if best and best is not group.default:
             others[name] = f"{best.name} on {name}"
     if others:
-        told += f" Other methods have a lower error there: {listed(list(others.values()))}."
-    return told, headline_of.verdict(found)
+        described += f" Other methods have a lower error there: {listed(list(others.values()))}."
+    return described, headline_of.verdict(found)
 
 
 def _novel(group: Group, where: str) -> tuple[str, str]:
@@ -67,21 +69,21 @@ def _novel(group: Group, where: str) -> tuple[str, str]:
     targets = [target for target in wording.TARGETS if scores.best(tried, target, False)]
     if not targets:
         return "", ""
-    told = f"Novel objects{where}: "
+    described = f"Novel objects{where}: "
     if found and group.default in tried:
-        told += f"{_against(group.default, found)}. "
+        described += f"{_against(group.default, found)}. "
     evident = {target: better for target in targets if (better := beating(tried, target, False))}
     verdict = headline_of.verdict(found)
     if not evident:
         none = f"None of the {len(tried)} methods is" if len(tried) > 1 else f"{tried[0].name} is not"
-        told += f"{none} better than the best baseline with an interval above zero on any target: {NO_EVIDENCE}."
-        return told, verdict
+        described += f"{none} better than the best baseline with an interval above zero on any target: {NO_EVIDENCE}."
+        return described, verdict
     ahead = [
         f"{listed([one.name for one in better])} on {wording.TARGETS[target]}" for target, better in evident.items()
     ]
-    told += f"Better than the best baseline, with an interval above zero: {'; '.join(ahead)}."
+    described += f"Better than the best baseline, with an interval above zero: {'; '.join(ahead)}."
     rest = [wording.TARGETS[target] for target in targets if target not in evident]
-    return (f"{told} On {listed(rest)}, none: {NO_EVIDENCE}." if rest else told), verdict
+    return (f"{described} On {listed(rest)}, none: {NO_EVIDENCE}." if rest else described), verdict
 
 
 def _compared(group: Group, known: bool) -> list[Headline]:
@@ -113,8 +115,8 @@ def _gain(one: Headline) -> str:
 
 def _counted(method: Method, known: bool) -> str:
     """Return on how much a comparison rests."""
-    told = [one for target in method.targets if (one := scores.score(method.runs, target, known))]
-    grasps, objects, runs = (max(getattr(one, name) for one in told) for name in ("grasps", "objects", "runs"))
+    described = [one for target in method.targets if (one := scores.score(method.runs, target, known))]
+    grasps, objects, runs = (max(getattr(one, name) for one in described) for name in ("grasps", "objects", "runs"))
     return (
         f"{headline_of.counted(grasps, 'grasps')} of {headline_of.counted(objects, 'objects')} in "
         f"{headline_of.counted(runs, 'runs')} (95 % intervals over {'grasps' if known else 'objects'})"

@@ -11,7 +11,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import contents, provenance
-from tacpipe.report.naming import told_apart
+from tacpipe.report.naming import distinct_names
 from tacpipe.report.touch import predictions
 from tacpipe.report.touch.predictions import Predictions
 from tacpipe.tasks.touch.result_names import PREDICTIONS
@@ -25,12 +25,12 @@ PAPERS_SETS = ("vision2tactile",)  # whose paper's tables and figures stand next
 PAPERS = "pointnet"  # the architecture of the paper
 DEFAULT = "strong"  # the one that is trained where none is named
 NAMES = {PAPERS: "PointNet"}
-_NO_METHOD = ("seed", "setting", "baselines")  # runs of one method may differ in these; the setting is told as split
+_NO_METHOD = ("seed", "setting", "baselines")  # runs of one method may differ in these; the setting is given as split
 
 
 @dataclass(frozen=True)
 class Run:
-    """One result: a model trained once and judged once."""
+    """One result: a model trained once and evaluated once."""
 
     dataset: Dataset
     config: Tree
@@ -56,7 +56,7 @@ class Run:
 
     @property
     def split(self) -> str:
-        """How grasps were parted into those of training and others, in words; empty where nobody said."""
+        """How grasps were parted into those of training and others, in words; empty where nobody stated."""
         return str(self.config.get("split", ""))
 
     @property
@@ -106,7 +106,7 @@ class Method:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What any of its runs foretells, in the order of tables."""
+        """What any of its runs predicts, in the order of tables."""
         held = {target for run in self.runs for target in run.predictions.targets}
         return tuple(target for target in biotac_sp.TARGETS if target in held)
 
@@ -117,7 +117,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Group:
-    """Methods that were trained and judged on grasps parted in the same way: these can be compared."""
+    """Methods that were trained and evaluated on grasps parted in the same way: these can be compared."""
 
     split: str
     simulated: bool
@@ -125,12 +125,12 @@ class Group:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What any of its methods foretells, in the order of tables."""
+        """What any of its methods predicts, in the order of tables."""
         return tuple(one for one in biotac_sp.TARGETS if any(one in method.targets for method in self.methods))
 
     @property
     def default(self) -> Method:
-        """The method that stands for the project's own: the default with most runs, or else that with most runs."""
+        """The method that represents the project's own: the default with most runs, or else that with most runs."""
         return max(self.methods, key=lambda one: (one.architecture == DEFAULT, len(one.runs)))
 
     @property
@@ -149,7 +149,7 @@ class Group:
 def grouped(runs: Sequence[Run]) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
-    A method is all params but the seed, the split of its grasps, and whether these were simulated. Its name tells what it
+    A method is all params but the seed, the split of its grasps, and whether these were simulated. Its name states what it
     does without, colour, and the settings in which it differs from most methods of its architecture.
     """
     found: dict[str, tuple[Tree, list[Run]]] = {}
@@ -159,7 +159,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     made = []
     for architecture in dict.fromkeys(str(settings["architecture"]) for settings, _ in found.values()):
         same = [one for one in found.values() if one[0]["architecture"] == architecture]
-        names = told_apart([(architecture, settings) for settings, _ in same], _usual(same))
+        names = distinct_names([(architecture, settings) for settings, _ in same], _usual(same))
         made += [
             Method(" · ".join([*_called(settings), *marks]), settings, tuple(held))
             for (_, marks), (settings, held) in zip(names, same, strict=True)
@@ -185,7 +185,7 @@ def groups(methods: Sequence[Method]) -> list[Group]:
 
 
 def _called(settings: Tree) -> list[str]:
-    """Return what a kind of model is called by what it reads; marks that tell methods of a kind apart come behind."""
+    """Return what a kind of model is called by what it reads; marks that distinguish methods of a kind come behind."""
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
         return ["trees on geometry and colour" if coloured else "trees on geometry"]
@@ -199,7 +199,7 @@ def _settings(run: Run) -> dict[str, Any]:
     if not str(params.get("inputs", "")).endswith("pose") and params.get("normalisation") != "wrist":
         params.pop("wrist", None)  # nothing reads it
     if not params.get("together", True):  # trees are one model of all targets
-        params.pop("targets", None)  # one network a target: others beside it change nothing
+        params.pop("targets", None)  # one network a target: others next to it change nothing
     return {**params, "architecture": run.architecture, "split": run.split, "simulated": run.simulated}
 
 

@@ -1,4 +1,4 @@
-"""What a result's model and baselines foretold of each grasp that the model has not seen."""
+"""What a result's model and baselines predicted of each grasp that the model has not seen."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
 
-UNNAMED = "unnamed"  # an object of which no recording tells the name
+UNNAMED = "unnamed"  # an object of which no recording states the name
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Predictions:
     objects: NDArray[np.str_]  # (grasp,)
     known: NDArray[np.bool_]  # (grasp,), whether the model was trained on other grasps of the object
     true: Touch
-    said: Mapping[str, Touch]  # by predictor
+    predicted: Mapping[str, Touch]  # by predictor
     t_ns: NDArray[np.int64] | None = None  # (grasp,)
 
     @property
@@ -44,23 +44,25 @@ class Predictions:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What the model foretells, in the order of tables."""
-        return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.said[MODEL])
+        """What the model predicts, in the order of tables."""
+        return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
     def of(self, known: bool | None) -> Predictions:
         """Return the rows of known or of novel objects, or all."""
         return self if known is None else self.rows(self.known == known)
 
     def rows(self, chosen: NDArray[Any]) -> Predictions:
-        """Return some rows, told by a mask (grasp,) or by their numbers."""
-        said = {name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.said.items()}
+        """Return some rows, stated by a mask (grasp,) or by their numbers."""
+        predicted = {
+            name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.predicted.items()
+        }
         true = {target: one[chosen] for target, one in self.true.items()}
         t_ns = None if self.t_ns is None else self.t_ns[chosen]
-        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, said, t_ns)
+        return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, predicted, t_ns)
 
 
 def read(shard: Recording) -> Predictions:
-    """Return what the recording ``predictions`` of a result says of grasps that its model has not seen."""
+    """Return what the recording ``predictions`` of a result states of grasps that its model has not seen."""
     grasps = shard.table(GRASPS)
     others = {name: _touch(shard.table(name)) for name in shard.streams if name != GRASPS}
     found = Predictions(

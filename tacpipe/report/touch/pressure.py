@@ -15,7 +15,7 @@ SHOWN = 800  # grasps of a figure
 
 
 def section(method: Method) -> str:
-    """Return a figure a finger, of the first run; empty where the method foretells no pressure."""
+    """Return a figure a finger, of the first run; empty where the method predicts no pressure."""
     drawn = [_figure(method, target) for target in PRESSURES if target in method.runs[0].predictions.targets]
     return f'<div class="pair">{"".join(drawn)}</div>' if drawn else ""
 
@@ -30,8 +30,8 @@ def _figure(method: Method, target: str) -> str:
     objects = []
     for novel, name in parts:
         held = rows.rows((rows.objects == name) & (rows.known != novel))
-        objects.append(Scattered(name, novel, held.true[target][:, 0], held.said[MODEL][target][:, 0]))
-    constant = rows.said.get(CONSTANT, {}).get(target)
+        objects.append(Scattered(name, novel, held.true[target][:, 0], held.predicted[MODEL][target][:, 0]))
+    constant = rows.predicted.get(CONSTANT, {}).get(target)
     level = float("nan") if constant is None else float(constant[0, 0])
     name = wording.TARGETS[target]
     svg = figures.scatter(objects, level, "(counts)", f"Predicted over true {name}")

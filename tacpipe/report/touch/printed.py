@@ -1,4 +1,4 @@
-"""What the paper printed: it stands beside our numbers and is never averaged with them (RA-L 2020)."""
+"""What the paper printed: it is next to our numbers and is never averaged with them (RA-L 2020)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # of all tables; 1,000 epochs in F
 
 @dataclass(frozen=True)
 class Final:
-    """RMSE on the test set and on novel objects, as shares of the target's range and in device counts."""
+    """RMSE on the test set and on novel objects, as fractions of the target's range and in device counts."""
 
     test: float
     test_counts: int
@@ -56,8 +56,8 @@ FOUND_ON = (
     "these runs read and were trained on, and a constant's error on the two sets differs."
 )
 SCALES = (
-    "The paper's RMSE of one network on the thumb's pressure is 0.01141 in cross-validation (Tables III and IV) and 0.05496 "
-    "in testing (Figure 10), which cannot be on one scale: as a share of the largest reading, 3,400 counts, the former is "
-    "39 counts, as a share of the range of 900 it is 10, and the latter is 49. Tables I to IV stand as printed; our errors "
-    "are shares of the range."
+    "The paper's RMSE of one network on the thumb's pressure is 0.01141 in cross-validation (Tables III and IV) and "
+    "0.05496 in testing (Figure 10), which cannot be on one scale: as a fraction of the largest reading, 3,400 "
+    "counts, the former is 39 counts, as a fraction of the range of 900 it is 10, and the latter is 49. Tables I to "
+    "IV stand as printed; our errors are fractions of the range."
 )

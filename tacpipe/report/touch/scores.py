@@ -23,7 +23,7 @@ Floats = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Score:
-    """What one predictor does on one target; errors are shares of the target's range (`biotac_sp.RANGES`)."""
+    """What one predictor does on one target; errors are fractions of the target's range (`biotac_sp.RANGES`)."""
 
     target: str
     rmse: float  # global, over the grasps of all runs
@@ -42,30 +42,30 @@ class Score:
         return in_counts(self.target, self.rmse)
 
 
-def in_counts(target: str, share: float) -> float:
-    """Return a share of a target's range in device counts.
+def in_counts(target: str, fraction: float) -> float:
+    """Return a fraction of a target's range in device counts.
 
     >>> in_counts("pdc_th", 0.1)
     90.0
     """
     low, high = biotac_sp.RANGES[target]
-    return share * (high - low)
+    return fraction * (high - low)
 
 
 class _Rows(NamedTuple):
-    """What a run tells of a target."""
+    """What a run reports on a target."""
 
     true: Floats  # (grasp, value), normalised
-    said: Floats  # (grasp, value)
+    predicted: Floats  # (grasp, value)
     constant: Floats  # (grasp, value), NaN where the result holds none
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
 
 
 def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str = MODEL) -> Score | None:
-    """Return how a predictor of some runs does on known or on novel objects, or on all; None where it says nothing.
+    """Return how a predictor of some runs does on known or on novel objects, or on all; None where it states nothing.
 
-    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs said of each,
+    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs stated of each,
     where objects are known, and else from drawing objects: what is asked then is how the next object would fare.
     """
     parts = _rows(runs, target, known, predictor)
@@ -74,11 +74,11 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
     rows = _pooled(parts)
     return Score(
         target,
-        regression.rmse(rows.true, rows.said),
-        spread([regression.rmse(one.true, one.said) for one in parts]),
-        float(np.mean([regression.batch_mean_rmse(one.true, one.said) for one in parts])),
-        regression.mae(rows.true, rows.said),
-        regression.r2(rows.true, rows.said),
+        regression.rmse(rows.true, rows.predicted),
+        spread([regression.rmse(one.true, one.predicted) for one in parts]),
+        float(np.mean([regression.batch_mean_rmse(one.true, one.predicted) for one in parts])),
+        regression.mae(rows.true, rows.predicted),
+        regression.r2(rows.true, rows.predicted),
         _skill(rows, rows.recordings if known else rows.objects),
         len(np.unique(rows.recordings)),
         len(np.unique(rows.objects)),
@@ -87,13 +87,13 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
 
 
 def headline(method: Method, target: str, known: bool | None) -> Headline | None:
-    """Return how a method compares with its baselines on a target; None where it says nothing of it."""
+    """Return how a method compares with its baselines on a target; None where it states nothing of it."""
     errors: dict[str, dict[tuple[object, str], tuple[float, int]]] = {}
     objects: dict[str, str] = {}
     for run in method.runs:
-        for predictor in run.predictions.said:
+        for predictor in run.predictions.predicted:
             for rows in _rows([run], target, known, predictor):
-                squared = regression.squared_sums(rows.true, rows.said)
+                squared = regression.squared_sums(rows.true, rows.predicted)
                 objects |= dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
                 for name, one in zip(rows.recordings.tolist(), squared.tolist(), strict=True):
                     key = run.params.get("seed"), name
@@ -105,44 +105,46 @@ def headline(method: Method, target: str, known: bool | None) -> Headline | None
 
 
 def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:
-    """Return the method whose runs tell of a baseline: that with most runs which hold it; None where none does."""
-    held = [one for one in methods if any(target in run.predictions.said.get(predictor, ()) for run in one.runs)]
+    """Return the method whose runs report on a baseline: that with most runs which hold it; None where none does."""
+    held = [one for one in methods if any(target in run.predictions.predicted.get(predictor, ()) for run in one.runs)]
     return max(held, key=lambda one: len(one.runs), default=None)
 
 
 def baselines(methods: Sequence[Method]) -> list[str]:
-    """Return the predictors that are no model's own, in the order of their names."""
-    return sorted({name for one in methods for run in one.runs for name in run.predictions.said if name != MODEL})
+    """Return the predictors that are not a model's own, in the order of their names."""
+    return sorted({name for one in methods for run in one.runs for name in run.predictions.predicted if name != MODEL})
 
 
 def best(methods: Sequence[Method], target: str, known: bool | None) -> Method | None:
     """Return the method of least RMSE on a target; of two that err alike the first."""
-    found = [(told.rmse, one) for one in methods if (told := score(one.runs, target, known))]
+    found = [(described.rmse, one) for one in methods if (described := score(one.runs, target, known))]
     return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> Floats | None:
-    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is said of the target."""
+    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
     parts = _rows(runs, target, known, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
 
 
 def of_object(runs: Sequence[Run], name: str) -> list[Run]:
-    """Return runs as if they had been judged on the grasps of one object alone."""
-    told = [(run, run.predictions) for run in runs]
-    return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in told]
+    """Return runs as if they had been evaluated on the grasps of one object alone."""
+    described = [(run, run.predictions) for run in runs]
+    return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in described]
 
 
 def _rows(runs: Sequence[Run], target: str, known: bool | None, predictor: str) -> list[_Rows]:
-    """Return what each run tells that holds the target, the predictor and such objects."""
+    """Return what each run states that holds the target, the predictor and such objects."""
     found = []
     for rows in (run.predictions.of(known) for run in runs):
-        said = rows.said.get(predictor, {})
-        if target not in said or target not in rows.true or not len(rows.recordings):
+        predicted = rows.predicted.get(predictor, {})
+        if target not in predicted or target not in rows.true or not len(rows.recordings):
             continue
-        constant = rows.said.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
-        true, told, mean = (biotac_sp.normalised(target, one) for one in (rows.true[target], said[target], constant))
-        found.append(_Rows(true, told, mean, rows.recordings, rows.objects))
+        constant = rows.predicted.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
+        true, described, mean = (
+            biotac_sp.normalised(target, one) for one in (rows.true[target], predicted[target], constant)
+        )
+        found.append(_Rows(true, described, mean, rows.recordings, rows.objects))
     return found
 
 
@@ -153,5 +155,5 @@ def _pooled(parts: Sequence[_Rows]) -> _Rows:
 def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Interval:
     """Return the skill over the constant on rows where there is one."""
     held = ~np.isnan(rows.constant).any(axis=1)
-    model, baseline = (regression.squared_sums(rows.true[held], one[held]) for one in (rows.said, rows.constant))
+    model, baseline = (regression.squared_sums(rows.true[held], one[held]) for one in (rows.predicted, rows.constant))
     return regression.skill_interval(model, baseline, clusters[held])

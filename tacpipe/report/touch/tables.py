@@ -1,4 +1,4 @@
-"""The tables in which methods and baselines stand beside each other, of one way to part grasps."""
+"""The tables in which methods and baselines are next to each other, of one way to part grasps."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # of a ta
 
 
 def errors(group: Group, known: bool) -> str:
-    """Return a table a target with every method and baseline on known or on novel objects; empty where none was judged."""
+    """Return a table a target with every method and baseline on known or on novel objects; empty where none was
+    evaluated."""
     return "".join(_errors(group, target, known) for target in wording.TARGETS)
 
 
 def by_object(group: Group) -> str:
-    """Return errors and skill by object of one method an architecture; empty where no object was judged."""
+    """Return errors and skill by object of one method an architecture; empty where no object was evaluated."""
     return "".join(_by_object(group, method) for method in group.main)
 
 
@@ -42,23 +43,23 @@ def every_run(methods: Sequence[Method]) -> str:
     for method in methods:
         for run in sorted(method.runs, key=lambda run: str(run.params.get("seed", ""))):
             for known in (True, False):
-                told = [scores.score([run], target, known) for target in wording.TARGETS]
-                if not any(told):
+                described = [scores.score([run], target, known) for target in wording.TARGETS]
+                if not any(described):
                     continue
                 trained = NONE if run.trained is None else f"{run.trained:,}"
                 about = [method.name, wording.split(method.split), str(run.params.get("seed", NONE)), trained]
-                counted = max(one.grasps for one in told if one)
-                cells = [cell for one in told for cell in _short(one)]
+                counted = max(one.grasps for one in described if one)
+                cells = [cell for one in described for cell in _short(one)]
                 rows.append([*about, wording.OBJECTS[known], f"{counted:,}", *cells, str(len(run.history) or NONE)])
     parts = [f"{name} {part}" for name in wording.TARGETS.values() for part in ("RMSE", "R²")]
-    heads = ["", "split", "seed", "trained on", "judged on", "grasps", *parts, "epochs"]
+    heads = ["", "split", "seed", "trained on", "evaluated on", "grasps", *parts, "epochs"]
     runs = sum(len(one.runs) for one in methods)
-    told_runs = f"All {runs} runs" if runs > 1 else "The run"
-    return f"<details><summary>{told_runs}</summary>{markup.table('Each run', heads, rows)}</details>"
+    runs_text = f"All {runs} runs" if runs > 1 else "The run"
+    return f"<details><summary>{runs_text}</summary>{markup.table('Each run', heads, rows)}</details>"
 
 
 def cells(found: Score | None) -> list[str]:
-    """Return what a table in the paper's form says of a score, as `ROWS` names it."""
+    """Return what a table in the paper's form states of a score, as `ROWS` names it."""
     if found is None:
         return [NONE] * len(ROWS)
     error = markup.with_sd(found.each.mean, found.each.sd)
@@ -71,8 +72,8 @@ def baseline_rows(methods: Sequence[Method], target: str, known: bool | None) ->
     found = []
     for predictor in dict.fromkeys([*wording.BASELINES, *scores.baselines(methods)]):
         source = scores.reference(methods, target, predictor)
-        told = scores.score(source.runs, target, known, predictor) if source else None
-        found.append((wording.baseline(predictor), told))
+        described = scores.score(source.runs, target, known, predictor) if source else None
+        found.append((wording.baseline(predictor), described))
     return found
 
 
@@ -81,11 +82,11 @@ def _errors(group: Group, target: str, known: bool) -> str:
     if first is None:
         return ""
     every = [(method.name, scores.score(method.runs, target, known)) for method in group.methods]
-    told = [one for one in every if one[1]]
+    described = [one for one in every if one[1]]
     baselines = baseline_rows(group.methods, target, known)
-    rows = [[name, *_cells(one)] for name, one in [*told, *baselines]]
-    kinds = dict.fromkeys(range(len(told), len(rows)), "quiet")
-    kinds[[name for name, _ in told].index(first.name)] = "best"
+    rows = [[name, *_cells(one)] for name, one in [*described, *baselines]]
+    kinds = dict.fromkeys(range(len(described), len(rows)), "quiet")
+    kinds[[name for name, _ in described].index(first.name)] = "best"
     return markup.table(f"{wording.TARGETS[target]}, {wording.OBJECTS[known]}", ["", *HEADS], rows, kinds)
 
 
@@ -94,12 +95,12 @@ def _cells(found: Score | None) -> list[str]:
     if found is None:
         return [NONE] * len(HEADS)
     return [
-        wording.share(found.rmse),
+        wording.percentage(found.rmse),
         f"{found.counts:.0f}",
         wording.signed(found.r2),
         wording.skill(found),
         markup.with_sd(found.each.mean, found.each.sd),
-        wording.share(found.batch_mean),
+        wording.percentage(found.batch_mean),
         f"{scores.in_counts(found.target, found.mae):.0f}",
         f"{found.grasps:,}",
         str(found.runs),
@@ -128,7 +129,7 @@ def _by_object(group: Group, method: Method) -> str:
 
 
 def _short(found: Score | None) -> list[str]:
-    return [wording.share(found.rmse), wording.signed(found.r2)] if found else [NONE, NONE]
+    return [wording.percentage(found.rmse), wording.signed(found.r2)] if found else [NONE, NONE]
 
 
 def _of_object(runs: Sequence[Run], target: str, known: bool) -> list[str]:
@@ -136,6 +137,6 @@ def _of_object(runs: Sequence[Run], target: str, known: bool) -> list[str]:
     found, mean = (scores.score(runs, target, known, one) for one in (MODEL, OBJECT_MEAN))
     if found is None:
         return [NONE, NONE]
-    below = f"<br><small>{wording.share(mean.rmse)}</small>" if mean and known else ""
+    below = f"<br><small>{wording.percentage(mean.rmse)}</small>" if mean and known else ""
     skill = NONE if math.isnan(found.skill.mean) else markup.decimals(found.skill.mean)
-    return [markup.Markup(f"{wording.share(found.rmse)}{below}"), skill]
+    return [markup.Markup(f"{wording.percentage(found.rmse)}{below}"), skill]

@@ -1,4 +1,4 @@
-"""How numbers and names of this task are written, and what must be said beside an error."""
+"""How numbers and names of this task are written, and what must be stated next to an error."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
 SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor."
 RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
-    "were recorded as well: the mean of the grasps nearest in time, whatever their object, says how much."
+    "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
 )
 IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by turns
 
 
 def caution(methods: Sequence[Method]) -> str:
-    """Return what these grasps cannot show, beside every table of errors; empty where nothing is known against them."""
+    """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
     if methods and all(one.simulated for one in methods):
         return SIMULATED
     found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.runs]
@@ -53,7 +53,7 @@ def form(what: str, text: str, published: bool) -> str:
 
 
 def baseline(predictor: str) -> str:
-    """Return what a table calls a predictor that is no model's own.
+    """Return what a table calls a predictor that is not a model's own.
 
     >>> baseline("object_mean"), baseline("nearest_neighbours")
     ('mean of the object', 'nearest neighbours')
@@ -63,8 +63,8 @@ def baseline(predictor: str) -> str:
 
 def skill(found: Score) -> str:
     """Return a skill over the constant above its interval."""
-    told = markup.sure(*found.skill)
-    return NONE if math.isnan(found.skill.mean) else told
+    described = markup.sure(*found.skill)
+    return NONE if math.isnan(found.skill.mean) else described
 
 
 def skill_within(found: Score) -> str:
@@ -72,14 +72,14 @@ def skill_within(found: Score) -> str:
     mean, low, high = found.skill
     if math.isnan(mean):
         return "no constant to compare with"
-    told = markup.decimals(mean)
-    return told if math.isnan(low) else f"{told} ({markup.decimals(low)} to {markup.decimals(high)})"
+    described = markup.decimals(mean)
+    return described if math.isnan(low) else f"{described} ({markup.decimals(low)} to {markup.decimals(high)})"
 
 
-def share(value: float) -> str:
-    """Return an error as a share of a range.
+def percentage(value: float) -> str:
+    """Return an error as a fraction of a range.
 
-    >>> share(0.05496), share(float("nan"))
+    >>> percentage(0.05496), percentage(float("nan"))
     ('0.0550', '–')
     """
     return NONE if math.isnan(value) else f"{value:.4f}"
@@ -105,18 +105,18 @@ def signed_short(value: float) -> str:
     return f"−{-value:.1f}" if value > -9 else "< −9"
 
 
-def split(told: str) -> str:
-    """Return how grasps were parted, where somebody said so."""
-    return told.replace("-", " ").replace("_", " ") or "one split"
+def split(described: str) -> str:
+    """Return how grasps were parted, where somebody stated so."""
+    return described.replace("-", " ").replace("_", " ") or "one split"
 
 
-def place(told: str, simulated: bool) -> str:
+def place(described: str, simulated: bool) -> str:
     """Return how grasps were parted and whether they were simulated.
 
     >>> place("by-day", True), place("simulated", True), place("", False)
     ('by day, simulated', 'simulated', 'one split')
     """
-    name = split(told)
+    name = split(described)
     return f"{name}, simulated" if simulated and "simulated" not in name else name
 
 
@@ -126,24 +126,24 @@ def schedule(run: Run) -> str:
         return "fitted without epochs"
     params = run.params
     epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
-    told = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
+    described = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
     if run.architecture != PAPERS or not run.published:
-        return told
+        return described
     if (batch, rate) == (printed.BATCH, printed.LEARNING_RATE) and int(epochs or 0) >= printed.EPOCHS:
-        return f"paper schedule ({told})"
-    return f"quick ({told}; the paper: {printed.EPOCHS}, {printed.BATCH}, {printed.LEARNING_RATE})"
+        return f"paper schedule ({described})"
+    return f"quick ({described}; the paper: {printed.EPOCHS}, {printed.BATCH}, {printed.LEARNING_RATE})"
 
 
 def basis(methods: Sequence[Method]) -> str:
     """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
     runs = [run for one in methods for run in one.runs]
-    told = [
+    described = [
         f"{count} run{'s' if count > 1 else ''}: {one}"
         for one, count in Counter(schedule(run) for run in runs).most_common()
     ]
     trained = sorted({run.trained for run in runs if run.trained is not None})
     counts = f" Trained on {span(trained)} grasps." if trained else ""
-    return f"{'; '.join(told)}.{counts}"
+    return f"{'; '.join(described)}.{counts}"
 
 
 def span(counts: Sequence[int]) -> str:

@@ -57,7 +57,7 @@ class Faults:
 
 
 def parse(text: str) -> Faults:
-    """Return the faults that a command line names. Raises `UsageError` for an unknown one and for what is no number.
+    """Return the faults that a command line names. Raises `UsageError` for an unknown one and for what is not a number.
 
     >>> parse("noise=0.5,drop=0.01").drop
     0.01
@@ -68,7 +68,7 @@ def parse(text: str) -> Faults:
         try:
             values[name.strip()] = float(value)
         except ValueError:
-            raise UsageError(f"--faults: {part!r} is no fault; each reads like noise=0.5, with a number.") from None
+            raise UsageError(f"--faults: {part!r} is not a fault; each reads like noise=0.5, with a number.") from None
     found: Faults = params.filled(Faults, values, "--faults", "fault")
     return found
 
@@ -84,7 +84,7 @@ class Item(NamedTuple):
 
 
 class Harm:
-    """Does to the frames of one stream what its faults say."""
+    """Does to the frames of one stream what its faults state."""
 
     def __init__(self, faults: Faults, sensor: Sensor, seed: Sequence[int], *, packets: bool) -> None:
         self.faults, self.sensor, self.packets = faults, sensor, packets
@@ -105,7 +105,7 @@ class Harm:
             return items
         until_ns = items[-1].due_ns + 1
         self._change(items, until_ns)
-        self._judge(items, frames)
+        self._mark_undetectable(items, frames)
         items = self._lose(items)
         items = self._move(items) if self.packets else items
         items = self._add_noise(items, until_ns)
@@ -141,7 +141,7 @@ class Harm:
                 items[row] = items[row]._replace(data=data[:start] + random + data[start + there :], cause=BURST)
             row, start, count = row + 1, 0, 0 if self.packets else count - there
 
-    def _judge(self, items: list[Item], frames: Sequence[bytes]) -> None:
+    def _mark_undetectable(self, items: list[Item], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
             if item.cause in CHANGED:
                 items[row] = item._replace(invisible=undetectable_faults.passes(self.sensor, frames, row, item.data))

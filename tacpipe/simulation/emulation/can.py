@@ -107,7 +107,7 @@ class Slcan(Pty):
         """Any speed will do: it is a USB adapter."""
         return False
 
-    def told(self, piece: bytes) -> bytes:
+    def on_the_line(self, piece: bytes) -> bytes:
         """Return the lines of the CAN frames of a piece."""
         return b"".join(line(identifier, data) for identifier, data in split(piece))
 

@@ -18,7 +18,7 @@ def no_steps(t_ns: Times) -> Times:
 
 
 class ClockSteps:
-    """Steps of one size at random moments; calling it tells by how much the clock has been set until then."""
+    """Steps of one size at random moments; calling it states by how much the clock has been set until then."""
 
     def __init__(self, rate_hz: float, step_ms: float, seed: Sequence[int]) -> None:
         self._happening = Happening(rate_hz, np.random.default_rng([*seed, 5]))

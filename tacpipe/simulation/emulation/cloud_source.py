@@ -1,4 +1,4 @@
-"""The clouds that an emulated depth camera takes: a table with an object and another beside it, a new scene a cloud."""
+"""The clouds that an emulated depth camera takes: a table with an object and another next to it, a new scene a cloud."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CloudSource:
         self._samples = functools.lru_cache(2)(self._made)
 
     def block(self, number: int) -> Samples:
-        """Return the points of the clouds of block ``number``; ``rows`` tells of which each is."""
+        """Return the points of the clouds of block ``number``; ``rows`` reports on which each is."""
         return self._samples(number)
 
     def numbers(self, block: int) -> NDArray[np.int64]:

@@ -35,16 +35,16 @@ from tacpipe.simulation.emulation.source import Sampled, Source, Timing
 from tacpipe.simulation.emulation.transmission import Plan, Transmission
 from tacpipe.simulation.emulation.world import World
 
-LOOK_NS = 20_000_000  # between looks at what no descriptor tells
+LOOK_NS = 20_000_000  # between looks at what no descriptor states
 FILL_S = 0.1  # between looks whether more must be planned
 LONGEST_S = 0.02  # that a wait lasts at most
-UNPACED_HZ = 2.0  # of sensors that say no rate: clouds that come when they come
+UNPACED_HZ = 2.0  # of sensors that state no rate: clouds that come when they come
 
 
 class Emulator:
     """A rig that is served while the ``with`` statement lasts.
 
-    ``rig`` is the same rig with the addresses that were made, ``ledger`` tells for each stream what was sent and what was
+    ``rig`` is the same rig with the addresses that were made, ``ledger`` states for each stream what was sent and what was
     harmed, ``folder`` holds pseudo-terminals and files. With ``patient`` no frame is lost because a host fetches it late.
     """
 
@@ -199,14 +199,14 @@ def stream_of_clouds(sensor: Sensor) -> bool:
 
 
 def pace(rig: Rig, name: str) -> Pace:
-    """Return the pace of a stream: what the rig file says under ``emulate``, of the stream over that of the rig."""
+    """Return the pace of a stream: what the rig file states under ``emulate``, of the stream over that of the rig."""
     where = f"stream {name}, emulate"
     found: Pace = params.filled(Pace, {**rig.emulate, **rig.streams[name].emulate}, where, "key")
     return found
 
 
 def clock(its_pace: Pace, seed: list[int]) -> clocks.Clock:
-    """Return a device's clock: as its pace says, or as far off as those of the simulated rig may be."""
+    """Return a device's clock: as its pace states, or as far off as those of the simulated rig may be."""
     rng, usual = np.random.default_rng([*seed, 8]), pick_and_move.Rig()
     offset, skew = rng.uniform(-1, 1, 2)
     offset_ms = its_pace.offset_ms if its_pace.offset_ms is not None else offset * usual.clock_offset_ms

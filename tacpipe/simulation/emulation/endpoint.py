@@ -39,7 +39,7 @@ class Endpoint(Protocol):
         """Return what hosts wrote, after ``descriptor`` became readable; a new host has written nothing."""
 
     def look(self) -> Sequence[tuple[Peer, bytes]]:
-        """Look after what no descriptor tells, a few times a tenth of a second; as `ready`."""
+        """Manage what no descriptor states, a few times a tenth of a second; as `ready`."""
 
     def unplug(self) -> None:
         """Take the device away; hosts lose their link."""

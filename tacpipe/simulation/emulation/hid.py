@@ -2,7 +2,7 @@
 
 Hosts run as ``UMOCKDEV_DIR=… umockdev-wrapper PROGRAM``; the folder stands in FOLDER/hid/root. All devices of an emulator
 are in one folder. A report is written at once, but two that a slow host left lying come as one, and an unplugged device
-falls silent without its host being told: the mock has neither the kernel's queue nor its hang-up.
+falls silent without its host being informed: the mock has neither the kernel's queue nor its hang-up.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SIX_AXES = (  # six 16-bit axes in report 1, three in report 2, 32 buttons in re
     "0501 0908 a101 a100 8501 16a2fe 265e01 7510 9506 0930 0931 0932 0933 0934 0935 8102 c0 "
     "a100 8502 16a2fe 265e01 7510 9503 0933 0934 0935 8102 c0 a102 8503 0509 1901 2920 1500 2501 7501 9520 8102 c0 c0"
 )
-DESCRIPTORS = {"256f:c635": SIX_AXES}  # of devices that are no raw HID
+DESCRIPTORS = {"256f:c635": SIX_AXES}  # of devices that are not a raw HID
 _servers: dict[Path, Server] = {}
 
 
@@ -46,15 +46,17 @@ class Server:
         self.root = self.line().decode()
         if not self.root:
             assert self.process.stderr is not None
-            told = self.process.stderr.read().decode().strip().splitlines()[-1:]
-            raise DeviceError(f"umockdev did not start ({' '.join(told)}). Install gir1.2-umockdev-1.0 and python3-gi.")
+            message = self.process.stderr.read().decode().strip().splitlines()[-1:]
+            raise DeviceError(
+                f"umockdev did not start ({' '.join(message)}). Install gir1.2-umockdev-1.0 and python3-gi."
+            )
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "root").write_text(f"{self.root}\n", encoding="utf-8")
         self.devices: list[Hid] = []
         self._pending = b""
 
     def line(self) -> bytes:
-        """Return the next line that the server says, waiting for it."""
+        """Return the next line that the server states, waiting for it."""
         assert self.process.stdout is not None
         found = b""
         while not found.endswith(b"\n"):
@@ -64,7 +66,7 @@ class Server:
             found += piece
         return found.strip()
 
-    def tell(self, command: str) -> None:
+    def send(self, command: str) -> None:
         """Give the server a command."""
         assert self.process.stdin is not None
         self.process.stdin.write(command.encode() + b"\n")
@@ -89,7 +91,7 @@ class Server:
 
 
 class Host:
-    """Whoever has the device open; the mock does not tell."""
+    """Whoever has the device open; the mock does not state."""
 
     fault = byte_faults.SOUND
 
@@ -100,7 +102,7 @@ class Host:
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send each piece as a report."""
         for piece in pieces:
-            self.endpoint.server.tell(f"send {self.endpoint.number} {piece.hex()}")
+            self.endpoint.server.send(f"send {self.endpoint.number} {piece.hex()}")
         return [len(piece) for piece in pieces]
 
 
@@ -118,13 +120,13 @@ class Hid:
         named = address.place.partition("?")[0] if ":" in address.place else (*sensor.usb_ids, "16c0:0486")[0]
         vendor, _, product = named.lower().partition(":")
         descriptor = bytes.fromhex(DESCRIPTORS.get(named.lower(), RAW)).hex()
-        self.server.tell(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
+        self.server.send(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
         self.server.line()
         self._away = False
         self.peers = [Host(self)]
 
     def descriptors(self) -> list[int]:
-        """Return where the server tells what hosts wrote, of the first device alone."""
+        """Return where the server states what hosts wrote, of the first device alone."""
         assert self.server.process.stdout is not None
         return [self.server.process.stdout.fileno()] if self.number == 0 else []
 

@@ -57,7 +57,7 @@ def answering(descriptor: bytes) -> Any:
 
 
 def hear(number: int, board: int) -> None:
-    """Tell what hosts write to a device."""
+    """Report what hosts write to a device."""
     while select.select([board], [], []):
         try:
             data = os.read(board, MOST)

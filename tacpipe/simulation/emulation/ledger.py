@@ -35,7 +35,7 @@ class Entry:
     size: int  # bytes that went out
     cause: str
     invisible: bool  # harmed, and still takes the protocol's own test for a frame
-    source: int  # number of the source: a device that is told another rate begins a new one
+    source: int  # number of the source: a device that is given another rate begins a new one
 
 
 class Ledger:
@@ -64,7 +64,7 @@ class Ledger:
         self._invisible.append(item.invisible)
         self._source.append(len(self.sources) - 1)
 
-    def tell(self, t_ns: int, what: str, more: str = "") -> None:
+    def enter(self, t_ns: int, what: str, more: str = "") -> None:
         """Enter something that happened: opened, closed, unplug, replug, heard, rate, clock."""
         self.events.append((t_ns, what, more))
 
@@ -104,7 +104,7 @@ class Ledger:
     def samples(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> Samples:
         """Return what a perfect link would give of entries, made once more from the source; by default of all `whole` ones.
 
-        Values are those that were encoded, as far as the protocol can hold them; ``rows`` tells of which entry each is.
+        Values are those that were encoded, as far as the protocol can hold them; ``rows`` reports on which entry each is.
         """
         rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
         sensor = self.sources[-1].sensor
@@ -147,13 +147,13 @@ class Ledger:
 
         folder.mkdir(parents=True, exist_ok=True)
         pq.write_table(self.table(), folder / f"{self.name}.parquet")
-        told = {
+        content = {
             "counts": self.counts,
             "clock": [_clock(source) for source in self.sources],
             "events": [{"t_ns": t_ns, "what": what, "more": more} for t_ns, what, more in self.events],
             "harmed": {str(row): data.hex() for row, data in self.harmed.items()},
         }
-        (folder / f"{self.name}.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        (folder / f"{self.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def taken(samples: Samples, rows: NDArray[np.int64]) -> Samples:

@@ -1,4 +1,4 @@
-"""What a pad of taxels feels that is no uSkin: the contact's force, shared out over a grid of any number of taxels."""
+"""What a pad of taxels measures that is not a uSkin: the contact's force, shared out over a grid of any number of taxels."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def pressed(world: World, finger: int, t_ns: Times, taxels: int) -> Floats:
     load_n = world.contact(t_ns, lambda scene: scene.contact.force_n[:, ::2]) / 2
     centre_m = world.skins[finger].centre_m + np.clip(moved_m, -WIDTH_M / 2, WIDTH_M / 2)
     distance2 = ((places(taxels) - centre_m[:, None]) ** 2).sum(axis=2)  # (time, taxel)
-    share = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * SIGMA_M**2))
-    share /= share.sum(axis=1, keepdims=True)
-    force: Floats = share[:, :, None] * np.column_stack([load_n, normal_n])[:, None]
+    fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * SIGMA_M**2))
+    fraction /= fraction.sum(axis=1, keepdims=True)
+    force: Floats = fraction[:, :, None] * np.column_stack([load_n, normal_n])[:, None]
     return force
 
 
-def peak_share(taxels: int) -> float:
-    """Return the share of the force that the taxel under its centre bears, of so many."""
+def peak_fraction(taxels: int) -> float:
+    """Return the fraction of the force that the taxel under its centre bears, of so many."""
     distance2 = (places(taxels) ** 2).sum(axis=1)
     weight = np.exp((distance2.min() - distance2) / (2 * SIGMA_M**2))
     return float(weight.max() / weight.sum())

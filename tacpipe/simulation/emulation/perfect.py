@@ -14,7 +14,7 @@ from tacpipe.sensors.sensor import Frames, Samples, Sensor
 
 
 def decoded(sensor: Sensor, frames: Frames) -> Samples:
-    """Return the samples of what `Sensor.encode` gave; ``rows`` tells of which frame each is."""
+    """Return the samples of what `Sensor.encode` gave; ``rows`` reports on which frame each is."""
     parts = list(_alike(frames)) if isinstance(frames, list) and isinstance(sensor.framer(), ByteFramer) else [frames]
     found = []
     for part in parts:
@@ -25,7 +25,7 @@ def decoded(sensor: Sensor, frames: Frames) -> Samples:
 
 
 def joined(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Samples:
-    """Return samples one behind the other, which are of so many frames each; by default of as many as they say."""
+    """Return samples one behind the other, which are of so many frames each; by default of as many as they state."""
     counts = frames or [int(part.rows.max(initial=-1)) + 1 for part in parts if part.rows is not None]
     values = tuple(np.concatenate(blocks) for blocks in zip(*(part.values for part in parts), strict=True))
     starts = np.cumsum([0, *counts])

@@ -22,7 +22,7 @@ from tacpipe.simulation.emulation import byte_faults, uart
 from tacpipe.simulation.emulation.endpoint import stretched
 
 TERMIOS2, SPEED_AT = 44, 40  # bytes of struct termios2 of <asm-generic/termbits.h>, and where its output speed stands
-TCGETS2 = 0x802C542A  # likewise; tells speeds that have no name, too
+TCGETS2 = 0x802C542A  # likewise; states speeds that have no name, too
 MOST_READ = 4096
 
 
@@ -68,7 +68,7 @@ class Pty:
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         name = os.ttyname(slave)
-        os.close(slave)  # from now on the master tells whether anybody has it open
+        os.close(slave)  # from now on the master states whether anybody has it open
         draft.unlink(missing_ok=True)
         draft.symlink_to(name)
         draft.replace(self.link)
@@ -121,29 +121,29 @@ class Pty:
 
     def write(self, pieces: Sequence[bytes]) -> list[int]:
         """Write pieces, garbled at a wrong speed; return how many bytes of each were taken."""
-        told = [self.told(piece) for piece in pieces]
+        on_the_line = [self.on_the_line(piece) for piece in pieces]
         self.garbling = self.wrong_baud()
         if self.garbling:
-            told = [uart.garbled(piece, self.sensor.baud, self._baud) for piece in told]
+            on_the_line = [uart.garbled(piece, self.sensor.baud, self._baud) for piece in on_the_line]
         taken = 0
         with contextlib.suppress(BlockingIOError):
-            taken = os.write(self._master, b"".join(told))
-        sizes = stretched([len(piece) for piece in told], taken)
+            taken = os.write(self._master, b"".join(on_the_line))
+        sizes = stretched([len(piece) for piece in on_the_line], taken)
         return [
             len(piece) if size == len(sent) else min(size, len(piece) - 1)
-            for piece, sent, size in zip(pieces, told, sizes, strict=True)
+            for piece, sent, size in zip(pieces, on_the_line, sizes, strict=True)
         ]
 
-    def told(self, piece: bytes) -> bytes:
+    def on_the_line(self, piece: bytes) -> bytes:
         """Return a frame as it goes over the line."""
         return piece
 
     def understood(self, data: bytes) -> list[bytes]:
-        """Return what the host's bytes tell the device."""
+        """Return what the host's bytes state the device."""
         return [data]
 
 
 def _speed(master: int) -> int:
     """Return the speed in bits a second that the host has set."""
-    told = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2))
-    return int(struct.unpack_from("=I", told, SPEED_AT)[0])
+    on_the_line = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2))
+    return int(struct.unpack_from("=I", on_the_line, SPEED_AT)[0])

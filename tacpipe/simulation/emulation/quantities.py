@@ -27,7 +27,7 @@ CLEARANCE_M = 0.12  # from the wrist's proximity sensor down to the object, as l
 WARMING_C, WARM_C, WARMING_NS = 4.0, 31.0, 600_000_000_000  # a device warms up by so much, towards so much, that slowly
 STEP_NS = 1_000_000  # over which differences are taken
 STRENGTH = 1200.0  # of what a range finder gets back
-FRICTION = 0.5  # that a sensor of slip tells
+FRICTION = 0.5  # that a sensor of slip states
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def look(quantity: str, view: View, fields: Sequence[pa.Field]) -> Floats:
 
 
 def of(field: pa.Field, key: str) -> str | None:
-    """Return what a field's metadata says under ``key``; None where it is silent."""
+    """Return what a field's metadata states under ``key``; None where it is silent."""
     found = (field.metadata or {}).get(key.encode())
     return None if found is None else found.decode()
 
@@ -90,7 +90,7 @@ def _normal(view: View, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _force(view: View, fields: Sequence[pa.Field]) -> Floats:
-    """Return what the hand's load cell feels: the contact's force with its sign turned; alone, the finger's pressure."""
+    """Return what the hand's load cell measures: the contact's force with its sign turned; alone, the finger's pressure."""
     load = -view.world.contact(view.t_ns, lambda scene: scene.contact.force_n)
     normal = view.world.contact(view.t_ns, lambda scene: scene.contact.normal_n[:, view.finger])
     return _vector(np.column_stack([load, normal]), fields, schema.AXES, 3)

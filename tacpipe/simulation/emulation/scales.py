@@ -39,7 +39,7 @@ FULL = {  # what a device of counts is made for, SI
     "deflection": 10.0, "external_torque": 90.0,
 }  # fmt: skip
 SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities of one taxel among others
-NOISE = 0.002  # standard deviation as a share of what a device is made for
+NOISE = 0.002  # standard deviation as a fraction of what a device is made for
 SILENT = ("time", "status", "sequence", "label", "mask", "orientation", "mass", "friction")  # quantities without noise
 
 
@@ -47,7 +47,7 @@ def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.rand
     """Return the column (time,) of each field, in its own type, of what the world shows (time, field), SI."""
     full = FULL.get(quantity, 1.0)
     if quantity in SHARED:  # a device with many taxels is made for less on each
-        full *= pad.peak_share(max(1, sum(axis_of(field) in (None, "z") for field in fields)))
+        full *= pad.peak_fraction(max(1, sum(axis_of(field) in (None, "z") for field in fields)))
     noise = 0.0 if quantity in SILENT else NOISE * full
     noisy = values + noise * rng.standard_normal(values.shape) if noise else values
     return [_column(field, column, full, quantity) for field, column in zip(fields, noisy.T, strict=True)]

@@ -31,14 +31,14 @@ Columns = dict[int, NDArray[Any]]  # number of the field to its values (time,)
 
 BLOCK_S = 0.5
 KEPT = 3  # blocks that are kept in case they are asked for once more
-PARTS = {"report": (1, 2)}  # what fields go through that name the part of a state that a frame tells
+PARTS = {"report": (1, 2)}  # what fields go through that name the part of a state that a frame states
 UNCOUNTED = 1 << 32  # modulus of a counter that nobody looks at
 USKIN = 48  # channels of a 4x4
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When an emulated sensor takes its samples, and what its clock and its counters say."""
+    """When an emulated sensor takes its samples, and what its clock and its counters state."""
 
     rate_hz: float
     start_ns: int = 0  # of the first sample, in the world's time
@@ -137,7 +137,7 @@ class Source:
         return dict(zip(group, scales.sent(quantity, values, fields, rng), strict=True))
 
     def _uskin(self, view: View, block: int, rng: np.random.Generator) -> NDArray[np.uint16]:
-        """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that goes on."""
+        """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that continues."""
         one = view.world.skins[view.finger]
         noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
         counts = one.base_count + taxels.signal(one, view.world.touch(view.finger, view.t_ns)) + noise

@@ -1,4 +1,4 @@
-"""A device that serves TCP: frames go over the connection, or, of a ``tcp+udp`` device, to a UDP port told there."""
+"""A device that serves TCP: frames go over the connection, or, of a ``tcp+udp`` device, to a UDP port stated there."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Connection:
             return self.socket.send(data)
         except BlockingIOError:
             return 0
-        except OSError:  # which reading tells as well
+        except OSError:  # which reading states as well
             self.fault = byte_faults.GONE
             return 0
 
@@ -63,8 +63,8 @@ class Connection:
             return None
 
 
-class Telling(Connection):
-    """A host that is connected, and told the device a UDP port to send frames to: replies go over the connection."""
+class Registration(Connection):
+    """A host that is connected, and named a UDP port to the device to send frames to: replies go over the connection."""
 
     def __init__(self, made: socket.socket, sensor: Sensor) -> None:
         super().__init__(made, sensor)
@@ -78,7 +78,7 @@ class Telling(Connection):
         self._port.close()
 
     def post(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send frames to the port that the host told; those that the network refuses are lost."""
+        """Send frames to the port that the host stated; those that the network refuses are lost."""
         sizes = []
         for piece in pieces:
             try:
@@ -154,11 +154,11 @@ class Tcp:
         return self.understood(peer, data)
 
     def understood(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
-        """Return what the host's bytes tell the device."""
+        """Return what the host's bytes state the device."""
         return [(peer, data)] if data else []
 
     def look(self) -> list[tuple[Connection, bytes]]:
-        """Return nothing: descriptors tell all."""
+        """Return nothing: descriptors state all."""
         return []
 
 
@@ -166,4 +166,4 @@ class TcpUdp(Tcp):
     """A TCP server for control, frames by UDP."""
 
     scheme = "tcp+udp"
-    kind = Telling
+    kind = Registration

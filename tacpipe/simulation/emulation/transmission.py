@@ -1,4 +1,5 @@
-"""One stream of an emulated rig as it goes out: samples planned ahead, harmed as the faults say, sent when they are due."""
+"""One stream of an emulated rig as it goes out: samples planned ahead, harmed as the faults state, sent when they are
+due."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from tacpipe.simulation.emulation.undetectable_faults import one_by_one
 
 AHEAD_NS = 1_500_000_000  # that frames are planned before they are due
 IDLE_NS = 20_000_000  # between looks at a stream that nobody receives
-MOST_TOLD = 1000  # messages of the host that the ledger keeps
+MOST_MESSAGES = 1000  # messages of the host that the ledger keeps
 PAUSE_NS = 2_000_000  # between two tries of a patient device
 
 
@@ -127,7 +128,7 @@ class Transmission:
             self.endpoint.replug()
         else:
             self.endpoint.unplug()
-        self.ledger.tell(now_ns, REPLUG if back else UNPLUG)
+        self.ledger.enter(now_ns, REPLUG if back else UNPLUG)
 
     def _receivers(self) -> list[Peer]:
         return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.wanted]
@@ -190,9 +191,9 @@ class Transmission:
     def heard(self, peer: Peer, data: bytes, now_ns: int) -> None:
         """Have the device take what a host wrote: replies go first, then the frames that were asked for."""
         if not data:
-            self.ledger.tell(now_ns, "connected")
-        elif len(self.ledger.events) < MOST_TOLD:
-            self.ledger.tell(now_ns, "heard", data.hex())
+            self.ledger.enter(now_ns, "connected")
+        elif len(self.ledger.events) < MOST_MESSAGES:
+            self.ledger.enter(now_ns, "heard", data.hex())
         replies = [reply for reply in peer.device.hear(data) if reply]
         if replies and self._late and peer is self._awaited:  # behind the frame that is half sent
             for reply in reversed(replies):
@@ -201,7 +202,7 @@ class Transmission:
             peer.send(replies)
         rate_hz = peer.device.rate_hz
         if rate_hz and rate_hz != self._rate_hz:
-            self.ledger.tell(now_ns, "rate", f"{rate_hz:g}")
+            self.ledger.enter(now_ns, "rate", f"{rate_hz:g}")
             self._begin(rate_hz, now_ns - self._epoch_ns)
         wanted = peer.device.polled()
         if wanted:

@@ -68,7 +68,7 @@ class Udp:
         return [(self.peers[0], data)]
 
     def look(self) -> list[tuple[Correspondent, bytes]]:
-        """Return nothing: the port tells all."""
+        """Return nothing: the port states all."""
         return []
 
     def post(self, data: bytes, target: tuple[str, int]) -> int:

@@ -23,7 +23,7 @@ class Client(Connection):
         self.open = False
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send each piece as a message of text; bytes that are no text (a fault's) go as a binary one."""
+        """Send each piece as a message of text; bytes that are not text (a fault's) go as a binary one."""
         if not self.open:
             return [0] * len(pieces)
         wires = [self._message(piece) for piece in pieces]
@@ -69,7 +69,7 @@ class Websocket(Tcp):
                 heard.append((peer, bytes(event.data)))
             elif event.opcode is Opcode.CLOSE:
                 peer.open = False
-        with contextlib.suppress(OSError):  # of a peer that is gone: the next read says so
+        with contextlib.suppress(OSError):  # of a peer that is gone: the next read states it
             for piece in protocol.data_to_send():
                 if piece:
                     peer.socket.send(piece)

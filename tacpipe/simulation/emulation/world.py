@@ -109,9 +109,9 @@ def with_return(scene: pick_and_move.Scene) -> pick_and_move.Scene:
     held = 1 - trajectory.minimum_jerk(np.clip(since_s / RELEASE_S, 0.0, 1.0))  # (time,), of the grip
     away = 1 - trajectory.minimum_jerk(np.clip((since_s - RELEASE_S) / (RETURN_S - RELEASE_S), 0.0, 1.0))
 
-    def fading(values: Floats, share: Floats, rest: Any = 0.0) -> Floats:
+    def fading(values: Floats, fraction: Floats, rest: Any = 0.0) -> Floats:
         last = values[-1] - rest
-        faded: Floats = np.concatenate([values, rest + np.multiply.outer(share, last)])
+        faded: Floats = np.concatenate([values, rest + np.multiply.outer(fraction, last)])
         return faded
 
     path, contact, grasp = scene.path, scene.contact, scene.grasp

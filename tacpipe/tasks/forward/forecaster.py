@@ -61,7 +61,7 @@ class WindowArrays(NamedTuple):
 
 @dataclass(frozen=True)
 class Forecaster:
-    """Reads windows of touch and arm, and tells touch."""
+    """Reads windows of touch and arm, and states touch."""
 
     model: nn.Module
     config: Config
@@ -82,7 +82,7 @@ class Forecaster:
 
     @property
     def actions(self) -> str:
-        """What it is told of the plan: planned, none or shuffled."""
+        """What it is informed of the plan: planned, none or shuffled."""
         return str(self.config["params"]["actions"])
 
     @property
@@ -115,7 +115,7 @@ class Forecaster:
 
     @property
     def tells_change(self) -> bool:
-        """Whether it tells what is added to the last row, rather than levels."""
+        """Whether it states what is added to the last row, rather than levels."""
         return bool(self.model.change_only)
 
     @property
@@ -186,7 +186,7 @@ class Forecaster:
             moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
             told = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
             if any(one.shape != (1, self.horizon, touch.shape[2]) for one in told.values()):
-                raise ValueError("the baselines tell another number of steps or channels")
+                raise ValueError("the baselines predict another number of steps or channels")
 
     @overload
     def predict(self, recordings: Dataset | Recording, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
@@ -234,21 +234,21 @@ class Forecaster:
     def windows(self, recording: Recording) -> WindowArrays:
         """Return all windows of a recording as `predict` reads them: ``window``, ``plan`` and ``t_ns``, when each was known.
 
-        Rows in gaps are in none of them. The recorded motion stands for the plan. Raises as `predict`.
+        Rows in gaps are in none of them. The recorded motion represents the plan. Raises as `predict`.
         """
         from tacpipe.tasks.forward import prediction  # which reads this module
 
         return prediction.inputs(self, opened(recording.alone, self.chain))
 
     def _of_arrays(self, touch: Floats, arm: Floats, finger: Floats) -> Floats:
-        """Return the touch to come (window, horizon, channel) of what `_parts` returns."""
+        """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
         read = Windows(*(torch.from_numpy(np.ascontiguousarray(one.swapaxes(0, 1))) for one in (latent, arm, finger)))
         return self.decoded(self.told(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: Floats) -> None:
-        """Refuse windows (window, context, channel) whose levels are not near rest, as `predict` says."""
+        """Refuse windows (window, context, channel) whose levels are not near rest, as `predict` states."""
         largest = self.largest_level
         if largest is None:
             warnings.warn(
@@ -276,7 +276,7 @@ class Forecaster:
         """Return counts above rest (window, horizon, channel) of predicted features (window, horizon, feature).
 
         ``last`` (window, channel) and ``last_feature`` (window, feature) are those of the last row read. A model that
-        tells change adds the decoded change to the last row, so that it does not pay for what the codec lost of it.
+        states change adds the decoded change to the last row, so that it does not pay for what the codec lost of it.
         """
         levels = codecs.decode_ahead(self.codec, features, last)
         if self.tells_change and self.lossy:
@@ -304,10 +304,10 @@ class Forecaster:
                 at = np.argwhere(~np.isfinite(given))[0]
                 raise TacpipeError(
                     f"The {name} holds {given[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
-                    "all values must be finite. Leave the window out, or mend the recording."
+                    "all values must be finite. Leave the window out, or fix the recording."
                 )
             if not given[..., before + 3 : before + POSE].any(axis=-1).all():
-                raise TacpipeError(f"The {name} holds a quaternion of length 0, which is no orientation.")
+                raise TacpipeError(f"The {name} holds a quaternion of length 0, which is not an orientation.")
         if len(window) != len(plan):
             raise TacpipeError(
                 f"There are {len(window)} windows and {len(plan)} plans; each window needs its own plan."

@@ -80,7 +80,7 @@ class Trial:
     name: str
     seen: bool  # in training or validation of the model
     object: str | None = None
-    known: bool = True  # whether the model was trained on recordings of the same object, or nobody said what is held
+    known: bool = True  # whether the model was trained on recordings of the same object, or nobody stated what is held
     windows: int = 0
     errors: dict[str, Errors] = field(default_factory=dict)
 

@@ -41,7 +41,8 @@ class Rows:
         return loop.Part(len(self.starts), self.loss)
 
     def pick(self, starts: Tensor) -> tuple[Windows, Tensor]:
-        """Return the windows that begin at ``starts`` (window,) and their touch to come (horizon, window, feature)."""
+        """Return the windows that begin at ``starts`` (window,) and their future tactile signals (horizon, window,
+        feature)."""
         steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
         touch, arm = (one.index_select(0, rows.flatten()).view(*rows.shape, -1) for one in (self.touch, self.arm))

@@ -50,7 +50,7 @@ class Track:
     finger: Floats  # (time,), m; 0 where it is not recorded
     tactile: Floats  # (time, channel)
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
-    object: str | None = None  # what is held, where a label tells
+    object: str | None = None  # what is held, where a label states
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> NDArray[np.int64]:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""

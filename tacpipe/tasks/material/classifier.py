@@ -143,7 +143,9 @@ class Classifier:
         that recordings went through the same.
         """
         if CONFIG not in files:
-            raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train material`.")
+            raise TacpipeError(
+                "This is not a model: it has no config.json. Give the output of `tacpipe train material`."
+            )
         task = model_files.tree(files, CONFIG).get("task")
         if task != TASK:
             told = plain(str(task))
@@ -219,7 +221,7 @@ class Classifier:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
-                f"The model knows the sensors {', '.join(self.layouts)}; name the one that felt the slides."
+                f"The model knows the sensors {', '.join(self.layouts)}; name the one that recorded the slides."
             )
         layout = self.layout(sensor or next(iter(self.layouts)))
         frames = np.asarray(slides, np.float32)

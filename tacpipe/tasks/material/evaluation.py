@@ -40,13 +40,13 @@ PREDICTIONS = "predictions"
 
 @dataclass
 class Judged:
-    """What was said of the slides of one sensor."""
+    """What was stated of the slides of one sensor."""
 
     slides: Slides
     seen: NDArray[np.bool_]  # (slide,): the model was trained on it
     told: Told
     predicted: dict[str, Materials]  # predictor -> the material it names (slide,)
-    held: NDArray[np.bool_]  # (slide,): of a material whose label the sensor was not told
+    held: NDArray[np.bool_]  # (slide,): of a material whose label the sensor was not stated
     zero_shot: tuple[Materials, Materials] | None = None  # another sensor's names: of all materials, of held-out ones
     counted: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
 
@@ -70,7 +70,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     }
     if not judged:
         raise TacpipeError(
-            "There is no slide to judge the model on. Give a dataset that `tacpipe segment slides` made."
+            "There is no slide to evaluate the model on. Give a dataset that `tacpipe segment slides` made."
         )
     tree = _summary(judged, classifier, seen=False)
     seen = _summary(judged, classifier, seen=True)

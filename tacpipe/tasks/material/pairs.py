@@ -29,7 +29,7 @@ class Pairs:
     pairing: str = "random"  # random: other pairs every epoch; fixed: drawn once; permuted: random, of other classes
     shuffle: bool = True  # other batches every epoch; without, pairs are fixed as well
     drop_last: bool = False  # leave out the batch that is not full
-    reduced: str = ""  # sensor that learns from a share of the batches alone
+    reduced: str = ""  # sensor that learns from a fraction of the batches alone
     ratio: int = 100  # that share, in percent
     partners: Mapping[int, int] | None = None  # class of the first sensor -> class of the others, of permuted pairs
     seed: int = 0  # of what is drawn once
@@ -45,7 +45,7 @@ class Pairs:
         if self.reduced and self.shuffle:
             raise TacpipeError(
                 "A reduced sensor must see the same slides in every epoch, or it would see all in the end: "
-                "give --no-shuffle beside --reduce."
+                "give --no-shuffle next to --reduce."
             )
 
     def epoch(self) -> list[dict[str, Tensor]]:

@@ -65,7 +65,7 @@ def spectra(config: Config, known: BySensor, watched: BySensor, held: Mapping[st
     named = {name: {int(one) for one in some.labels} for name, some in told.items()}
     missing = sorted(set(config["classes"]) - set().union(*named.values()))
     if missing:
-        raise UsageError(f"hold_out leaves no sensor that is told of material {missing[0]}; leave one at least.")
+        raise UsageError(f"hold_out leaves no sensor with labels of material {missing[0]}; leave one at least.")
     config = config | {
         "spectra": {
             "way_m": bands.way_m,
@@ -93,7 +93,7 @@ def _felt(speeds: str, known: BySensor) -> dict[str, Felt]:
         told = some.speeds_m_s[some.speeds_m_s > 0]
         if not len(told) and name not in given:
             raise UsageError(
-                f"Nothing tells how fast {name} slides, and speeds is {speeds!r}; add {name}=0.05, or what it is."
+                f"It is not known how fast {name} slides, and speeds is {speeds!r}; add {name}=0.05, or what it is."
             )
         if some.layout.rate_hz <= 0:
             raise TacpipeError(

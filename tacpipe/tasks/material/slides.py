@@ -89,7 +89,7 @@ def read(
         sensor = shard.attributes.get("sensor")
         if not isinstance(sensor, str):
             raise TacpipeError(
-                f"Recording {name} does not say which sensor felt it; set it with `tacpipe label RECORDINGS {name} "
+                f"Recording {name} has no attribute with its sensor; set it with `tacpipe label RECORDINGS {name} "
                 f"--set sensor=biotac`, or what it is."
             )
         there.add(sensor)

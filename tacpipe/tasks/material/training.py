@@ -78,7 +78,7 @@ def train(
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     classes = sorted({int(one) for some in known.values() for one in some.materials})
     if len(classes) < 2:
-        raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to tell apart.")
+        raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to classify.")
     config: Config = {
         "task": TASK,
         "architecture": params["architecture"],

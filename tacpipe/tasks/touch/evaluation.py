@@ -42,10 +42,12 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     grasps = grasps_of.read(recordings)
     if not len(grasps):
         raise TacpipeError(
-            "There is no grasp to judge the model on. Give a dataset with recordings of the role asked for."
+            "There is no grasp to evaluate the model on. Give a dataset with recordings of the role asked for."
         )
     if predictor.baselines is None:
-        raise TacpipeError("The model was trained without baselines, and cannot be judged. Train it with --baselines.")
+        raise TacpipeError(
+            "The model was trained without baselines, and cannot be evaluated. Train it with --baselines."
+        )
     told = {TRUE: grasps.felt, MODEL: predictor.foretell(grasps), **predictor.baselines.foretell(grasps)}
     told = {name: {target: one[target] for target in predictor.targets} for name, one in told.items()}
     streams = {name: told_table(one) for name, one in told.items()}

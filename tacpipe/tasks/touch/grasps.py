@@ -121,7 +121,7 @@ def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
 def _felt(shard: Recording) -> dict[str, Floats]:
     if READING not in shard.streams:
         raise TacpipeError(
-            f"Recording {shard.name} has no reading of touch to learn from or to judge by. `tacpipe predict` needs none."
+            f"Recording {shard.name} has no reading of touch to learn from or to evaluate by. `tacpipe predict` needs none."
         )
     table = shard.table(READING)
     if table.num_rows != 1:

@@ -136,7 +136,7 @@ def _check(inputs: Inputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
         )
     if (inputs.posed or inputs.normalisation == "wrist") and inputs.wrist == "given" and grasp.wrist is None:
         raise TacpipeError(
-            f"{name} does not tell how the wrist is turned, which inputs {inputs.mode} with normalisation "
+            f"{name} does not state how the wrist is turned, which inputs {inputs.mode} with normalisation "
             f"{inputs.normalisation} need. Choose others, or --wrist estimated, which makes it of the closing axis and the "
             f"camera's line of sight."
         )

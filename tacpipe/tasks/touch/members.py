@@ -54,7 +54,7 @@ class ForestMember:
             require_colours(grasps.names, grasps.clouds)
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
-            raise TacpipeError("The model was trained on other features than this version tells. Train it again.")
+            raise TacpipeError("The model was trained on other features than this version computes. Train it again.")
         told = averaged((group, forest.predict(rows)) for group, forest in self.forests)
         return np.concatenate([told[target] for target in self.targets], axis=1)
 

@@ -31,6 +31,6 @@ def predictions(predictor: Predictor, recordings: Dataset) -> pa.Table:
     """Return the table of `predict`, which raises the same errors."""
     grasps = grasps_of.read(recordings, felt=False)
     if not len(grasps):
-        raise TacpipeError("There is no grasp to foretell. Give a dataset with recordings of the role asked for.")
+        raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the role asked for.")
     table = told_table(predictor.foretell(grasps))
     return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))

@@ -87,16 +87,16 @@ class Predictor:
                 baselines = Baselines.from_tensors(told, tuple(config["learned_objects"]))
                 baselines.check()
             if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
-                raise ValueError(f"its members do not foretell {excerpt(config['targets'])}")
+                raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
         return cls(config, found, baselines, chain)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
-        """What the model foretells."""
+        """What the model predicts."""
         return tuple(self.config["targets"])
 
     def foretell(self, grasps: Grasps) -> dict[str, Floats]:
-        """Return what would be felt by target (grasp, value), device counts: the mean of the members.
+        """Return what would be measured by target (grasp, value), device counts: the mean of the members.
 
         Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
         """
@@ -110,7 +110,7 @@ class Predictor:
     def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
 
     def predict(self, given: Dataset | Recording | Cloud, grasp: Grasp | None = None, /) -> pa.Table | Touch:
-        """Return what grasps would feel like: of a dataset or one of its ``shards`` as a table, of one cloud as `Touch`.
+        """Return what grasps would measure like: of a dataset or one of its ``shards`` as a table, of one cloud as `Touch`.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
         a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.
@@ -122,7 +122,7 @@ class Predictor:
         """
         if isinstance(given, Cloud):
             if grasp is None:
-                raise UsageError("A cloud alone does not say where the fingers close. Give predict(cloud, grasp).")
+                raise UsageError("A cloud alone does not state where the fingers close. Give predict(cloud, grasp).")
             return self.predict_all(given, [grasp])[0]
         from tacpipe.tasks.touch import prediction  # which reads this module
 
@@ -159,7 +159,7 @@ def _member(config: Config, about: Mapping[str, Any], tensors: dict[str, Any], d
         for group, forest in forests:
             forest.check(len(about["features"]), sum(biotac_sp.width(target) for target in group))
         if {target for group, _ in forests for target in group} != {*targets}:
-            raise ValueError(f"the forests do not foretell {excerpt(targets)}")
+            raise ValueError(f"the forests do not predict {excerpt(targets)}")
         return members.ForestMember(targets, forests, about["coloured"], about["placed"], tuple(about["features"]))
     scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):

@@ -120,7 +120,7 @@ def test_recordings_whose_objects_nobody_named_are_neither_known_nor_unseen() ->
 def test_told_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:
     results = [result("raw", seed, ratio=ratio) for seed, ratio in enumerate((0.5, 0.25, 0.375))]
     results += [result("PCA-20", seed, ratio=2.0) for seed in range(2)]
-    told = over(*results).told_apart()
+    told = over(*results).representative_runs()
     assert [(run.config["codec"]["name"], run.config["params"]["seed"]) for run in told] == [("raw", 2), ("PCA-20", 0)]
 
 
@@ -197,6 +197,6 @@ def test_without_unseen_objects_only_known_ones_are_told() -> None:
 
 def test_figures_5_and_6_are_drawn_from_the_papers_representations() -> None:
     html = overview.render(over(result("PCA-20"), result("AE-C1-8"), result("raw")), [], simulated=False)
-    assert html.count("Predictions beside the truth") == 2
+    assert html.count("Predictions next to the truth") == 2
     figure_6 = html[html.index("Figure 5 in the paper") :]
     assert ">z01<" in figure_6 and ">z03<" in figure_6 and ">z00<" not in figure_6

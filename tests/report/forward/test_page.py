@@ -74,7 +74,9 @@ def test_simulated_results_say_so_and_others_do_not(judged: Any) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_number_of_traces_is_the_readers_choice(judged: Any) -> None:
-    drawn = [page.render([judged], title="t", traces=count).decode().count("Predictions beside") for count in (0, 1, 2)]
+    drawn = [
+        page.render([judged], title="t", traces=count).decode().count("Predictions next to") for count in (0, 1, 2)
+    ]
     assert drawn == [0, 1, 2]
 
 

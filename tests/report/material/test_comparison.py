@@ -41,7 +41,7 @@ def test_the_interval_covers_what_drawing_slides_anew_gives() -> None:
     assert found.high == pytest.approx(0.2 + 1.96 * sd, abs=0.05)
 
 
-def test_methods_that_are_as_good_cannot_be_told_apart() -> None:
+def test_methods_that_are_as_good_cannot_be_representative_runs() -> None:
     found = comparison.difference(runs(3), runs(3), "biotac")
     assert found is not None
     assert (found.mean, found.mcnemar, found.word) == (0, 1, "unclear")

@@ -118,7 +118,8 @@ def test_a_missing_control_and_a_missing_counterpart_are_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("correct", "word"), [(20, "above chance"), (5, "which cannot be told from chance"), (0, "which cannot be told")]
+    ("correct", "word"),
+    [(20, "above chance"), (5, "which cannot be distinguished from chance"), (0, "which cannot be distinguished")],
 )
 def test_materials_that_a_sensor_never_saw_are_told_of(correct: int, word: str) -> None:
     zero = {

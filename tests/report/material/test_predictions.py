@@ -36,8 +36,8 @@ def test_the_last_batch_does_not_count_where_the_model_leaves_it_out() -> None:
 
 def test_a_predictor_that_says_nothing_of_a_sensor_has_no_names_there() -> None:
     found = read(result(wrong=BOTH, also={"swapped": {"biotac": 0}}))
-    assert (found.of("roboskin").said["swapped"] == predictions.NOTHING).all()
-    assert (found.of("biotac").said["swapped"] == found.of("biotac").materials).all()
+    assert (found.of("roboskin").predicted["swapped"] == predictions.NOTHING).all()
+    assert (found.of("biotac").predicted["swapped"] == found.of("biotac").materials).all()
     assert found.latents is None
 
 

@@ -22,7 +22,7 @@ def test_values_are_device_counts_by_target_with_electrodes_side_by_side() -> No
     assert found.targets == biotac_sp.TARGETS
     assert found.true["e_mf"].shape == (24, 24)
     np.testing.assert_allclose(found.true["pdc_th"][:2, 0], [3040, 2860])  # 0.6 and 0.4 of 2500 to 3400
-    np.testing.assert_allclose(found.said["model"]["pdc_th"][:2, 0], [3130, 2950])  # a tenth more
+    np.testing.assert_allclose(found.predicted["model"]["pdc_th"][:2, 0], [3130, 2950])  # a tenth more
 
 
 def test_known_and_novel_objects_are_told_apart() -> None:

@@ -94,7 +94,7 @@ def test_simulated_results_beside_recorded_ones_are_marked_and_kept_apart() -> N
     text = page.render([result(), result(simulated=True)], title="t").decode()
     elements.check(text)
     assert text.count('<span class="badge">simulated</span>') == 1
-    assert "What is marked simulated is no evidence about a real sensor." in text
+    assert "What is marked simulated is not evidence about a real sensor." in text
     assert text.count("<h4>PDC thumb, known objects") == 2
 
 

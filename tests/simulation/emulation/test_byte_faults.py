@@ -220,7 +220,7 @@ def test_faults_are_read_from_a_command_line() -> None:
     ("text", "told"),
     [
         ("nois=1", "there is no fault nois"),
-        ("noise", "'noise' is no fault"),
+        ("noise", "'noise' is not a fault"),
         ("drop=2", "0 to 1"),
         ("flip=-1", "below 0"),
     ],

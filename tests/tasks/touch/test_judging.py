@@ -227,5 +227,5 @@ def test_what_cannot_be_judged_is_refused(model: dict[str, bytes], tmp_path: Pat
     with pytest.raises(TacpipeError, match="ball-000 has no reading of touch"):
         touch.evaluate(model, dataset(recording(0, felt=False)))
     bare = trained(tmp_path, **FAST, baselines=False)
-    with pytest.raises(TacpipeError, match="trained without baselines, and cannot be judged"):
+    with pytest.raises(TacpipeError, match="trained without baselines, and cannot be evaluated"):
         touch.evaluate(bare, recordings(6, 1))

@@ -1,0 +1,201 @@
+"""Pages that come from the program itself: the command line, the params of every stage, Python, decisions, result tables.
+
+mkdocs calls ``on_files`` and ``on_page_markdown``; tests call the functions that return pages.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+BUILT_IN = ("tacpipe.", "tacpipe_stages.")
+TABLE = re.compile(r"^\[\[results: (\w+)\]\]$", re.MULTILINE)
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the generated pages to those that lie in ``docs/``."""
+    from mkdocs.structure.files import File
+
+    for path, text in pages().items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the tables of results where a page asks for them with ``[[results: NAME]]``."""
+    return TABLE.sub(lambda found: result_table(found.group(1)), markdown)
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each generated page by path."""
+    return {
+        "reference/cli.md": command_line(),
+        "reference/params.md": params(),
+        "reference/python.md": python(),
+        "decisions/index.md": decisions(),
+    }
+
+
+def stage_names() -> list[str]:
+    """Return the names of the stages that tacpipe brings."""
+    from tacpipe.plugins import registry
+
+    return [name for name, target in registry.stages().items() if target.startswith(BUILT_IN)]
+
+
+def command_line() -> str:
+    """Return the page of all commands, each with its help as the program prints it."""
+    parts = [
+        "# Command line\n",
+        "The text below is what `tacpipe COMMAND --help` prints, `-h` for short.\n",
+        f"```text\n{help_of([])}\n```\n",
+    ]
+    for words in command_names():
+        parts += [f"## tacpipe {' '.join(words)}\n", f"```text\n{help_of(words)}\n```\n"]
+    return "\n".join(parts)
+
+
+def command_names() -> list[list[str]]:
+    """Return the words of every command, those of groups behind their group."""
+    from tacpipe.cli import commands, main
+
+    found: list[list[str]] = []
+    groups: dict[str, list[str]] = {}
+    for name in stage_names():
+        group, _, method = name.partition(".")
+        groups.setdefault(group, []).append(method)
+    for group in [name for name in main.ORDER if name in groups]:
+        found.append([group])
+        found += [[group, method] for method in groups[group] if method]
+    for name in commands.NAMES:
+        found.append([name])
+        found += [[name, verb] for verb in _verbs(name)]
+    return found
+
+
+def _verbs(name: str) -> list[str]:
+    listed = help_of([name]).split("\nCommands:\n")
+    return re.findall(r"^  ([a-z-]+) ", listed[1], re.MULTILINE) if len(listed) > 1 else []
+
+
+def help_of(words: list[str]) -> str:
+    """Return what ``tacpipe WORDS --help`` prints, 100 columns wide."""
+    import typer
+
+    from tacpipe.cli import help as plain_help
+    from tacpipe.cli import main
+
+    arguments = [*words, "--help"]
+    before, columns = sys.argv, os.environ.get("COLUMNS")
+    sys.argv, os.environ["COLUMNS"] = ["tacpipe", *arguments], "102"
+    try:
+        program = main.app(arguments)
+        plain_help.apply(program)
+        command: Any = typer.main.get_command(program)
+        context = command.make_context("tacpipe", [], resilient_parsing=True)
+        for word in words:
+            command = command.get_command(context, word)
+            context = command.make_context(word, [], parent=context, resilient_parsing=True)
+        text: str = command.get_help(context)
+    finally:
+        sys.argv = before
+        if columns is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = columns
+    return text.strip()
+
+
+def params() -> str:
+    """Return the page of the params of every stage, with meaning, values and default."""
+    from tacpipe.plugins import registry
+
+    parts = [
+        "# Params of every stage\n",
+        "Each is an option (`--learning-rate 0.001`), a line of `params.yaml` (`learning_rate: 0.001`) and a `--set` "
+        "(`--set learning_rate=0.001`). All params of a stage are part of its key. The tables come from the dataclasses.\n",
+    ]
+    for name in stage_names():
+        stage = registry.load(name)
+        rows = param_rows(stage)
+        parts.append(f"## {name.replace('.', ' ')}\n\n{registry.summary(name)}\n")
+        if not rows:
+            parts.append("It has no params.\n")
+            continue
+        parts.append("| param | values | default | meaning |\n| --- | --- | --- | --- |")
+        parts += [f"| {' | '.join(row)} |" for row in rows]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def param_rows(stage: Any) -> list[list[str]]:
+    """Return name, values, default and meaning of each param of a stage, as Markdown."""
+    from tacpipe.plugins import fields
+    from tacpipe.plugins import params as params_of
+
+    comments = params_of.comments(stage)
+    rows = []
+    for name, wanted in params_of.fields(stage).items():
+        default = " or ".join(f"`{value}`" if value != "" else "empty" for value in params_of.defaults(stage, name))
+        text = comments.get(name, "")
+        if owners := params_of.having(stage, name):
+            text = f"{text}; only with {params_of.tag(stage)} {', '.join(map(str, owners))}".lstrip("; ")
+        rows.append([f"`{name}`", _cell(fields.describe(wanted)), default, _cell(text)])
+    return rows
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
+
+
+def python() -> str:
+    """Return the page of the Python interface: one entry a name of ``tacpipe.__all__``, from its docstring."""
+    import tacpipe
+
+    parts = [
+        "# Python\n",
+        "All public names are those of `tacpipe.__all__`, and the constraints that params are annotated with.\n",
+    ]
+    for name in sorted(tacpipe.__all__, key=str.lower):
+        if name.startswith("__"):
+            continue
+        parts.append(f"::: {_path(name)}\n    options:\n      heading_level: 2\n")
+    parts.append(
+        "## Constraints of params\n\n::: tacpipe.plugins.constraints\n    options:\n      show_root_heading: false\n"
+        "      filters: ['!^_', '!^allows$', '!^describe$']\n"
+    )
+    return "\n".join(parts)
+
+
+def _path(name: str) -> str:
+    """Return where a public name is defined, for mkdocstrings."""
+    tacpipe: Any = importlib.import_module("tacpipe")
+    found = getattr(tacpipe, name)
+    module = getattr(found, "__module__", None)
+    defined = getattr(found, "__qualname__", name)
+    return f"{module}.{defined}" if module and module.startswith("tacpipe") else f"tacpipe.{name}"
+
+
+def decisions() -> str:
+    """Return the list of decisions, oldest first."""
+    lines = ["# Decisions\n", "What took an argument or a measurement to decide, one page each.\n"]
+    for page in sorted((DOCS / "decisions").glob("[0-9]*.md")):
+        if page.stem.startswith("0000"):
+            continue
+        title = page.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+        lines.append(f"- [{title}]({page.name})")
+    return "\n".join([*lines, ""])
+
+
+def result_table(name: str) -> str:
+    """Return a table of ``docs/results/`` as Markdown."""
+    with (DOCS / "results" / f"{name}.csv").open(encoding="utf-8") as file:
+        head, *rows = list(csv.reader(file))
+    lines = [f"| {' | '.join(word.replace('_', ' ') for word in head)} |", f"|{' --- |' * len(head)}"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])

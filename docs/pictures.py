@@ -1,0 +1,97 @@
+"""Draw the pictures of the docs: `make pictures`, which runs ``python docs/pictures.py demo/report.html``.
+
+The charts show the tables in ``docs/results/``; the picture of the front page is the first screen of the demo's report.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+IMAGES = DOCS / "images"
+TITLES = {  # of each table: what its value is, and the column that groups its rows
+    "forward": ("Skill over persistence, known objects, with 95 % interval", "objects"),
+    "material": ("Slides named right, %, with 95 % interval", "sensor"),
+    "touch": ("Skill over the constant, known objects, with 95 % interval", "target"),
+}
+VALUES = ("skill", "accuracy_percent")
+BLUE, GREY = "#1f6feb", "#6e7781"
+WIDTH, HEIGHT = 1100, 1010  # of the first screen, pixels
+
+
+def rows(name: str) -> list[dict[str, str]]:
+    """Return the rows of a table of results."""
+    with (DOCS / "results" / f"{name}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def value_of(row: dict[str, str]) -> float:
+    """Return the value that a row of results states."""
+    return float(next(row[name] for name in VALUES if name in row))
+
+
+def chart(name: str) -> None:
+    """Draw one table as a dot and an interval a row."""
+    from matplotlib.figure import Figure
+
+    title, group = TITLES[name]
+    table = rows(name)
+    figure = Figure(figsize=(7.5, 0.36 * len(table) + 0.9), layout="constrained")
+    axes: Any = figure.add_subplot()
+    for place, row in enumerate(table):
+        baseline = any(word in row["method"] for word in ("baseline", "persistence", "constant", "chance"))
+        colour = GREY if baseline else BLUE
+        axes.plot([float(row["low"]), float(row["high"])], [place, place], color=colour, linewidth=2)
+        axes.plot(value_of(row), place, "o", color=colour, markersize=6)
+    labels = [
+        f"{row['method']} · {row[group]}" if row[group] not in ("both", "known") else row["method"] for row in table
+    ]
+    axes.set_yticks(range(len(table)), labels)
+    axes.invert_yaxis()
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    axes.grid(axis="x", alpha=0.3)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    figure.savefig(IMAGES / f"{name}.png", dpi=110, metadata={"Software": None})
+
+
+def first_screen(page: Path) -> None:
+    """Take a picture of the first screen of a report.
+
+    Raises `FileNotFoundError` where there is no Chromium.
+    """
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        raise FileNotFoundError("chromium is not installed; on Debian: sudo apt-get install chromium")
+    with tempfile.TemporaryDirectory() as folder:
+        shot = Path(folder) / "report.png"
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WIDTH},{HEIGHT}"]
+        subprocess.run(
+            [browser, *flags, f"--screenshot={shot}", page.resolve().as_uri()],
+            check=True,
+            capture_output=True,
+            timeout=300,
+        )
+        from PIL import Image
+
+        with Image.open(shot) as image:
+            image.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(IMAGES / "report.png", optimize=True)
+
+
+def main() -> None:
+    """Draw all pictures; the first screen only where a report is named."""
+    IMAGES.mkdir(exist_ok=True)
+    for name in TITLES:
+        chart(name)
+    for page in sys.argv[1:]:
+        first_screen(Path(page))
+
+
+if __name__ == "__main__":
+    main()
