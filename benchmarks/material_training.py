@@ -1,4 +1,4 @@
-"""An epoch of joint learning, beside a plain PyTorch loop of the same maths; and how long the strong classifier takes."""
+"""An epoch of joint learning next to a plain PyTorch loop of the same maths, and the seconds of the MiniRocket classifier."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, Shape
-from tacpipe.models.strong import Strong
-from tacpipe.tasks.material.learning import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import Felt, JointWork, Weights
 from tacpipe.tasks.material.pairs import Pairs
 from tacpipe.training import loop
 
@@ -24,11 +24,11 @@ SLIDES, CLASSES, BATCH, RATE = 600, 20, 32, 5e-4
 SHAPES = {"biotac": Shape(19, CLASSES), "roboskin": Shape(60, CLASSES, header="cnn")}
 FRAMES = {"biotac": 400, "roboskin": 75}
 WEIGHTS = Weights(align_from=0)
-FIT_S = 30.0  # seconds that the strong classifier may take on two cores
+FIT_S = 30.0  # seconds that the MiniRocket classifier may take on two cores
 
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
-    """Return the ratio of training speeds, the losses being the same, and the strong classifier's seconds."""
+    """Return the ratio of training speeds, the losses being the same, and the MiniRocket classifier's seconds."""
     torch.manual_seed(0)
     felt = {name: _felt(name) for name in SHAPES}
     first = nn.ModuleDict({name: RecurrentAutoencoder(shape) for name, shape in SHAPES.items()}).state_dict()
@@ -54,7 +54,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
             "3 times as fast",
             found >= 3,
         ),
-        _strong(felt),
+        _minirocket(felt),
     ]
 
 
@@ -152,16 +152,18 @@ def _step(optimiser: torch.optim.Optimizer, loss: Tensor) -> float:
     return float(loss.detach())
 
 
-def _strong(felt: Mapping[str, Felt]) -> timing.Line:
-    """Return how long the strong classifier takes to fit the slides of both sensors."""
+def _minirocket(felt: Mapping[str, Felt]) -> timing.Line:
+    """Return how long the MiniRocket classifier takes to fit the slides of both sensors."""
     seconds = {}
     for name, one in felt.items():
         begun = time.perf_counter()
-        Strong.fit(one.frames.numpy(), one.classes.numpy())
+        MinirocketClassifier.fit(one.frames.numpy(), one.classes.numpy())
         seconds[name] = time.perf_counter() - begun
     worst = max(seconds.values())
     told = " and ".join(f"{value:.1f} s ({name})" for name, value in seconds.items())
-    return timing.Line(f"strong classifier, {SLIDES} slides fitted", told, "–", "", f"{FIT_S:.0f} s", worst <= FIT_S)
+    return timing.Line(
+        f"MiniRocket classifier, {SLIDES} slides fitted", told, "–", "", f"{FIT_S:.0f} s", worst <= FIT_S
+    )
 
 
 def _felt(name: str) -> Felt:

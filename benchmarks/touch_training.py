@@ -19,7 +19,7 @@ from tacpipe.models.pointnet import PointFeatures, PointNet
 from tacpipe.simulation.grasp import simulate_trial
 from tacpipe.simulation.grasp_scene import Rig
 from tacpipe.tasks.touch.inputs import Inputs, Sources
-from tacpipe.tasks.touch.learning import SMALLEST, Felt, TouchWork
+from tacpipe.tasks.touch.losses import SMALLEST, Felt, TouchWork
 from tacpipe.training import loop
 
 CLOUDS = 9_000  # that the letter trains on

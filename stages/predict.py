@@ -1,4 +1,9 @@
-"""Tell what a model expects of recordings, row by row; `tacpipe evaluate` tells how well it does."""
+"""Predict recordings with a trained model, row by row.
+
+`tacpipe evaluate` reports how good the predictions are.
+
+Example: tacpipe predict models/forward data/segments -o data/predictions
+"""
 
 from __future__ import annotations
 
@@ -19,14 +24,14 @@ STEPS = CommaList(PositiveInt, least=1)
 
 @dataclass(frozen=True)
 class Params:
-    """What is told."""
+    """What is predicted."""
 
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
 
 
 @stage(version=1)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Write what a model expects of each recording, with the time at which it was known."""
+    """Return the predictions for each recording, with the time at which each was available."""
     from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))

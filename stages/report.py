@@ -1,8 +1,10 @@
-"""Put results on one page that needs nothing but a browser.
+"""Show results on one self-contained HTML page.
 
 Results of the same task are compared, seeds and folds of a method pooled. Of more than two of the task ``forward``, only
-the best method's and that of the paper are told in full; outputs of ``tacpipe compress`` may be given besides, which tell
-what codecs of other widths lose. With those of the task ``material``, slides may be given, which tell how they went.
+the best method's and that of the paper are shown in full; with outputs of ``tacpipe compress``, the page shows the loss of
+codecs of other widths. With slides next to results of the task ``material``, it shows their profiles.
+
+Example: tacpipe report results/forward -o report.html
 """
 
 from __future__ import annotations
@@ -25,12 +27,12 @@ class Params:
     """What the page shows."""
 
     title: str = ""  # heading of the page; without one, what its tasks predict
-    traces: NonNegativeInt = 2  # recordings of each forecast told in full whose predictions are drawn
+    traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn
 
 
-@stage(version=4)
+@stage(version=5)
 def report(params: Params, results: Datasets) -> Result:
-    """Put results on one page: headline, figures, tables, and where every number comes from."""
+    """Return one page: headline, figures, tables, and where every number comes from."""
     from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 

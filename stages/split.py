@@ -1,4 +1,7 @@
-"""Give each recording its role: train, val or test."""
+"""Assign each recording a role: train, val or test.
+
+Example: tacpipe split data/segments -o data/split
+"""
 
 from __future__ import annotations
 

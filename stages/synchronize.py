@@ -1,13 +1,19 @@
-"""Bring the streams of each recording onto one clock: one table, one row a grid point."""
+"""Resample all streams of a recording onto one clock.
+
+The output has one table a recording and one row a grid point, over the time that all streams cover, with masks of
+repeated samples and of gaps.
+
+Example: tacpipe synchronize data/recordings -o data/synced
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins.constraints import PositiveFloat, Rate
+from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
 if TYPE_CHECKING:
@@ -33,11 +39,12 @@ BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at
 class Params:
     """The grid, the clock that places samples on it, and what counts as a gap."""
 
-    rate_hz: Rate = 50.0  # points a second of the uniform grid
+    rate_hz: Rate = 50.0  # rate of the uniform grid
     # uniform; logged: at the master's own stamps; fresh: at those whose rows are not repeated samples
     grid: Literal["uniform", "logged", "fresh"] = "uniform"
     master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
-    gap_ms: PositiveFloat = 50.0  # milliseconds; a point between samples further apart than this is marked as in a gap
+    # longest time between samples without a gap; points in a longer one are marked
+    gap_ms: Annotated[PositiveFloat, Unit("ms")] = 50.0
     # time of a sample: device: its own stamp; arrival: when it came; auto: the device's where there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are

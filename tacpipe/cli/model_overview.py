@@ -12,6 +12,7 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline
+from tacpipe.plugins import params as params_of
 from tacpipe.store.store import Store
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
@@ -39,7 +40,7 @@ def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
         "parameters": config.get("parameters") or _parameters(opened),
         "epochs": len(history) or None,
         "validation": config.get("validation") or _best(history),
-        "params": config.get("params", dict(opened.source.params)),
+        "params": params_of.named(opened.source.stage, config.get("params", opened.source.params)),
         "inputs": _inputs(opened.source.inputs, store),
         "chain": [f"{step['stage']} {step['version']}" for step in opened.source.chain],
     }

@@ -83,7 +83,7 @@ def fit(
     workspace: Path,
     *,
     components: int,
-    of: str = frame_stacking.LEVELS,
+    representation: str = frame_stacking.LEVELS,
 ) -> Autoencoder:
     """Return the codec of ``components`` latents whose network, of those ``tried``, gives held-out rows back best.
 
@@ -105,15 +105,17 @@ def fit(
             f"An autoencoder cannot be fitted on {len(train)} rows and stopped by {len(val)}. Give it longer training "
             "recordings with contact."
         )
-    mean, scale = standard(train[:, -width:], of)
+    mean, scale = standard(train[:, -width:], representation)
     learned, watched = (torch.from_numpy(scaled(part, mean, scale)) for part in (train, val))
     found = [
-        _trained(learned, watched, network, schedule, workspace / f"{index:02d}", components, of)
+        _trained(learned, watched, network, schedule, workspace / f"{index:02d}", components, representation)
         for index, network in enumerate(tried)
     ]
     best = min(range(len(found)), key=lambda index: _lowest(found[index]))
     encoder, decoder = (_layers(found[best].weights, part) for part in ("encoder", "decoder"))
-    codec = Autoencoder(rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, of)
+    codec = Autoencoder(
+        rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
+    )
     told = [
         _told(network, one) | {"kept": at == best} for at, (network, one) in enumerate(zip(tried, found, strict=True))
     ]
@@ -153,7 +155,7 @@ def _trained(
     schedule: loop.Schedule,
     workspace: Path,
     components: int,
-    of: str,
+    representation: str,
 ) -> loop.Trained:
     widths = (learned.shape[1], *network.hidden, components)
 
@@ -165,7 +167,7 @@ def _trained(
         return loop.Part(len(rows), loss)
 
     return loop.train(
-        lambda: _Mirrored(widths, bias=of == frame_stacking.LEVELS),
+        lambda: _Mirrored(widths, bias=representation == frame_stacking.LEVELS),
         loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace,

@@ -27,7 +27,7 @@ class Codec(Protocol):
         """The word that `load` knows it by."""
 
     @property
-    def of(self) -> str:
+    def representation(self) -> str:
         """What latents stand for: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
 
     @property
@@ -51,7 +51,7 @@ class Codec(Protocol):
         """
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts that latents stand for, (…, latent) to (…, channel): levels or increments, as ``of`` says."""
+        """Return decoded counts, (…, latent) to (…, channel): levels or increments, whichever ``representation`` is."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Raw:
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
     kind: str = "raw"
-    of: str = LEVELS
+    representation: str = LEVELS
 
     @property
     def latents(self) -> tuple[str, ...]:
@@ -85,7 +85,7 @@ def decode_ahead(codec: Codec, latents: Floats, last: Floats) -> Floats:
     above rest. A codec of increments adds them up onto ``last``; one of levels does not look at it.
     """
     decoded = codec.decode(latents)
-    return last[:, None] + np.cumsum(decoded, axis=1) if codec.of == INCREMENTS else decoded
+    return last[:, None] + np.cumsum(decoded, axis=1) if codec.representation == INCREMENTS else decoded
 
 
 def encode_finite(project: Callable[[Floats], Floats], inputs: Floats, width: int) -> Floats:

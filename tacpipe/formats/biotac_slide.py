@@ -75,7 +75,10 @@ def recording_name(material: int, trial: int) -> str:
 
 @stage(version=2, discover=discover)
 def biotac_slide(params: Params, files: Files) -> RecordingOutput:
-    """Return the stream biotac of a slide, and those of the arm that are there; angular velocity that is NaN stays so."""
+    """Read slides of a BioTac over materials.
+
+    Each gives the stream biotac and those of the arm that are there; angular velocity that is NaN stays so.
+    """
     from tacpipe.formats import published, xela
 
     streams: dict[str, pa.Table] = {}

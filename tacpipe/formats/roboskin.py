@@ -47,7 +47,7 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
 class Params:
     """How slides are read."""
 
-    rate_hz: Rate = 50.0  # frames a second that stamps are made from; nominal, the set does not tell
+    rate_hz: Rate = 50.0  # nominal frame rate, from which time stamps are computed: the set has none
     # time: frames in order of time; authors: in the order in which they were published, to compare with
     layout: Literal["time", "authors"] = "time"
 
@@ -84,7 +84,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def roboskin(params: Params, files: Files) -> RecordingOutput:
-    """Return the stream roboskin of a slide: 60 columns, triangle by triangle, one row a frame; stamps are made."""
+    """Read slides of an iCub RoboSkin over materials.
+
+    Each gives the stream roboskin: 60 columns, triangle by triangle, one row a frame, with computed time stamps.
+    """
     import numpy as np
 
     from tacpipe.channels import schema

@@ -27,7 +27,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=2, discover=discover)
 def xela_flat(params: Params, files: Files) -> RecordingOutput:
-    """Return the streams xela1, xela2, robot, marker1 and marker2 of a trial; an unseen marker is NaN."""
+    """Read pick-and-move trials of two XELA uSkin.
+
+    Each gives the streams xela1, xela2, robot, marker1 and marker2; an unseen marker is NaN.
+    """
     import numpy as np
 
     from tacpipe.channels import schema

@@ -29,7 +29,10 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
 
 @stage(version=1, discover=discover)
 def xela_psc(params: Params, files: Files) -> RecordingOutput:
-    """Return the streams xela1, xela2, robot, marker and slip of a trial; an unseen marker is NaN."""
+    """Read pushing trials of two XELA uSkin with labels of slip.
+
+    Each gives the streams xela1, xela2, robot, marker and slip; an unseen marker is NaN.
+    """
     import numpy as np
     import pyarrow as pa
 

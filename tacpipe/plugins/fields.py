@@ -56,11 +56,15 @@ def bare(wanted: Any) -> Any:
 
 def constraints(wanted: Any) -> list[Constraint]:
     """Return the constraints of an annotation, also of one that None is the only alternative to."""
+    return [one for one in metadata(wanted) if isinstance(one, Constraint)]
+
+
+def metadata(wanted: Any) -> tuple[Any, ...]:
+    """Return what follows the type in ``Annotated``, also where None is the only alternative; empty for other types."""
     kinds = [kind for kind in get_args(wanted) if kind is not types.NoneType] if get_origin(wanted) in _UNIONS else []
     if len(kinds) == 1:
-        return constraints(kinds[0])
-    found = get_args(wanted)[1:] if get_origin(wanted) is Annotated else ()
-    return [one for one in found if isinstance(one, Constraint)]
+        return metadata(kinds[0])
+    return get_args(wanted)[1:] if get_origin(wanted) is Annotated else ()
 
 
 def check(value: Any, wanted: Any, name: str, where: str = "") -> Any:

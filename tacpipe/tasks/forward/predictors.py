@@ -96,7 +96,7 @@ def told(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Ite
 def _of_model(forecaster: Forecaster, some: Forecast, last: Floats, last_feature: Floats) -> dict[str, Prediction]:
     """Return the model's prediction, and persistence; ``last`` (window, channel) is what is felt now."""
     codec, horizon = forecaster.codec, forecaster.horizon
-    still = np.zeros_like(last_feature) if codec.of == INCREMENTS else last_feature
+    still = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
     found = {
         MODEL: Prediction(some.features, some.count),
         BASELINE: Prediction(_held(still, horizon), _held(last, horizon)),

@@ -29,6 +29,7 @@ from tacpipe.tasks.material.classifier import (
     Told,
 )
 from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
+from tacpipe.tasks.material.params import XLSTM, Raec
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.material.training import HISTORY
 
@@ -108,7 +109,8 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
     predicted = {MODEL: classifier.named(told.scores)}
     if sensor in classifier.last:
         predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].tell(slides.frames).scores)
-    mapped = bool(classifier.config["params"].get("known"))  # all have the known sensor's classifier already
+    params = classifier.params
+    mapped = isinstance(params, Raec) and bool(params.frozen_sensor)  # all have the frozen sensor's classifier already
     if classifier.config.get("joint") and told.latents is not None and not mapped:
         predicted[SWAPPED] = _exchanged(classifier, sensor, told.latents)
     for name, by_sensor in classifier.baselines.items():
@@ -119,9 +121,8 @@ def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
     counted = np.ones(len(slides), bool)
-    if classifier.config["params"].get("drop_last"):
-        batch = classifier.config["params"]["batch"]
-        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
+    if isinstance(params, Raec | XLSTM) and params.drop_last:
+        counted[len(slides) // params.batch * params.batch or len(slides) :] = False  # fewer than one batch count all
     found = Judged(
         slides,
         np.array([digest in known for digest in slides.digests], bool),

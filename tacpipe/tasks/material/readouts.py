@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
@@ -12,44 +11,43 @@ from safetensors.numpy import save
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
 from tacpipe.models.level import Level
+from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.spatial_spectrum import Bands, Felt
-from tacpipe.models.strong import Strong
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins.constraints import Assignments
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, MEAN_LEVEL, PERMUTED_LABELS, WEIGHTS, Config
+from tacpipe.tasks.material.params import Minirocket, Params, Spectra
 from tacpipe.tasks.material.slides import Slides
 
-Params = Mapping[str, Any]
 BySensor = Mapping[str, Slides]
 Arrays = dict[str, np.ndarray]
 
 
-def rockets(config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+def rockets(params: Minirocket, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
     """Return the files of a model of patterns and a readout, of each sensor alone."""
-    params = config["params"]
     tensors: Arrays = {}
     baselines: Arrays = {}
     for place, (name, some) in enumerate(known.items()):
         frames, materials = _labelled(params, some, watched.get(name), place)
-        settings = {"seed": params["seed"], "features": params["features"]}
-        strong = Strong.fit(frames, materials, **settings)
+        strong = MinirocketClassifier.fit(frames, materials, seed=params.seed, features=params.features)
         tensors |= {f"{name}.{key}": value for key, value in strong.to_tensors().items()}
-        if params["baselines"]:
-            shuffled = np.random.default_rng([params["seed"], 3, place]).permutation(materials)
+        if params.baselines:
+            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= stored(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
     return _files(config, tensors, baselines)
 
 
-def spectra(config: Config, known: BySensor, watched: BySensor, held: Mapping[str, Iterable[int]]) -> dict[str, bytes]:
+def spectra(
+    params: Spectra, config: Config, known: BySensor, watched: BySensor, held: Mapping[str, Iterable[int]]
+) -> dict[str, bytes]:
     """Return the files of a model of spectra over spatial frequency, by which sensors tell one another of materials.
 
     ``held`` are the materials whose labels a sensor is not told; nothing that is fitted for it sees their slides. Raises
     `TacpipeError` where a sensor's speed or rate is not known, where sensors share too few materials, and where no
     sensor is told of a material.
     """
-    params = config["params"]
-    felt = _felt(params["speeds"], known)
+    felt = _felt(params.speeds, known)
     bands = Bands.common(list(felt.values()))
     told: dict[str, transfer.Told] = {}
     baselines: Arrays = {}
@@ -58,8 +56,8 @@ def spectra(config: Config, known: BySensor, watched: BySensor, held: Mapping[st
         free = ~np.isin(materials, list(held[name]))
         frames, materials = frames[free], materials[free]
         told[name] = transfer.Told(bands.log_power(frames, felt[name].rate_hz, felt[name].speed_m_s), materials)
-        if params["baselines"]:
-            shuffled = np.random.default_rng([params["seed"], 3, place]).permutation(materials)
+        if params.baselines:
+            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= stored(PERMUTED_LABELS, name, Level.fit(told[name].features[:, None], shuffled))
     named = {name: {int(one) for one in some.labels} for name, some in told.items()}
@@ -105,10 +103,12 @@ def _felt(speeds: str, known: BySensor) -> dict[str, Felt]:
     return found
 
 
-def _labelled(params: Params, some: Slides, watched: Slides | None, place: int) -> tuple[np.ndarray, np.ndarray]:
+def _labelled(
+    params: Minirocket | Spectra, some: Slides, watched: Slides | None, place: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames and materials to learn from: those of validation too, where params say so."""
     frames, materials = some.frames, permuted(params, some.materials, place)
-    if params["use_validation"] and watched is not None and params["labels"] == "true":
+    if params.use_validation and watched is not None and params.labels == "true":
         frames = np.concatenate([frames, watched.frames])
         materials = np.concatenate([materials, watched.materials])
     return frames, materials
@@ -116,12 +116,12 @@ def _labelled(params: Params, some: Slides, watched: Slides | None, place: int) 
 
 def permuted(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
     """Return labels dealt out anew among the slides, where params ask for it: then there is nothing to learn."""
-    if params["labels"] == "true":
+    if params.labels == "true":
         return materials
-    return np.random.default_rng([params["seed"], 2, place]).permutation(materials)
+    return np.random.default_rng([params.seed, 2, place]).permutation(materials)
 
 
-def stored(kind: str, sensor: str, fitted: Level | Strong) -> Arrays:
+def stored(kind: str, sensor: str, fitted: Level | MinirocketClassifier) -> Arrays:
     """Return what a baseline is told by, under names that no other has."""
     return {f"{kind}.{sensor}.{key}": value for key, value in fitted.to_tensors().items()}
 

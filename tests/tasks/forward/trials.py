@@ -30,7 +30,7 @@ LENGTH = CONTEXT + HORIZON
 SMALL = {"architecture": "gru", "hidden": 16, "epochs": 2, "batch": 64, "context": CONTEXT, "horizon": HORIZON}
 
 
-def params(**changed: Any) -> dict[str, Any]:
+def params(**changed: Any) -> Any:
     """The params of the training stage, small."""
     return fitting("train.forward", SMALL, **changed)
 
@@ -41,11 +41,11 @@ def trained(folder: Path, training: Any = None, validation: Any = None, **change
     return forward.train(params(**changed), training, validation or dataset(motion(10)), folder)
 
 
-def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, of: str = "levels") -> Any:
+def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, representation: str = "levels") -> Any:
     """The recordings with three principal components, and the codec's files."""
     stage = registry.load("compress.pca")
     assert stage.fit is not None
-    asked = stage.params(components=3, of=of)
+    asked = stage.params(components=3, representation=representation)
     files = dict(files or stage.fit(asked, dataset(*shards)).files)
     latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
     return dataset(*latent, files=files)

@@ -29,14 +29,13 @@ class Weights:
     classification: float = 1.0
     alignment: float = 1.0  # 0: sensors are learned independently
     align_from: int = 20  # first epoch, from 0, in which the alignment counts
-    agreement: str = (
-        "pairs"  # what is aligned: pairs of one row, or each slide with all of its class, in contrast to others
-    )
+    # what is aligned: pairs of one row, or each slide with all of its class, in contrast to others
+    alignment_loss: str = "pairs"
 
     def __post_init__(self) -> None:
-        """Refuse an agreement that there is none of."""
-        if self.agreement not in ("pairs", "contrast"):
-            raise TacpipeError(f"agreement is {self.agreement!r}; it must be pairs or contrast.")
+        """Refuse an unknown alignment loss."""
+        if self.alignment_loss not in ("pairs", "contrast"):
+            raise TacpipeError(f"alignment_loss is {self.alignment_loss!r}; it must be pairs or contrast.")
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,11 @@ class _Sums:
 class JointWork:
     """Networks of one or more sensors, learned side by side and, where ``weights.alignment`` is above 0, jointly.
 
-    Each sensor's network lowers the mean squared error of its slides made again and the negative log-likelihood of their
-    classes; from epoch ``align_from`` on also the mean squared difference of its latents to those of the other sensors'
-    slides in the same row of the batch (Gao et al. 2020, section IV). A sensor in ``known`` learns nothing: others
-    learn to meet its latents, without seeing a class. Joint networks are chosen together, by the mean validation
-    accuracy over sensors, others each by its own; of equals the later epoch.
+    Each sensor's network lowers the mean squared error of its reconstructed slides and the negative log-likelihood of
+    their classes; from epoch ``align_from`` on also the mean squared difference of its latents to those of the other
+    sensors' slides in the same row of the batch (Gao et al. 2020, section IV). The network of ``frozen_sensor`` is not
+    trained: the latents of others are aligned to its own, without their classes. Joint networks are chosen together, by
+    the mean validation accuracy over sensors, others each by its own; of equals the later epoch.
     """
 
     def __init__(
@@ -82,11 +81,11 @@ class JointWork:
         validation: Mapping[str, Felt],
         pairs: Pairs,
         weights: Weights,
-        known: str = "",
+        frozen_sensor: str = "",
         drop_last: bool = False,
     ) -> None:
         self.training, self.validation, self.pairs, self.weights = training, validation, pairs, weights
-        self.known, self.drop_last = known, drop_last
+        self.frozen_sensor, self.drop_last = frozen_sensor, drop_last
         self._sums = _Sums()
 
     @property
@@ -109,7 +108,7 @@ class JointWork:
                 total = total.to(loss.device) + loss
         if self.joint:
             aligned = self._alignment(batch, told)
-            if self.weights.agreement == "contrast":
+            if self.weights.alignment_loss == "contrast":
                 aligned = self._contrast(batch, told)
             if aligned is not None and epoch >= self.weights.align_from:
                 total = total + self.weights.alignment * aligned
@@ -119,7 +118,7 @@ class JointWork:
         """Return what a network says of some slides, and the losses that are its own."""
         felt, weights = self.training[sensor], self.weights
         frames, classes = felt.batch(chosen), felt.classes[chosen]
-        if sensor == self.known:
+        if sensor == self.frozen_sensor:
             with torch.no_grad():
                 told: Told = network(frames, decode=False)
             return told, told.latents.new_zeros(())
@@ -129,7 +128,7 @@ class JointWork:
         if labelled.any():
             loss = nn.functional.cross_entropy(told.scores[labelled], classes[labelled])
             self._sums.add(f"{sensor}.classification", loss, int(labelled.sum()))
-            if not self.known:  # a sensor that is mapped to a known space learns without classes
+            if not self.frozen_sensor:  # a sensor that is aligned to a frozen one learns without classes
                 total = total + weights.classification * loss
         if told.frames is not None:
             loss = nn.functional.mse_loss(told.frames, frames)

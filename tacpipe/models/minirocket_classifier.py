@@ -28,7 +28,7 @@ SHARES = (0.0, 0.3, 1.0)  # that strength may have beside the 1 of patterns; fin
 
 
 @dataclass(frozen=True)
-class Strong:
+class MinirocketClassifier:
     """What was fitted."""
 
     patterns: Rocket
@@ -36,7 +36,7 @@ class Strong:
     share: float  # of strength, beside the 1 of patterns
 
     @classmethod
-    def fit(cls, x: Floats, labels: Labels, *, seed: int = 0, features: int = 10_000) -> Strong:
+    def fit(cls, x: Floats, labels: Labels, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:
         """Return the classifier of training slides (slide, time, channel) and their classes (slide,), whole numbers.
 
         ``features`` is the number of patterns; ``seed`` that of the draws among them. Raises `TacpipeError` for slides
@@ -46,10 +46,10 @@ class Strong:
         patterns = Rocket.fit(wide, features=features, seed=seed)
         return cls(patterns, *_read(patterns.transform(wide), _strength(wide), labels))
 
-    def relabelled(self, x: Floats, labels: Labels) -> Strong:
+    def relabelled(self, x: Floats, labels: Labels) -> MinirocketClassifier:
         """Return a classifier with the same patterns, its readout fitted to slides ``x`` and other ``labels``."""
         wide = _wide(x)
-        return Strong(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
+        return MinirocketClassifier(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
 
     @property
     def classes(self) -> NDArray[np.int32]:
@@ -76,7 +76,7 @@ class Strong:
         return tensors | {"share": np.array([self.share])}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Strong:
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> MinirocketClassifier:
         """Return the classifier that `to_tensors` described."""
         return cls(
             Rocket.from_tensors(under("patterns.", tensors)),
