@@ -1,4 +1,4 @@
-"""An epoch of joint learning next to a plain PyTorch loop of the same maths, and the seconds of the MiniRocket classifier."""
+"""An epoch of joint learning next to a plain PyTorch loop of the same maths, and seconds of the MiniRocket classifier."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, Shape
-from tacpipe.tasks.material.losses import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import Pairs
 from tacpipe.training import loop
 
@@ -95,7 +95,7 @@ class _Plain(nn.Module):
 class _Paired(Dataset[tuple[Tensor, ...]]):
     """A slide of each sensor and their class."""
 
-    def __init__(self, felt: Mapping[str, Felt]) -> None:
+    def __init__(self, felt: Mapping[str, ScaledSlides]) -> None:
         self.felt = felt
 
     def __len__(self) -> int:
@@ -105,7 +105,7 @@ class _Paired(Dataset[tuple[Tensor, ...]]):
         return (*(one.frames[index] for one in self.felt.values()), self.felt["biotac"].classes[index])
 
 
-def _plain_epochs(first: Mapping[str, Tensor], felt: Mapping[str, Felt]) -> Iterator[None]:
+def _plain_epochs(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> Iterator[None]:
     """Train for an epoch each time it is asked."""
     models = _plain(first)
     optimiser = torch.optim.Adam(models.parameters(), lr=RATE)
@@ -124,7 +124,7 @@ def _plain_loss(models: nn.ModuleDict, frames: list[Tensor], classes: Tensor) ->
     return total + nn.functional.mse_loss(*latents)
 
 
-def _check(first: Mapping[str, Tensor], felt: Mapping[str, Felt]) -> None:
+def _check(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> None:
     """Refuse to compare loops whose losses over the first steps differ."""
     work = _work(felt)
     losses: list[list[float]] = []
@@ -152,7 +152,7 @@ def _step(optimiser: torch.optim.Optimizer, loss: Tensor) -> float:
     return float(loss.detach())
 
 
-def _minirocket(felt: Mapping[str, Felt]) -> timing.Line:
+def _minirocket(felt: Mapping[str, ScaledSlides]) -> timing.Line:
     """Return how long the MiniRocket classifier takes to fit the slides of both sensors."""
     seconds = {}
     for name, one in felt.items():
@@ -166,7 +166,7 @@ def _minirocket(felt: Mapping[str, Felt]) -> timing.Line:
     )
 
 
-def _felt(name: str) -> Felt:
+def _felt(name: str) -> ScaledSlides:
     """Return slides like those of a sensor: smooth, each class with a frequency of its own."""
     rng = np.random.default_rng(len(name))
     classes = np.arange(SLIDES) % CLASSES
@@ -174,11 +174,11 @@ def _felt(name: str) -> Felt:
     phases = rng.uniform(0, 2 * np.pi, (SLIDES, 1, SHAPES[name].channels))
     frames = 1 + np.sin(2 * np.pi * (2 + classes[:, None, None]) * times + phases)
     frames += rng.normal(0, 0.1, frames.shape)
-    return Felt(torch.from_numpy(frames.astype(np.float32)), torch.from_numpy(classes))
+    return ScaledSlides(torch.from_numpy(frames.astype(np.float32)), torch.from_numpy(classes))
 
 
-def _work(felt: Mapping[str, Felt]) -> JointWork:
-    one_each = {name: Felt(one.frames[:1], one.classes[:1]) for name, one in felt.items()}
+def _work(felt: Mapping[str, ScaledSlides]) -> JointWork:
+    one_each = {name: ScaledSlides(one.frames[:1], one.classes[:1]) for name, one in felt.items()}
     return JointWork(felt, one_each, Pairs({name: one.classes for name, one in felt.items()}, BATCH), WEIGHTS)
 
 

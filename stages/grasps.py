@@ -35,7 +35,9 @@ class Params:
     object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
     # largest distance of the object from the line between the fingers, or from its sight line
     near_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0
-    outlier_neighbours: PositiveInt = 20  # points whose mean distance tells a stray one at the object's rim
+    outlier_neighbours: PositiveInt = (
+        20  # nearest points whose mean distance identifies stray points at the object's rim
+    )
     # standard deviations of that distance above its mean, beyond which it is stray
     outlier_deviations: PositiveFloat = 5.0
     # time at the start whose median is each finger's pressure without load
@@ -82,8 +84,8 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
         outlier_neighbours=params.outlier_neighbours,
         outlier_deviations=params.outlier_deviations,
     )
-    felt: dict[str, pa.Table] = {}
-    told: dict[str, int] = {}
+    reading: dict[str, pa.Table] = {}
+    attributes: dict[str, int] = {}
     try:
         if "scene" in given:
             scene = Cloud.of(given.pop("scene"))
@@ -91,15 +93,15 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
             colours = None if scene.colours is None else scene.colours[rows]
             given["cloud"] = Cloud(scene.points_m[rows], colours).table()
         if "biotac_sp" in given:
-            felt["reading"], told["contact_ns"] = _reading(params, given.pop("biotac_sp"))
+            reading["reading"], attributes["contact_ns"] = _reading(params, given.pop("biotac_sp"))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     kept = {name: table for name, table in given.items() if table.num_rows == 1 or name == "cloud"}
-    return RecordingOutput({**kept, **felt}, told)
+    return RecordingOutput({**kept, **reading}, attributes)
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the row that the fingers felt when they had closed, and when both first touched."""
+    """Return the reading once the fingers had closed, as one row, and the time when both first touched."""
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema
@@ -118,7 +120,7 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     pressure = np.column_stack([stream.column(name).to_numpy() for name in names]).astype(np.float64)  # (time, finger)
     contact = contact_row(pressure, t_ns, limits)
     rows = settled_rows(pressure, t_ns, contact, limits)
-    felt = []
+    medians = []
     for field in fields:
         values = stream.column(field.name).to_numpy()[rows].astype(np.float64)
         if not np.isfinite(values).any():
@@ -126,5 +128,5 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
                 f"The column {field.name} of biotac_sp holds no value in the {params.settle_s:g} s of the reading. Leave "
                 f"the grasp out."
             )
-        felt.append(np.rint(np.nanmedian(values, keepdims=True)))
-    return schema.stream(t_ns[rows.start : rows.start + 1], felt, fields), int(t_ns[contact])
+        medians.append(np.rint(np.nanmedian(values, keepdims=True)))
+    return schema.stream(t_ns[rows.start : rows.start + 1], medians, fields), int(t_ns[contact])

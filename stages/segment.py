@@ -73,7 +73,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     median of the first seconds, whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and
     ``off_count``. One in any other unit has those of ``on_level`` and ``off_level`` or of its noise at rest (see
     `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off``
-    and ``<stream>_contact_unit`` say which these were. A recording without a contact has a note.
+    and ``<stream>_contact_unit`` record them. A recording without a contact has a note.
 
     Example: tacpipe segment contacts data/synced -o data/segments
     """
@@ -114,7 +114,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
     notes = [] if len(intervals) else [_no_contact(params, units, limits, largest)]
     marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
-    return RecordingOutput(marked, _thresholds_told(units, limits), notes)
+    return RecordingOutput(marked, _threshold_attributes(units, limits), notes)
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class SlideParams:
 
     # static pressure whose first crossing starts the slide
     pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
-    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; told only where the arm was recorded
+    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; only where the arm was recorded
     steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
     # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
@@ -346,8 +346,8 @@ def _given(params: Params, found: Thresholds) -> Thresholds:
     return found._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
 
 
-def _thresholds_told(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
-    """Return the attributes that say by which thresholds a stream in another unit than counts was segmented."""
+def _threshold_attributes(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
+    """Return the attributes that record by which thresholds a stream in another unit than counts was segmented."""
     told: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if unit != COUNT and math.isfinite(on):
@@ -405,7 +405,7 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
         return channel
     if len(found) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is told from one. "
+            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected in one. "
             f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
     return found[0]
@@ -421,7 +421,7 @@ def _rate_hz(name: str, t_ns: NDArray[np.int64]) -> float:
     mean_ns = float(steps_ns.mean())
     if not mean_ns > 0 or np.abs(steps_ns - mean_ns).max() > EVEN * mean_ns:
         raise TacpipeError(
-            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is told "
+            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is detected "
             f"on even ones. Synchronize with `--grid uniform`."
         )
     return 1e9 / mean_ns

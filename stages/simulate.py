@@ -35,8 +35,8 @@ class Params:
     # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
     effort: NonNegativeFloat = 0.0
     friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
-    grip_loss_probability: Fraction = 0.0  # share of trials in which the grip gives way, unannounced
-    grip_loss: Fraction = 0.2  # share of the grip force that is lost then
+    grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
+    grip_loss: Fraction = 0.2  # fraction of the grip force that is lost then
     # sideways distance from the grasp to the centre of mass; it twists the object
     lever_m: Annotated[NonNegativeFloat, Unit("m")] = 0.0
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
-DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device says of a sample; they stay as they are
+DEVICE, SEQUENCE = "t_device_ns", "seq"  # a device's own time and number of a sample; they stay as they are
 UNCERTAIN = "t_uncertain_ns"  # by how much a sample may be stamped late; the recorder's, and no channel
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
 MEDIAN_NS = (
@@ -125,7 +125,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:
-    """Return a stream with its samples on the host's clock; ``clock`` says by which stamps."""
+    """Return a stream with its samples on the host's clock; ``clock`` names the stamps."""
     stream = _Stream(name, columns, _stamps(recording, name, columns), _held(columns))
     if clock == "arrival" or stream.truth:
         return stream
@@ -152,7 +152,7 @@ def _on_host_clock(
     if column.null_count or not pa.types.is_integer(column.type):
         raise TacpipeError(
             f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
-            f"it must be whole nanoseconds in each row. Mend it at the source, or take `--clock arrival`."
+            f"it must be whole nanoseconds in each row. Repair it at the source, or take `--clock arrival`."
         )
     device_ns = column.cast(pa.int64()).to_numpy()
     try:
@@ -189,7 +189,7 @@ def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
         row = int(back.argmax()) + 1
         raise TacpipeError(
             f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
-            f"{t_ns[row - 1]} to {t_ns[row]} ns. Mend its clock at the source, or exclude the recording."
+            f"{t_ns[row - 1]} to {t_ns[row]} ns. Repair its clock at the source, or exclude the recording."
         )
     return t_ns
 

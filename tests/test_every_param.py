@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -244,7 +245,7 @@ def test_a_number_whose_name_ends_in_a_unit_shows_that_unit() -> None:
     wrong = {key: shown[key] for key, end in ends.items() if end and shown[key] != [UNITS[end]]}
     assert not wrong
     assert sum(map(bool, ends.values())) > 30
-    assert fields.describe(numbers["synchronize", "gap_ms"]).endswith("in ms")
+    assert fields.describe(numbers["synchronize", "gap_ms"]).endswith("(ms)")
 
 
 def test_each_param_of_a_model_is_in_one_panel_of_the_help() -> None:
@@ -274,6 +275,15 @@ def test_the_options_of_a_command_know_their_panels(name: str) -> None:
     found = {param.name: getattr(param, "rich_help_panel", None) for param in typer.main.get_command(program).params}
     panels = params_of.panels(registry.load(name))
     assert {field: found[field] for field in panels} == panels
+
+
+def test_models_and_tasks_read_params_as_attributes_of_their_dataclasses() -> None:
+    root = Path(params_of.__file__).parents[1]
+    files = [file for part in ("tasks", "models", "codecs", "training") for file in (root / part).rglob("*.py")]
+    lookups = re.compile(r"\bparams(?:\[[\"']|\.get\()|\bparams: (?:Mapping|dict)\b|\bParams = (?:Mapping|dict)\b")
+    found = {file.name: lookups.findall(file.read_text(encoding="utf-8")) for file in files}
+    assert {name: texts for name, texts in found.items() if texts} == {}
+    assert len(files) > 50
 
 
 # ---- what help says of a stage
@@ -351,7 +361,7 @@ def test_the_command_line_names_no_stage() -> None:
         ("synchronize nowhere --grid bogus --skip-bad", "--grid is 'bogus'; it must be one of uniform, logged, fresh."),
         (
             "synchronize nowhere --rate-hz -5",
-            "--rate-hz is -5; it must be a number above 0 and at most 1000000000, in Hz.",
+            "--rate-hz is -5; it must be a number above 0 and at most 1000000000 (Hz).",
         ),
         ("synchronize nowhere --rate-hz nan", "--rate-hz is nan; it must be a number above 0 and"),
         ("synchronize nowhere --set rate_hz=-5", "--set rate_hz=-5: rate_hz is -5; it must be a number above 0 and"),

@@ -132,6 +132,18 @@ def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
         asked(name, **{**options, **stored})
 
 
+def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
+    from tacpipe.datasets.manifest import chain_difference
+    from tacpipe.tasks import opened
+
+    stored = params_of.to_json(asked("compress.pca", components=3, representation="increments"))
+    step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}
+    assert opened._command(step) == "compress pca --components 3 --representation increments"
+    other = {**step, "params": {**stored, "of": "levels"}}
+    assert "representation" in chain_difference([step], [other])
+    assert params_of.named("no.such.stage", {"of": "levels"}) == {"of": "levels"}
+
+
 def test_a_models_params_are_of_the_class_of_its_architecture_and_of_the_right_types() -> None:
     union = registry.load("train.touch").params
     assert params_of.read(union, {"architecture": "trees", "trees": 5, "gone": 1}, "config.json") == Trees(

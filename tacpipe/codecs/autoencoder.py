@@ -68,7 +68,7 @@ class Autoencoder:
         return _through(self.encoder, scaled(inputs, self.mean_count, self.scale_count))
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the newest frame's counts that latents stand for as float64, (…, latent) to (…, channel)."""
+        """Return the newest frame's counts that latents decode to as float64, (…, latent) to (…, channel)."""
         *first, (weight, bias) = self.decoder
         newest = (*first, (weight[-len(self.channels) :], bias[-len(self.channels) :]))
         decoded = _through(newest, latents.reshape(-1, latents.shape[-1]).astype(np.float32))

@@ -28,7 +28,7 @@ class Codec(Protocol):
 
     @property
     def representation(self) -> str:
-        """What latents stand for: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
+        """What latents encode: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -45,7 +45,7 @@ class Codec(Protocol):
     def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
         """Return the latents of counts above rest, (time, channel) to (time, latent), float32.
 
-        ``begins`` (time,) says where a stretch of rows that follow one another begins; None: at the first row alone.
+        ``begins`` (time,) marks where a stretch of rows that follow one another begins; None: at the first row alone.
         A row's latents depend on rows of its stretch up to it, never on later ones; where one of those that it reads is
         not finite they are NaN.
         """
@@ -79,7 +79,7 @@ class Raw:
 
 
 def decode_ahead(codec: Codec, latents: Floats, last: Floats) -> Floats:
-    """Return the counts above rest that latents of the rows to come stand for, shape (window, step, channel).
+    """Return the counts above rest that latents of future rows decode to, shape (window, step, channel).
 
     ``latents`` is (window, step, latent), its first step the row after ``last``, which is (window, channel) in counts
     above rest. A codec of increments adds them up onto ``last``; one of levels does not look at it.

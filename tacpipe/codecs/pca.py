@@ -68,7 +68,7 @@ class PCA:
         return ((inputs - self.mean_count) / self.scale_count) @ self.components.T
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts that latents stand for as float64, (…, latent) to (…, channel)."""
+        """Return the counts that latents decode to as float64, (…, latent) to (…, channel)."""
         return (latents @ self.components) * self.scale_count + self.mean_count
 
     def to_files(self) -> dict[str, bytes]:
@@ -117,16 +117,18 @@ def fit(
 ) -> PCA:
     """Return the codec fitted on ``inputs`` (row, channel), counts above rest or their increments (``representation``).
 
-    It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this share of the variance.
+    It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this fraction of the variance.
     A channel that never moves gets the scale 1. The sign of each component is such that its largest weight is positive.
-    Raises `TacpipeError` for a count or share that the data cannot give.
+    Raises `TacpipeError` for a count or fraction that the data cannot give.
     """
     rows, width = inputs.shape
     most = min(rows - 1, width)
     if most < 1:
         raise TacpipeError(f"A codec cannot be fitted on {rows} rows. Give it training recordings with contact.")
     if not 0 <= variance < 1:
-        raise TacpipeError(f"variance is {variance}; it is a share between 0 and 1. Use 0 to count components instead.")
+        raise TacpipeError(
+            f"variance is {variance}; it must be a fraction between 0 and 1. Use 0 to count components instead."
+        )
     if variance == 0 and not 1 <= components <= most:
         raise TacpipeError(f"components is {components}; {rows} rows of {width} channels give 1 to {most}.")
     mean, scale = standard(inputs, representation)

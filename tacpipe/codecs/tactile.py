@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
-LAYOUT = ("stream", "taxel", "axis")  # field metadata that says where a channel sits
+LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes where a channel lies
 
 
 def metadata(field: pa.Field) -> dict[str, str]:
@@ -43,7 +43,7 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
         level = metadata(schema.field(name)).get("rest")
         if level is None:
             raise TacpipeError(
-                f"Channel {name} has no rest level, so its counts cannot be told from its load. "
+                f"Channel {name} has no rest level, so its counts cannot be separated from its load. "
                 "Run `tacpipe segment contacts` first: it writes the level into the column's metadata."
             )
         rest.append(float(level))
@@ -64,7 +64,7 @@ def above_rest(table: pa.Table, channels: Sequence[str]) -> Floats:
 
 
 def gaps(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` says so."""
+    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` marks it."""
     gap = np.zeros(table.num_rows, dtype=bool)
     for name in table.column_names:
         if name.endswith("_gap"):
@@ -75,5 +75,5 @@ def gaps(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
 def times(table: pa.Table) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
     if "t_ns" not in table.column_names:
-        raise TacpipeError("There is no column t_ns, so it cannot be told which rows follow one another.")
+        raise TacpipeError("There is no column t_ns, so consecutive rows cannot be found.")
     return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)

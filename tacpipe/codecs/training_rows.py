@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
-HELD_OUT = 0.15  # share of the training recordings that a codec is measured on
+HELD_OUT = 0.15  # fraction of the training recordings that a codec is measured on
 log = logging.getLogger(__name__)
 
 

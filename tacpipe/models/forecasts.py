@@ -23,7 +23,7 @@ AnyLoss = Literal["auto", "absolute", "huber", "squared"]
 
 
 class RecurrentForecast(nn.Module):
-    """The paper's model between its scalings: features and poses to [-1, 1] and back; it tells levels, not changes."""
+    """The paper's model between its scalings: features and poses to [-1, 1] and back; it predicts levels, not changes."""
 
     change_only = False
     touch_centre: Tensor
@@ -98,7 +98,7 @@ def build(
 
 
 def resolved_loss(loss: AnyLoss, *, changes: bool) -> Loss:
-    """Return the loss that ``auto`` is; ``changes`` says that features are increments already.
+    """Return the loss that ``auto`` is; ``changes``: features are increments already.
 
     Where a sensor repeats samples most increments are 0, and so is their median, which is all that the absolute error
     teaches.

@@ -119,9 +119,9 @@ class Unit:
         """Return the kind of number with its unit.
 
         >>> Unit("mm").describe(Range(above=0).describe("a number"))
-        'a number above 0, in mm'
+        'a number above 0 (mm)'
         """
-        return f"{kind}, in {self.name}"
+        return f"{kind} ({self.name})"
 
 
 @dataclass(frozen=True)

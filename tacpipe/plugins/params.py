@@ -141,7 +141,7 @@ def presets(stage: Stage) -> list[str]:
 
 
 def panels(stage: Stage) -> dict[str, str]:
-    """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses say; no panel for others."""
+    """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses declare; no panel for others."""
     found: dict[str, str] = {}
     for kind in kinds(stage):
         for owner in kind.__mro__:
@@ -361,8 +361,8 @@ def _checked(stage: Stage, kind: Kind, given: _Given, before: Mapping[str, Any])
     if given.key in known:
         wanted = known[given.key]
         if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
-            told = f"with {name} {current} it must be {fields_of.describe(wanted)}"
-            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {told}.")
+            rule = f"with {name} {current} it must be {fields_of.describe(wanted)}"
+            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {rule}.")
         return fields_of.check(given.value, wanted, given.name, given.place)
     owners = having(stage, given.key)
     raise UsageError(

@@ -111,8 +111,8 @@ class Forecaster:
         return (*tracks.VELOCITY, *tracks.TURNING)
 
     @property
-    def tells_change(self) -> bool:
-        """Whether it tells what is added to the last row, rather than levels."""
+    def predicts_change(self) -> bool:
+        """Whether it predicts what is added to the last row, rather than levels."""
         return bool(self.model.change_only)
 
     @property
@@ -180,8 +180,8 @@ class Forecaster:
         if self.baselines is not None:
             parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
             moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
-            told = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
-            if any(one.shape != (1, self.horizon, touch.shape[2]) for one in told.values()):
+            predicted = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
+            if any(one.shape != (1, self.horizon, touch.shape[2]) for one in predicted.values()):
                 raise ValueError("the baselines predict another number of steps or channels")
 
     def predict_windows(self, window: Floats, plan: Floats) -> Floats:
@@ -198,10 +198,10 @@ class Forecaster:
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
         read = Windows(*(torch.from_numpy(np.ascontiguousarray(one.swapaxes(0, 1))) for one in (latent, arm, finger)))
-        return self.decoded(self.told(read), touch[:, -1], latent[:, -1])
+        return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: Floats) -> None:
-        """Refuse windows (window, context, channel) whose levels are not near rest, as `predict` says."""
+        """Refuse windows (window, context, channel) whose levels are not near rest; see `model.ForwardModel.predict`."""
         largest = self.largest_level
         if largest is None:
             warnings.warn(
@@ -219,7 +219,7 @@ class Forecaster:
             )
 
     @torch.no_grad()
-    def told(self, windows: Windows) -> Floats:
+    def features(self, windows: Windows) -> Floats:
         """Return the features to come (window, horizon, feature), in the codec's unit."""
         predicted: Tensor = self.model(acted(windows, self.actions))
         features: Floats = predicted.transpose(0, 1).numpy()
@@ -229,10 +229,10 @@ class Forecaster:
         """Return counts above rest (window, horizon, channel) of predicted features (window, horizon, feature).
 
         ``last`` (window, channel) and ``last_feature`` (window, feature) are those of the last row read. A model that
-        tells change adds the decoded change to the last row, so that it does not pay for what the codec lost of it.
+        predicts change adds the decoded change to the last row, so that it has no error from what the codec lost of it.
         """
         levels = codecs.decode_ahead(self.codec, features, last)
-        if self.tells_change and self.lossy:
+        if self.predicts_change and self.lossy:
             return self.anchored(levels, last, last_feature)
         return levels.astype(np.float64, copy=False)
 
@@ -257,7 +257,7 @@ class Forecaster:
                 at = np.argwhere(~np.isfinite(given))[0]
                 raise TacpipeError(
                     f"The {name} holds {given[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
-                    "all values must be finite. Leave the window out, or mend the recording."
+                    "all values must be finite. Leave the window out, or repair the recording."
                 )
             if not given[..., before + 3 : before + POSE].any(axis=-1).all():
                 raise TacpipeError(f"The {name} holds a quaternion of length 0, which is no orientation.")

@@ -1,4 +1,4 @@
-"""What a forecaster says of recordings, without a word on whether it came true."""
+"""Predictions of a forecaster for recordings, without their evaluation."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
     for step in steps:
         if not 1 <= step <= forecaster.horizon:
             raise TacpipeError(
-                f"The model tells 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
+                f"The model predicts 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
             )
     check_codec(forecaster.codec_files, recordings.files)
     found = {}

@@ -36,7 +36,7 @@ from tacpipe.tasks.forward.forecaster import (
     network,
 )
 from tacpipe.tasks.forward.params import Change, Params
-from tacpipe.tasks.forward.predictors import told
+from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.seen import seen
@@ -145,7 +145,7 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for track in part:
         loads.begin(track)
-        for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add(some)
     return loads.calibrated()
 

@@ -24,7 +24,7 @@ from tacpipe.models.transfer import Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.losses import JUDGED, Network
+from tacpipe.tasks.material.losses import CHUNK, Network
 from tacpipe.tasks.material.params import Params
 from tacpipe.tasks.material.slides import Layout, Slides, difference
 from tacpipe.tasks.opened import Chain
@@ -48,8 +48,8 @@ Materials = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a reader says of slides."""
+class ReaderOutput:
+    """Predictions of a reader for slides."""
 
     scores: Floats  # (slide, class), in the order of the model's classes
     latents: Floats | None  # (slide, latent)
@@ -62,18 +62,18 @@ class NetworkReader:
     network: Network
     scaling: Affine
 
-    def tell(self, frames: Floats) -> Told:
-        """Return what the network says of slides (slide, time, channel) in device counts."""
+    def read(self, frames: Floats) -> ReaderOutput:
+        """Return scores and latents of slides (slide, time, channel) in device counts."""
         scores, latents = [], []
         device = next(self.network.parameters()).device
         self.network.eval()
         with torch.no_grad():
-            for first in range(0, len(frames), JUDGED):
-                scaled = torch.from_numpy(self.scaling.apply(frames[first : first + JUDGED])).to(device)
-                told = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
-                scores.append(told.scores.cpu().numpy())
-                latents.append(told.latents.cpu().numpy())
-        return Told(np.concatenate(scores), np.concatenate(latents))
+            for first in range(0, len(frames), CHUNK):
+                scaled = torch.from_numpy(self.scaling.apply(frames[first : first + CHUNK])).to(device)
+                found = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
+                scores.append(found.scores.cpu().numpy())
+                latents.append(found.latents.cpu().numpy())
+        return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
 
     def scores_of(self, latents: Floats) -> Floats:
         """Return the scores (slide, class) that this sensor's classifier gives to latents, of another sensor maybe."""
@@ -91,14 +91,14 @@ class RocketReader:
     strong: MinirocketClassifier
     classes: tuple[int, ...]
 
-    def tell(self, frames: Floats) -> Told:
+    def read(self, frames: Floats) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
-        return Told(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
+        return ReaderOutput(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
 
 
 @dataclass(frozen=True)
 class SpectraReader:
-    """Spectra over spatial frequency of one sensor, and what it and other sensors were told of them."""
+    """Spectra over spatial frequency of one sensor, and the classes that it and other sensors learned."""
 
     bands: Bands
     rate_hz: float
@@ -106,13 +106,13 @@ class SpectraReader:
     transfer: Transfer
     classes: tuple[int, ...]
 
-    def tell(self, frames: Floats) -> Told:
+    def read(self, frames: Floats) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
         found = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
-        return Told(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
+        return ReaderOutput(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
 
     def expected(self, latents: Floats) -> Floats:
-        """Return the scores (slide, class) of spectra by what other sensors alone were told of the classes."""
+        """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
@@ -130,7 +130,7 @@ class Classifier:
         self.architecture: str = config["architecture"]
         self.classes: tuple[int, ...] = tuple(config["classes"])
         self.quantities = tuple(config["quantities"])
-        self.layouts = {name: Layout.from_told(name, told) for name, told in config["sensors"].items()}
+        self.layouts = {name: Layout.from_json(name, layout) for name, layout in config["sensors"].items()}
         self.readers: dict[str, Reader] = self._readers(files[WEIGHTS], WEIGHTS)
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files[BASELINES]) if BASELINES in files else {}
@@ -146,8 +146,8 @@ class Classifier:
             raise TacpipeError("This is no model: it has no config.json. Give the output of `tacpipe train material`.")
         task = model_files.tree(files, CONFIG).get("task")
         if task != TASK:
-            told = plain(str(task))
-            raise TacpipeError(f"This model is of the task {told}, not {TASK}. Give one of `tacpipe train material`.")
+            found = plain(str(task))
+            raise TacpipeError(f"This model is of the task {found}, not {TASK}. Give one of `tacpipe train material`.")
         with model_files.believed("the model"):
             made = cls(files, chain)
             made._try()
@@ -163,10 +163,10 @@ class Classifier:
             noise = np.random.default_rng(0).normal(size=(2, layout.frames, len(layout.channels))).astype(np.float32)
             if self.baselines:
                 self.baselines[MEAN_LEVEL][name].scores(noise)
-            found = [reader[name].tell(noise).scores for reader in (self.readers, self.last) if reader]
-            told = [scores.shape for scores in found if not np.isnan(scores).any()] or [(0, 0)]
-            if any(shape != (len(noise), len(self.classes)) for shape in told):
-                raise ValueError(f"slides of {name} get scores of {told}, not of {len(self.classes)} classes")
+            found = [reader[name].read(noise).scores for reader in (self.readers, self.last) if reader]
+            shapes = [scores.shape for scores in found if not np.isnan(scores).any()] or [(0, 0)]
+            if any(shape != (len(noise), len(self.classes)) for shape in shapes):
+                raise ValueError(f"slides of {name} get scores of {shapes}, not of {len(self.classes)} classes")
 
     def probabilities(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
@@ -184,7 +184,7 @@ class Classifier:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
-                f"The model knows the sensors {', '.join(self.layouts)}; name the one that felt the slides."
+                f"The model knows the sensors {', '.join(self.layouts)}; name the one that recorded the slides."
             )
         layout = self.layout(sensor or next(iter(self.layouts)))
         frames = np.asarray(slides, np.float32)
@@ -194,7 +194,7 @@ class Classifier:
             raise TacpipeError(f"Slides of {layout.sensor} are (slide, {wanted[0]}, {wanted[1]}), not {frames.shape}.")
         if not np.isfinite(frames).all():
             raise TacpipeError("A slide holds a value that is not finite; it must have a number in every frame.")
-        return self.readers[layout.sensor].tell(frames).scores
+        return self.readers[layout.sensor].read(frames).scores
 
     def layout(self, sensor: str) -> Layout:
         """Return the layout of a sensor's slides. Raises `TacpipeError` where the model does not know the sensor."""
@@ -247,13 +247,13 @@ class Classifier:
                 for name in self.layouts
             }
         if self.architecture == SPECTRA:
-            arrays, told = model_files.arrays(content, file), self.config["spectra"]
-            bands = Bands(told["way_m"], np.array(told["edges_per_m"]))
+            arrays, stored = model_files.arrays(content, file), self.config["spectra"]
+            bands = Bands(stored["way_m"], np.array(stored["edges_per_m"]))
             return {
                 name: SpectraReader(
                     bands,
                     layout.rate_hz,
-                    told["speed_m_s"][name],
+                    stored["speed_m_s"][name],
                     Transfer.from_tensors(under(f"{name}.", arrays)),
                     self.classes,
                 )

@@ -22,7 +22,7 @@ EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of the batches for a subsampl
 
 @dataclass(frozen=True)
 class Pairs:
-    """How the slides of all sensors are dealt into the batches of each epoch."""
+    """How the slides of all sensors are distributed over the batches of each epoch."""
 
     classes: Mapping[str, Tensor]  # sensor -> class of each slide, from 0; NONE for slides without label
     batch: int
@@ -35,7 +35,7 @@ class Pairs:
     seed: int = 0  # of what is drawn once
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be dealt."""
+        """Refuse options that do not fit."""
         if self.pairing not in PAIRINGS:
             raise TacpipeError(f"pairing is {self.pairing!r}; it must be {', '.join(PAIRINGS)}.")
         if self.subsample_percent not in (100, 90, *EVERY):
@@ -63,14 +63,14 @@ class Pairs:
         batches = [rows[:, first : first + size] for first in range(0, rows.shape[1], size)]
         if (self.drop_last or self.subsample_sensor) and batches and batches[-1].shape[1] < size:
             batches.pop()
-        dealt = []
+        found = []
         for number, batch in enumerate(batches):
             of = dict(zip(self.classes, batch.clone(), strict=True))
             if self.subsample_sensor and not visited(number, self.subsample_percent):
                 of[self.subsample_sensor][:] = NONE
             if any((one != NONE).any() for one in of.values()):
-                dealt.append(of)
-        return dealt
+                found.append(of)
+        return found
 
     def _rows(self) -> Tensor:
         """Return the slide of each sensor in every row (sensor, row), in the order of the epoch."""

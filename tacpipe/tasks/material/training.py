@@ -34,7 +34,7 @@ from tacpipe.tasks.material.classifier import (
     Config,
     NetworkReader,
 )
-from tacpipe.tasks.material.losses import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
 from tacpipe.tasks.material.params import XLSTM, Minirocket, Params, Raec, Spectra
 from tacpipe.tasks.material.slides import Slides
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 RAEC = "raec"
-QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params do not say
+QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params name none
 MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen one: that of the published script
 
 NetworkParams = Raec | XLSTM
@@ -64,7 +64,7 @@ def train(
     """Return the files of a model trained on the slides of ``training`` and, for networks, chosen on ``validation``.
 
     Whatever is fitted is fitted on training slides alone; a readout
-    in closed form needs none to choose by, and learns from validation slides too where ``use_validation`` says so.
+    in closed form needs none to choose by, and learns from validation slides too where ``use_validation`` is set.
     Raises `TacpipeError` where slides lack labels, differ in layout or, learned jointly, in materials.
     """
     _check(params, init)
@@ -78,14 +78,14 @@ def train(
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     classes = sorted({int(one) for some in known.values() for one in some.materials})
     if len(classes) < 2:
-        raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to tell apart.")
+        raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to classify.")
     config: Config = {
         "task": TASK,
         "architecture": params.architecture,
         "params": params_of.to_json(params),
         "split": params.run_label,
         "quantities": kinds,
-        "sensors": {name: some.layout.told() for name, some in known.items()},
+        "sensors": {name: some.layout.to_json() for name, some in known.items()},
         "classes": classes,
         "counts": {
             role: {name: len(some) for name, some in part.items()}
@@ -156,9 +156,9 @@ def _networks(
         shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
         scalings[mapped_to] = _reader(start, mapped_to).scaling
         config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
-    felt = [
+    scaled_slides = [
         {
-            name: _felt(params, config, some, scalings[name], held, device, place)
+            name: _scaled(params, config, some, scalings[name], held, device, place)
             for place, (name, some) in enumerate(part.items())
         }
         for part in (known, watched)
@@ -177,8 +177,8 @@ def _networks(
         config["partners"] = {
             str(config["classes"][one]): config["classes"][other] for one, other in sorted(partners.items())
         }
-    pairs = _pairs(params, felt[0], partners)
-    work = JointWork(felt[0], felt[1], pairs, _weights(params, joint), mapped_to, params.drop_last)
+    pairs = _pairs(params, scaled_slides[0], partners)
+    work = JointWork(scaled_slides[0], scaled_slides[1], pairs, _weights(params, joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
         return _built(params.architecture, shapes, start, mapped_to).to(device)
@@ -198,9 +198,9 @@ def _networks(
     return files
 
 
-def _pairs(params: NetworkParams, felt: Mapping[str, Felt], partners: Mapping[int, int] | None) -> Pairs:
+def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> Pairs:
     return Pairs(
-        {name: some.classes.cpu() for name, some in felt.items()},
+        {name: some.classes.cpu() for name, some in slides.items()},
         params.batch,
         pairing=params.pairing if isinstance(params, Raec) else Pairs.pairing,
         shuffle=params.shuffle,
@@ -233,7 +233,7 @@ def _shape(params: NetworkParams, some: Slides, header: str, classes: int) -> Sh
     )
 
 
-def _felt(
+def _scaled(
     params: NetworkParams,
     config: Config,
     some: Slides,
@@ -241,7 +241,7 @@ def _felt(
     held: Mapping[str, set[int]],
     device: str,
     place: int,
-) -> Felt:
+) -> ScaledSlides:
     """Return slides as networks read them; what is held out or not among the training slides' classes has no label."""
     name = some.layout.sensor
     numbers = {material: number for number, material in enumerate(config["classes"]) if material not in held[name]}
@@ -249,11 +249,11 @@ def _felt(
     classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
     if not (classes != NONE).any():
         raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
-    return Felt(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
+    return ScaledSlides(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
 
 
 def held_out(given: str, classes: Sequence[int], sensors: Sequence[str] | BySensor) -> dict[str, set[int]]:
-    """Return the materials whose labels each sensor is not told; ``given`` is like ``roboskin=17,18,19,20``.
+    """Return the materials whose labels each sensor does not learn; ``given`` is like ``roboskin=17,18,19,20``.
 
     >>> held_out("b=3,4", [1, 2, 3, 4], ["a", "b"])
     {'a': set(), 'b': {3, 4}}
@@ -350,7 +350,7 @@ def _network_baselines(trained: Classifier, known: BySensor, params: Params) -> 
     """Return the mean-level baseline, and a readout of the networks' own latents fitted to shuffled labels."""
     found: dict[str, np.ndarray] = {}
     for place, (name, some) in enumerate(known.items()):
-        latents = trained.readers[name].tell(some.frames).latents
+        latents = trained.readers[name].read(some.frames).latents
         assert latents is not None
         shuffled = np.random.default_rng([params.seed, 3, place]).permutation(some.materials)
         found |= readouts.stored(MEAN_LEVEL, name, Level.fit(some.frames, some.materials))

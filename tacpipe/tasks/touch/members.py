@@ -1,4 +1,4 @@
-"""What a model of touch consists of: members that each foretell some targets, and whose mean is the model's word."""
+"""The members of a model of touch, each of which predicts some targets; their mean is the model's prediction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tacpipe.models.pointnet import HEADS, PointNet
 from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Inputs, Sources
-from tacpipe.tasks.touch.losses import Drawn, foretold
+from tacpipe.tasks.touch.losses import Drawn, predictions
 from tacpipe.tasks.touch.patches import Patches, PatchSources, require_colours
 from tacpipe.training.scaling import Affine
 
@@ -29,49 +29,49 @@ LARGEST = 100_000  # points of a cloud, and times that they are drawn
 
 
 class Member(Protocol):
-    """A part of a model that foretells targets of its own."""
+    """A part of a model that predicts targets of its own."""
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What it foretells."""
+        """What it predicts."""
 
-    def foretell(self, grasps: Grasps) -> Floats:
+    def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets side by side (grasp, value), device counts."""
 
 
 @dataclass(frozen=True)
 class ForestMember:
-    """Forests that read the grasp's geometry; where several tell a target their mean counts."""
+    """Forests that read the grasp's geometry; where several predict a target their mean counts."""
 
     targets: tuple[str, ...]
-    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # each with the targets that it tells, side by side
+    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # each with the targets that it predicts, side by side
     coloured: bool
     placed: bool
     features: tuple[str, ...]
 
-    def foretell(self, grasps: Grasps) -> Floats:
+    def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts."""
         if self.coloured:
             require_colours(grasps.names, grasps.clouds)
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
-            raise TacpipeError("The model was trained on other features than this version tells. Train it again.")
-        told = averaged((group, forest.predict(rows)) for group, forest in self.forests)
-        return np.concatenate([told[target] for target in self.targets], axis=1)
+            raise TacpipeError("The model was trained on other features than this version computes. Train it again.")
+        found = averaged((group, forest.predict(rows)) for group, forest in self.forests)
+        return np.concatenate([found[target] for target in self.targets], axis=1)
 
 
 @dataclass(frozen=True)
 class NetworkMember:
-    """A network that reads points, and the scale of what it tells."""
+    """A network that reads points, and the scale of its output."""
 
     targets: tuple[str, ...]
     network: nn.Module
     scale: Affine
     params: NetworkParams
 
-    def foretell(self, grasps: Grasps) -> Floats:
+    def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
-        found = foretold(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
+        found = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
         return np.asarray(self.scale.restore(found), np.float64)
 
 
@@ -82,12 +82,12 @@ def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
 
 
 def averaged(several: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
-    """Return by target (grasp, value) the mean of what several tell, each its targets' values side by side."""
-    told: dict[str, list[Floats]] = {}
+    """Return by target (grasp, value) the mean of several predictions, each its targets' values side by side."""
+    found: dict[str, list[Floats]] = {}
     for targets, values in several:
         for target, own in parted(values, targets).items():
-            told.setdefault(target, []).append(own)
-    return {target: np.mean(values, axis=0) for target, values in told.items()}
+            found.setdefault(target, []).append(own)
+    return {target: np.mean(values, axis=0) for target, values in found.items()}
 
 
 def units(values: Floats, targets: Sequence[str]) -> Floats:

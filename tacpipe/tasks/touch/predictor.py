@@ -41,7 +41,7 @@ NEEDED = {
 
 @dataclass(frozen=True)
 class Touch:
-    """What both fingers would feel, device counts; NaN for what the model does not foretell.
+    """The reading of both fingers, device counts; NaN for what the model does not predict.
 
     ``th`` is the thumb, ``mf`` the middle finger. A reading at rest is about 2,779 and 1,676 counts of ``pdc``, and 2,400
     to 3,480 of each electrode; contact raises ``pdc`` and lowers the electrodes under it.
@@ -81,25 +81,25 @@ class Predictor:
             ]
             baselines = None
             if BASELINES in files:
-                told = model_files.arrays(files[BASELINES], BASELINES, but="")
-                baselines = Baselines.from_tensors(told, tuple(config["learned_objects"]))
+                stored = model_files.arrays(files[BASELINES], BASELINES, but="")
+                baselines = Baselines.from_tensors(stored, tuple(config["learned_objects"]))
                 baselines.check()
             if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
-                raise ValueError(f"its members do not foretell {excerpt(config['targets'])}")
+                raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
         return cls(params, config, found, baselines, chain)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
-        """What the model foretells."""
+        """What the model predicts."""
         return tuple(self.config["targets"])
 
-    def foretell(self, grasps: Grasps) -> dict[str, Floats]:
-        """Return what would be felt by target (grasp, value), device counts: the mean of the members.
+    def predict_grasps(self, grasps: Grasps) -> dict[str, Floats]:
+        """Return the predicted reading by target (grasp, value), device counts: the mean of the members.
 
         Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
         """
-        told = members.averaged((member.targets, member.foretell(grasps)) for member in self.members)
-        return {target: told[target] for target in self.targets}
+        found = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
+        return {target: found[target] for target in self.targets}
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""
@@ -113,11 +113,11 @@ class Predictor:
         bundle = Grasps(
             names, nothing, nothing, np.zeros(count, np.int64), (cloud,) * count, tuple(grasps), {}, nothing
         )
-        told = self.foretell(bundle)
-        for target in set(biotac_sp.TARGETS) - set(told):
-            told[target] = np.full((count, biotac_sp.width(target)), np.nan)
+        found = self.predict_grasps(bundle)
+        for target in set(biotac_sp.TARGETS) - set(found):
+            found[target] = np.full((count, biotac_sp.width(target)), np.nan)
         return [
-            Touch(float(told["pdc_th"][at, 0]), float(told["pdc_mf"][at, 0]), told["e_th"][at], told["e_mf"][at])
+            Touch(float(found["pdc_th"][at, 0]), float(found["pdc_mf"][at, 0]), found["e_th"][at], found["e_mf"][at])
             for at in range(count)
         ]
 
@@ -132,7 +132,7 @@ def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], d
         for group, forest in forests:
             forest.check(len(about["features"]), sum(biotac_sp.width(target) for target in group))
         if {target for group, _ in forests for target in group} != {*targets}:
-            raise ValueError(f"the forests do not foretell {excerpt(targets)}")
+            raise ValueError(f"the forests do not predict {excerpt(targets)}")
         return members.ForestMember(targets, forests, about["coloured"], about["placed"], tuple(about["features"]))
     scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):

@@ -26,7 +26,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.losses import Drawn, Felt, TouchWork
+from tacpipe.tasks.touch.losses import Drawn, ScaledGrasps, TouchWork
 from tacpipe.tasks.touch.members import NetworkParams
 from tacpipe.tasks.touch.params import Params, Trees
 from tacpipe.tasks.touch.patches import require_colours
@@ -144,7 +144,7 @@ def _learn(
     targets: Sequence[str],
     workspace: Path,
 ) -> None:
-    """Add the networks: one for all targets or one for each, and as many of each as ``networks`` says."""
+    """Add the networks: one for all targets or one for each, and as many of each as ``networks`` is."""
     known, watched = parts
     if watched is None and _chooses(params):
         raise TacpipeError(
@@ -181,7 +181,8 @@ def _work(
 ) -> TouchWork:
     """Return what a network of some targets learns; of ``parts`` the first is learned from and the second watched."""
     training, watched = (
-        Felt(drawn, torch.from_numpy(scale.apply(_side_by_side(some, group))).to(device)) for drawn, some in parts
+        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_side_by_side(some, group))).to(device))
+        for drawn, some in parts
     )
     return TouchWork(training, watched, params.batch, params.loss, _weights(group).to(device))
 
@@ -203,11 +204,11 @@ def _add(config: Config, tensors: dict[str, Tensor], about: dict[str, Any], name
 
 
 def _side_by_side(some: Grasps, group: Sequence[str]) -> Floats:
-    return np.concatenate([some.felt[target] for target in group], axis=1)
+    return np.concatenate([some.readings[target] for target in group], axis=1)
 
 
 def _scale(known: Grasps, group: Sequence[str], loss: str) -> Affine:
-    """Return the scale of what a network tells: the letter's ranges for its loss, else mean and spread of each value."""
+    """Return the scale of a network's output: the letter's ranges for its loss, else mean and spread of each value."""
     if loss != "rmse":
         return Affine.fit(_side_by_side(known, group), "standard")
     ranges = np.concatenate([[biotac_sp.RANGES[target]] * biotac_sp.width(target) for target in group])

@@ -20,7 +20,7 @@ from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.predictors import Told, told
+from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
 
@@ -63,11 +63,11 @@ def judged(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, b
     return json.loads(result.files["metrics.json"]), result
 
 
-def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[np.int64], Told]:
+def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[np.int64], Predicted]:
     """What a model says of all windows of a recording, with the windows' first rows."""
     found = tracks.track(shard, forecaster.codec)
     starts = found.starts(forecaster.context, forecaster.horizon)
-    (some,) = told(forecaster, found, starts)
+    (some,) = predicted(forecaster, found, starts)
     return found, starts, some
 
 

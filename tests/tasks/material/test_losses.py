@@ -10,16 +10,16 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.recurrent_autoencoder import Shape, build
-from tacpipe.tasks.material.losses import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import NONE, Pairs
 
 CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
 SHAPES = {"a": Shape(4, 3, hidden=6, latents=5), "b": Shape(7, 3, hidden=6, latents=5)}
 
 
-def felt(sensor: str, classes: Tensor = CLASSES) -> Felt:
+def felt(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
     generator = torch.Generator().manual_seed(len(sensor) + SHAPES[sensor].channels)
-    return Felt(torch.randn(len(classes), 9, SHAPES[sensor].channels, generator=generator), classes)
+    return ScaledSlides(torch.randn(len(classes), 9, SHAPES[sensor].channels, generator=generator), classes)
 
 
 def networks(architecture: str = "raec") -> nn.ModuleDict:

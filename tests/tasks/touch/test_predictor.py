@@ -42,7 +42,7 @@ def flat(one: Touch) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_grasp_alone_feels_as_it_does_among_others(kind: str, models: dict[str, TouchModel]) -> None:
     some = grasps(6, 2)
-    told = models[kind].foretell(some)
+    told = models[kind].predict_grasps(some)
     rows = np.concatenate([told[target] for target in ("pdc_th", "pdc_mf", "e_th", "e_mf")], axis=1)
     assert rows.shape == (4, 50)
     for row, seen, made in zip(rows, some.clouds, some.grasps, strict=True):
@@ -68,8 +68,8 @@ def test_a_model_says_the_same_each_time(models: dict[str, TouchModel]) -> None:
 
 def test_the_model_is_the_mean_of_its_members(models: dict[str, TouchModel]) -> None:
     some = grasps(6, 1)
-    told = models["patches"].foretell(some)
-    one, other = (member.foretell(some) for member in models["patches"].members)
+    told = models["patches"].predict_grasps(some)
+    one, other = (member.predict(some) for member in models["patches"].members)
     assert not np.allclose(one, other, atol=0.1)
     np.testing.assert_allclose(told["pdc_mf"], (one[:, 1:2] + other[:, 1:2]) / 2)
     np.testing.assert_allclose(told["e_mf"], (one[:, 26:] + other[:, 26:]) / 2)
@@ -83,7 +83,7 @@ def test_a_tree_ensemble_predicts_the_mean_of_a_targets_own_forest_and_that_of_a
     assert isinstance(member, members.ForestMember)
     rows, _ = geometry.table(some.clouds, some.grasps, coloured=True)
     own = [forest.predict(rows) for _, forest in member.forests]
-    told = models["tree-ensemble"].foretell(some)
+    told = models["tree-ensemble"].predict_grasps(some)
     np.testing.assert_allclose(told["pdc_th"], (own[0] + own[4][:, :1]) / 2)
     np.testing.assert_allclose(told["e_th"], (own[2] + own[4][:, 2:26]) / 2)
 
@@ -175,11 +175,11 @@ def test_features_that_this_version_does_not_tell_are_refused(models: dict[str, 
     member: Any = models["tree-ensemble"].members[0]
     old = dataclasses.replace(member, features=("opening",))
     with pytest.raises(TacpipeError, match="other features than this version tells"):
-        old.foretell(grasps(0, 1))
+        old.predict_grasps(grasps(0, 1))
 
 
 def test_the_touch_of_an_object_lies_among_what_was_felt_of_it(models: dict[str, TouchModel]) -> None:
     for kind, size_m in OBJECTS.items():
-        felt = grasps(0, 6, kinds=[kind]).felt["pdc_th"]
+        felt = grasps(0, 6, kinds=[kind]).readings["pdc_th"]
         found = models["tree-ensemble"].predict(cloud(9, size_m), grasp(9, size_m))
         assert felt.min() - 60 < found.pdc_th < felt.max() + 60

@@ -180,7 +180,7 @@ def test_several_networks_have_other_first_weights(tmp_path: Path) -> None:
 def test_some_targets_alone_are_told_where_only_they_are_asked_for(changed: dict[str, Any], tmp_path: Path) -> None:
     files = trained(tmp_path, **{**changed, "targets": "e_th,pdc_mf"})
     assert config(files)["targets"] == ["pdc_mf", "e_th"]
-    told = touch.load(files).foretell(grasps(6, 1))
+    told = touch.load(files).predict_grasps(grasps(6, 1))
     assert {target: values.shape for target, values in told.items()} == {"pdc_mf": (2, 1), "e_th": (2, 24)}
     metrics, result = judged(files, recordings(6, 2))
     assert list(metrics["model"]["rmse"]) == ["e_th", "pdc_mf"]
@@ -245,7 +245,7 @@ def test_the_papers_networks_learn_shares_of_its_ranges_and_the_balanced_loss_st
     assert paper["0.scale.offset"].tolist() == [2500]
     assert paper["0.scale.scale"].tolist() == [900]
     other = load(trained(tmp_path / "b", **PATCHES, targets="pdc_th")[WEIGHTS])
-    felt = grasps().felt["pdc_th"]
+    felt = grasps().readings["pdc_th"]
     assert other["0.scale.offset"].tolist() == pytest.approx([felt.mean()])
     assert other["0.scale.scale"].tolist() == pytest.approx([felt.std()])
 
