@@ -136,7 +136,7 @@ def test_tensors_hold_everything() -> None:
 
 
 def test_slides_that_teach_nothing_are_refused() -> None:
-    with pytest.raises(TacpipeError, match="told 2 classes in common; 3 at least"):
+    with pytest.raises(TacpipeError, match=" 2 classes in common; 3 "):
         Transfer.fit(told(range(4), 4), [told(range(2, 8), 4)])
     with pytest.raises(TacpipeError, match="8 slides of 1 classes do not show"):
         Transfer.fit(told([3], 8))

@@ -166,7 +166,7 @@ def test_a_cloud_without_colours_is_refused_by_a_model_that_reads_them(
 
 
 def test_a_grasp_without_wrist_is_refused_by_a_model_that_reads_it_alone(models: dict[str, TouchModel]) -> None:
-    with pytest.raises(TacpipeError, match=r"The grasp does not tell how the wrist is turned.*--wrist estimated"):
+    with pytest.raises(TacpipeError, match=r"wrist.*--wrist estimated"):
         models["posed"].predict(cloud(0), grasp(0, wrist=False))
     assert np.isfinite(flat(models["tree-ensemble"].predict(cloud(0), grasp(0, wrist=False)))).all()
 
