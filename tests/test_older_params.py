@@ -144,6 +144,14 @@ def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
     assert params_of.named("no.such.stage", {"of": "levels"}) == {"of": "levels"}
 
 
+def test_a_method_that_was_renamed_is_shown_by_its_name_of_today() -> None:
+    from tacpipe.cli import headline_table
+
+    assert headline_table.method("touch", "strong") == "tree-ensemble"
+    assert headline_table.method("touch", "pointnet") == "pointnet"
+    assert headline_table.method("forward", "taxelwise · raw") == "taxelwise · raw"
+
+
 def test_a_models_params_are_of_the_class_of_its_architecture_and_of_the_right_types() -> None:
     union = registry.load("train.touch").params
     assert params_of.read(union, {"architecture": "trees", "trees": 5, "gone": 1}, "config.json") == Trees(

@@ -86,7 +86,9 @@ def _headlines(
                 errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
             model = errors.pop(MODEL)
             low, high = biotac_sp.RANGES[target]
-            made = headlines.headline(predictor.params.architecture, target, high - low, model, errors, part, objects)
+            made = headlines.headline(
+                predictor.config["architecture"], target, high - low, model, errors, part, objects
+            )
             found += [made] if made else []
     return found
 
