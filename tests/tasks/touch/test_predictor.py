@@ -175,7 +175,7 @@ def test_features_that_this_version_does_not_tell_are_refused(models: dict[str, 
     member: Any = models["tree-ensemble"].members[0]
     old = dataclasses.replace(member, features=("opening",))
     with pytest.raises(TacpipeError, match="other features than this version tells"):
-        old.predict_grasps(grasps(0, 1))
+        old.predict(grasps(0, 1))
 
 
 def test_the_touch_of_an_object_lies_among_what_was_felt_of_it(models: dict[str, TouchModel]) -> None:
