@@ -174,7 +174,7 @@ def test_a_grasp_without_wrist_is_refused_by_a_model_that_reads_it_alone(models:
 def test_features_that_this_version_does_not_tell_are_refused(models: dict[str, TouchModel]) -> None:
     member: Any = models["tree-ensemble"].members[0]
     old = dataclasses.replace(member, features=("opening",))
-    with pytest.raises(TacpipeError, match="other features than this version tells"):
+    with pytest.raises(TacpipeError, match="other features than this version"):
         old.predict(grasps(0, 1))
 
 
