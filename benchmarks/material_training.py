@@ -1,4 +1,4 @@
-"""An epoch of joint learning, beside a plain PyTorch loop of the same maths; and how long the strong classifier takes."""
+"""An epoch of joint learning next to a plain PyTorch loop of the same maths, and seconds of the MiniRocket classifier."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, Shape
-from tacpipe.models.strong import Strong
-from tacpipe.tasks.material.learning import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import Pairs
 from tacpipe.training import loop
 
@@ -24,11 +24,11 @@ SLIDES, CLASSES, BATCH, RATE = 600, 20, 32, 5e-4
 SHAPES = {"biotac": Shape(19, CLASSES), "roboskin": Shape(60, CLASSES, header="cnn")}
 FRAMES = {"biotac": 400, "roboskin": 75}
 WEIGHTS = Weights(align_from=0)
-FIT_S = 30.0  # seconds that the strong classifier may take on two cores
+FIT_S = 30.0  # seconds that the MiniRocket classifier may take on two cores
 
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
-    """Return the ratio of training speeds, the losses being the same, and the strong classifier's seconds."""
+    """Return the ratio of training speeds, the losses being the same, and the MiniRocket classifier's seconds."""
     torch.manual_seed(0)
     felt = {name: _felt(name) for name in SHAPES}
     first = nn.ModuleDict({name: RecurrentAutoencoder(shape) for name, shape in SHAPES.items()}).state_dict()
@@ -54,7 +54,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
             "3 times as fast",
             found >= 3,
         ),
-        _strong(felt),
+        _minirocket(felt),
     ]
 
 
@@ -95,7 +95,7 @@ class _Plain(nn.Module):
 class _Paired(Dataset[tuple[Tensor, ...]]):
     """A slide of each sensor and their class."""
 
-    def __init__(self, felt: Mapping[str, Felt]) -> None:
+    def __init__(self, felt: Mapping[str, ScaledSlides]) -> None:
         self.felt = felt
 
     def __len__(self) -> int:
@@ -105,7 +105,7 @@ class _Paired(Dataset[tuple[Tensor, ...]]):
         return (*(one.frames[index] for one in self.felt.values()), self.felt["biotac"].classes[index])
 
 
-def _plain_epochs(first: Mapping[str, Tensor], felt: Mapping[str, Felt]) -> Iterator[None]:
+def _plain_epochs(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> Iterator[None]:
     """Train for an epoch each time it is asked."""
     models = _plain(first)
     optimiser = torch.optim.Adam(models.parameters(), lr=RATE)
@@ -124,7 +124,7 @@ def _plain_loss(models: nn.ModuleDict, frames: list[Tensor], classes: Tensor) ->
     return total + nn.functional.mse_loss(*latents)
 
 
-def _check(first: Mapping[str, Tensor], felt: Mapping[str, Felt]) -> None:
+def _check(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> None:
     """Refuse to compare loops whose losses over the first steps differ."""
     work = _work(felt)
     losses: list[list[float]] = []
@@ -152,19 +152,21 @@ def _step(optimiser: torch.optim.Optimizer, loss: Tensor) -> float:
     return float(loss.detach())
 
 
-def _strong(felt: Mapping[str, Felt]) -> timing.Line:
-    """Return how long the strong classifier takes to fit the slides of both sensors."""
+def _minirocket(felt: Mapping[str, ScaledSlides]) -> timing.Line:
+    """Return how long the MiniRocket classifier takes to fit the slides of both sensors."""
     seconds = {}
     for name, one in felt.items():
         begun = time.perf_counter()
-        Strong.fit(one.frames.numpy(), one.classes.numpy())
+        MinirocketClassifier.fit(one.frames.numpy(), one.classes.numpy())
         seconds[name] = time.perf_counter() - begun
     worst = max(seconds.values())
     told = " and ".join(f"{value:.1f} s ({name})" for name, value in seconds.items())
-    return timing.Line(f"strong classifier, {SLIDES} slides fitted", told, "–", "", f"{FIT_S:.0f} s", worst <= FIT_S)
+    return timing.Line(
+        f"MiniRocket classifier, {SLIDES} slides fitted", told, "–", "", f"{FIT_S:.0f} s", worst <= FIT_S
+    )
 
 
-def _felt(name: str) -> Felt:
+def _felt(name: str) -> ScaledSlides:
     """Return slides like those of a sensor: smooth, each class with a frequency of its own."""
     rng = np.random.default_rng(len(name))
     classes = np.arange(SLIDES) % CLASSES
@@ -172,11 +174,11 @@ def _felt(name: str) -> Felt:
     phases = rng.uniform(0, 2 * np.pi, (SLIDES, 1, SHAPES[name].channels))
     frames = 1 + np.sin(2 * np.pi * (2 + classes[:, None, None]) * times + phases)
     frames += rng.normal(0, 0.1, frames.shape)
-    return Felt(torch.from_numpy(frames.astype(np.float32)), torch.from_numpy(classes))
+    return ScaledSlides(torch.from_numpy(frames.astype(np.float32)), torch.from_numpy(classes))
 
 
-def _work(felt: Mapping[str, Felt]) -> JointWork:
-    one_each = {name: Felt(one.frames[:1], one.classes[:1]) for name, one in felt.items()}
+def _work(felt: Mapping[str, ScaledSlides]) -> JointWork:
+    one_each = {name: ScaledSlides(one.frames[:1], one.classes[:1]) for name, one in felt.items()}
     return JointWork(felt, one_each, Pairs({name: one.classes for name, one in felt.items()}, BATCH), WEIGHTS)
 
 

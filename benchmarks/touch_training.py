@@ -19,7 +19,7 @@ from tacpipe.models.pointnet import PointFeatures, PointNet
 from tacpipe.simulation.grasp import simulate_trial
 from tacpipe.simulation.grasp_scene import Rig
 from tacpipe.tasks.touch.inputs import Inputs, Sources
-from tacpipe.tasks.touch.learning import SMALLEST, Felt, TouchWork
+from tacpipe.tasks.touch.losses import SMALLEST, ScaledGrasps, TouchWork
 from tacpipe.training import loop
 
 CLOUDS = 9_000  # that the letter trains on
@@ -38,8 +38,8 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
     torch.manual_seed(0)
     first = PointNet(INPUTS.channels, INPUTS.grasp_numbers, 1).state_dict()
     _check(first, sources, values)
-    part = Felt(_Repeated(sources), values.repeat(PIECE // MADE, 1))
-    work = TouchWork(part, Felt(sources, values[:2]), BATCH, "rmse", torch.ones(1))
+    part = ScaledGrasps(_Repeated(sources), values.repeat(PIECE // MADE, 1))
+    work = TouchWork(part, ScaledGrasps(sources, values[:2]), BATCH, "rmse", torch.ones(1))
     schedule = loop.Schedule(epochs=1, batch=BATCH, learning_rate=RATE, patience=1, gradient_clip=math.inf, seed=0)
 
     def ours() -> None:

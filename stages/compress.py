@@ -7,12 +7,12 @@ what is needed to go back to counts, and how much is lost on the way.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tacpipe.errors import UsageError
-from tacpipe.plugins.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed
+from tacpipe.plugins.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, StoredAs
 from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.plugins.stage import Fitted, Result, Workspace
 
-Representation = Literal["levels", "increments"]
+Representation = Annotated[Literal["levels", "increments"], StoredAs("of")]
+Panels = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,9 @@ class Params:
     components: PositiveInt = 20  # latents to keep, at most the number of channels; the paper kept 20
     # keep as many latents as hold this fraction of the variance instead; 0: as many as components states
     variance: Annotated[float, Range(0, below=1)] = 0.0
-    of: Representation = "levels"  # levels: counts above rest; increments: what each row adds to the one before
+    # levels: counts above rest; increments: what each row adds to the one before
+    representation: Representation = "levels"
+    PANELS: ClassVar[Panels] = {"Model": ("components", "variance", "representation")}
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class AutoencoderParams:
     components: PositiveInt = 8  # latents; the paper chose 8
     # widths of the encoder's hidden layers, as 64,32; empty: those of the class
     hidden: Annotated[str, CommaList(PositiveInt)] = ""
-    of: Representation = "levels"  # levels: counts above rest; increments: what each row adds to the one before
+    # levels: counts above rest; increments: what each row adds to the one before
+    representation: Representation = "levels"
     search: Annotated[int, Range(0, 12)] = 0  # networks to try under the same budget, the best is kept; 0: none
     epochs: PositiveInt = 100  # maximum number of passes over the training rows
     batch: PositiveInt = 256  # rows per step of the optimiser
@@ -50,6 +54,10 @@ class AutoencoderParams:
     weight_decay: NonNegativeFloat = 1e-5  # of Adam
     patience: PositiveInt = 10  # epochs without a lower error on held-out training recordings after which training ends
     seed: Seed = 0  # random seed of initial weights and of the order of rows
+    PANELS: ClassVar[Panels] = {
+        "Model": ("frames", "components", "hidden", "representation", "search"),
+        "Training": ("epochs", "batch", "learning_rate", "weight_decay", "patience", "seed"),
+    }
     PRESETS: ClassVar[Mapping[str, Mapping[str, object]]] = {"quick": {"epochs": 5}}
 
     def check(self) -> None:
@@ -66,8 +74,10 @@ def fit(params: Params, train: Dataset) -> Result:
     from tacpipe.codecs import pca, training_rows
     from tacpipe.plugins.stage import Result
 
-    rows = training_rows.read(train.recordings, params.of)
-    codec = pca.fit_and_measure(rows, components=params.components, variance=params.variance, of=params.of)
+    rows = training_rows.read(train.recordings, params.representation)
+    codec = pca.fit_and_measure(
+        rows, components=params.components, variance=params.variance, representation=params.representation
+    )
     return Result(files=codec.to_files())
 
 
@@ -89,27 +99,34 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
         gradient_clip=autoencoder_fit.GRADIENT_CLIP,
         seed=params.seed,
     )
-    rows = training_rows.read(train.recordings, params.of, params.frames)
-    codec = autoencoder_fit.fit(rows, tried, schedule, workspace, components=params.components, of=params.of)
+    rows = training_rows.read(train.recordings, params.representation, params.frames)
+    codec = autoencoder_fit.fit(
+        rows, tried, schedule, workspace, components=params.components, representation=params.representation
+    )
     return Result(files=codec.to_files())
 
 
 @stage(version=2, fit=fit)
 def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
-    """Compress tactile channels to their principal components.
+    """Compress tactile channels with principal components.
 
-    They are added as columns ``z00``, ``z01``, …. Raises `TacpipeError` where the recording's channels are not
-    those the codec was fitted on.
+    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. Raises `TacpipeError` where
+    the recording's channels are not those the codec was fitted on.
+
+    Example: tacpipe compress pca data/segments --split data/split -o data/latents
     """
     return _encoded(recording, codec)
 
 
 @stage(version=1, fit=fit_autoencoder)
 def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) -> pa.Table:
-    """Compress tactile channels to the latents of an autoencoder.
+    """Compress tactile channels with an autoencoder.
 
-    They are added as columns ``z00``, ``z01``, …. 15 % of the training recordings are held out for early stopping.
-    Raises `TacpipeError` where the recording's channels are not those the codec was fitted on.
+    The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. 15 % of the training recordings
+    are held out to stop the training. Raises `TacpipeError` where the
+    recording's channels are not those the codec was fitted on.
+
+    Example: tacpipe compress autoencoder data/segments --split data/split -o data/latents
     """
     return _encoded(recording, codec)
 

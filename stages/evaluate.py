@@ -1,9 +1,12 @@
-"""Evaluate a model on recordings against its baselines.
+"""Evaluate a model on recordings, next to its baselines.
 
-Prints how the model compares with the best baseline, and writes it to ``headline.json``. Writes ``metrics.json``,
+Prints how the model compares with the best baseline, with intervals over recordings, and writes it to ``headline.json``.
+Writes ``metrics.json``,
 ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
 predictions of each recording. Recordings that the model was trained on are reported apart,
 under ``seen``.
+
+Example: tacpipe evaluate models/forward data/segments --split data/split -o results/forward
 """
 
 from __future__ import annotations
@@ -23,12 +26,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to choose: how a model is evaluated is not up to who trained it."""
+    """Nothing to choose: the evaluation of a model does not depend on who trained it."""
 
 
 @stage(version=3, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Evaluate a model with the metrics of its task."""
+    """Evaluate a model on recordings, by the measures of the task it was trained for."""
     from tacpipe.datasets import model_files
 
     task = model_files.task(model.files)

@@ -1,12 +1,12 @@
-"""Cut grasps down to what touch is predicted from, and to what was measured: the object's points and one reading."""
+"""Reduce grasps to the points of the object and one tactile reading: what models of the task ``touch`` are trained on."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed
+from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Unit
 from tacpipe.plugins.stage import RecordingOutput, stage
 
 if TYPE_CHECKING:
@@ -19,39 +19,46 @@ FINISHED = ("cloud", "grasp")
 
 @dataclass(frozen=True)
 class Params:
-    """What counts as the grasped object in a view of a camera, and as contact in what two BioTac SP measured.
+    """What counts as the grasped object in a camera's view, and as contact in the readings of two BioTac SP.
 
     Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
     """
 
-    # millimetres from the table's plane, within which points belong to it; more if it is noisy
-    plane_mm: PositiveFloat = 6.0
+    # distance from the plane of the table within which points belong to it; larger for a noisy table
+    plane_mm: Annotated[PositiveFloat, Unit("mm")] = 6.0
     plane_share: Fraction = 0.2  # of the scene's points, that the table must hold
     plane_trials: PositiveInt = 1000  # random samples by which a plane is looked for
     seed: Seed = 0  # random seed of these samples
-    cluster_mm: PositiveFloat = 12.0  # millimetres between neighbours in one thing
+    # largest distance between neighbouring points of one object
+    cluster_mm: Annotated[PositiveFloat, Unit("mm")] = 12.0
     cluster_points: PositiveInt = 6  # points so near to one another, without which a point is stray
     object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
-    # millimetres that the object may be from the line between the fingers, or from its sight
-    near_mm: PositiveFloat = 20.0
-    outlier_neighbours: PositiveInt = 20  # points whose mean distance marks a stray one at the object's rim
+    # largest distance of the object from the line between the fingers, or from its sight line
+    near_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0
+    outlier_neighbours: PositiveInt = (
+        20  # nearest points whose mean distance identifies stray points at the object's rim
+    )
     # standard deviations of that distance above its mean, beyond which it is stray
     outlier_deviations: PositiveFloat = 5.0
-    rest_s: PositiveFloat = 0.5  # seconds at the start whose median is each finger's pressure without load
-    # device counts of pressure above that, from which on a finger surely presses; noise is 0.25
-    on_count: PositiveFloat = 20.0
-    settle_s: PositiveFloat = 0.2  # seconds that both must press, and whose median is the reading
-    settled_count: NonNegativeFloat = 3.0  # device counts by which pressure may vary in that time, and still is settled
+    # time at the start whose median is each finger's pressure without load
+    rest_s: Annotated[PositiveFloat, Unit("s")] = 0.5
+    # pressure above rest from which a finger is in contact; noise is 0.25
+    on_count: Annotated[PositiveFloat, Unit("count")] = 20.0
+    # time for which both fingers must press, and whose median is the reading
+    settle_s: Annotated[PositiveFloat, Unit("s")] = 0.2
+    settled_count: Annotated[NonNegativeFloat, Unit("count")] = 3.0  # largest variation of the pressure in that time
 
 
 @stage(version=2)
 def grasps(params: Params, recording: Recording) -> RecordingOutput:
-    """Extract the grasped object and the fingers' readings.
+    """Cut out the grasped object and the tactile reading.
 
     Of ``scene``, ``grasp`` and ``biotac_sp`` it makes ``cloud``, the object's points, and ``reading``, one row: the median
-    of each channel after contact, stamped where it begins; ``contact_ns`` is when both fingers first touched. Other
+    of each channel after contact, stamped where it begins; ``contact_ns`` is the time when both fingers first touched. Other
     streams of one row stay, as ``grasp`` and the truth of a simulated one. A grasp that has ``cloud`` and ``grasp``
-    already stays as it is; one that was not made yet has no ``biotac_sp``, and gets no ``reading``.
+    already stays as it is; a planned one has no ``biotac_sp``, and gets no ``reading``.
+
+    Example: tacpipe segment grasps data/pinched -o data/grasps
     """
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
@@ -77,8 +84,8 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
         outlier_neighbours=params.outlier_neighbours,
         outlier_deviations=params.outlier_deviations,
     )
-    felt: dict[str, pa.Table] = {}
-    told: dict[str, int] = {}
+    reading: dict[str, pa.Table] = {}
+    attributes: dict[str, int] = {}
     try:
         if "scene" in given:
             scene = Cloud.of(given.pop("scene"))
@@ -86,15 +93,15 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
             colours = None if scene.colours is None else scene.colours[rows]
             given["cloud"] = Cloud(scene.points_m[rows], colours).table()
         if "biotac_sp" in given:
-            felt["reading"], told["contact_ns"] = _reading(params, given.pop("biotac_sp"))
+            reading["reading"], attributes["contact_ns"] = _reading(params, given.pop("biotac_sp"))
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     kept = {name: table for name, table in given.items() if table.num_rows == 1 or name == "cloud"}
-    return RecordingOutput({**kept, **felt}, told)
+    return RecordingOutput({**kept, **reading}, attributes)
 
 
 def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the row that the fingers measured when they had closed, and when both first touched."""
+    """Return the reading once the fingers had closed, as one row, and the time when both first touched."""
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema
@@ -113,7 +120,7 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
     pressure = np.column_stack([stream.column(name).to_numpy() for name in names]).astype(np.float64)  # (time, finger)
     contact = contact_row(pressure, t_ns, limits)
     rows = settled_rows(pressure, t_ns, contact, limits)
-    felt = []
+    medians = []
     for field in fields:
         values = stream.column(field.name).to_numpy()[rows].astype(np.float64)
         if not np.isfinite(values).any():
@@ -121,5 +128,5 @@ def _reading(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
                 f"The column {field.name} of biotac_sp holds no value in the {params.settle_s:g} s of the reading. Leave "
                 f"the grasp out."
             )
-        felt.append(np.rint(np.nanmedian(values, keepdims=True)))
-    return schema.stream(t_ns[rows.start : rows.start + 1], felt, fields), int(t_ns[contact])
+        medians.append(np.rint(np.nanmedian(values, keepdims=True)))
+    return schema.stream(t_ns[rows.start : rows.start + 1], medians, fields), int(t_ns[contact])

@@ -1,6 +1,8 @@
-"""Predict the rows of recordings with a trained model.
+"""Predict recordings with a trained model, row by row.
 
-`tacpipe evaluate` measures how good the predictions are.
+`tacpipe evaluate` reports how good the predictions are.
+
+Example: tacpipe predict models/forward data/segments -o data/predictions
 """
 
 from __future__ import annotations
@@ -22,17 +24,14 @@ STEPS = CommaList(PositiveInt, least=1)
 
 @dataclass(frozen=True)
 class Params:
-    """What is given."""
+    """What is predicted."""
 
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
 
 
 @stage(version=1)
 def predict(params: Params, model: Model, recordings: Dataset) -> Result:
-    """Predict the rows of recordings with a trained model.
-
-    Each prediction is a row with the time at which its input was known.
-    """
+    """Return the predictions for each recording, with the time at which each was available."""
     from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))

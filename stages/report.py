@@ -1,8 +1,10 @@
-"""Show results on one page that needs only a browser.
+"""Show results on one self-contained HTML page.
 
 Results of the same task are compared, seeds and folds of a method pooled. Of more than two of the task ``forward``, only
-the best method's and that of the paper are given in full; outputs of ``tacpipe compress`` may be given besides, which state
-what codecs of other widths lose. With those of the task ``material``, slides may be given, which state how they went.
+the best method's and that of the paper are shown in full; with outputs of ``tacpipe compress``, the page shows the loss of
+codecs of other widths. With slides next to results of the task ``material``, it shows their profiles.
+
+Example: tacpipe report results/forward -o report.html
 """
 
 from __future__ import annotations
@@ -28,12 +30,9 @@ class Params:
     traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn
 
 
-@stage(version=4)
+@stage(version=5)
 def report(params: Params, results: Datasets) -> Result:
-    """Show results on one page that needs only a browser.
-
-    It has headline, figures, tables, and where every number comes from.
-    """
+    """Return one page: headline, figures, tables, and where every number comes from."""
     from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 

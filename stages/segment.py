@@ -1,4 +1,4 @@
-"""Mark what happens in recordings, contacts and slips, or cut them down to the slide of a finger over a material.
+"""Mark contacts and slips in recordings, or cut out slides.
 
 Segments choose what a model is trained on. Contacts and slips throw nothing away, all rows stay; of a slide the frames
 remain that are alike in all recordings.
@@ -10,10 +10,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
@@ -40,13 +40,14 @@ class Params:
 
     # free: nothing is touched at first; grasped: all of the recording is one contact
     begins: Literal["free", "grasped"] = "free"
-    rest_s: NonNegativeFloat = 0.2  # seconds at the start whose median is each channel's level without load
-    # device counts by which a finger's taxels leave rest on average, where contact starts
-    on_count: PositiveFloat = 120.0
-    off_count: NonNegativeFloat = 80.0  # device counts below which it ends
-    merge_s: NonNegativeFloat = 0.5  # seconds; contacts no further apart are one
-    min_s: NonNegativeFloat = 0.3  # seconds; shorter contacts are left out
-    pad_s: NonNegativeFloat = 0.5  # seconds before and after each contact that belong to it
+    # time at the start whose median is each channel's level without load
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
+    # mean change of a finger's taxels from rest at which contact starts
+    on_count: Annotated[PositiveFloat, Unit("count")] = 120.0
+    off_count: Annotated[NonNegativeFloat, Unit("count")] = 80.0  # mean change below which it ends
+    merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # largest gap between two contacts that are merged
+    min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # shortest contact that is kept
+    pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that belongs to it
     # as on_count, of streams in other units, in theirs; None: from noise at rest
     on_level: PositiveFloat | None = added(None)
     # level below which it ends there; None: two thirds of where it starts
@@ -65,14 +66,16 @@ class Params:
 
 @stage(version=2)
 def contacts(params: Params, recording: Recording) -> RecordingOutput:
-    """Mark the rows in which a finger touches something.
+    """Mark contacts in synchronized recordings.
 
-    The column ``contact`` numbers the contacts from 0, and is -1 in all other rows. Each tactile channel's level
-    without load is written into its field metadata ``rest``. Contact is found from the median of the first seconds,
-    whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and ``off_count``. One in any other unit
-    has those of ``on_level`` and ``off_level`` or of its noise at rest (see
+    Rows in which either finger is in contact are numbered from 0 in the column ``contact``; all others have -1. Each
+    tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
+    median of the first seconds, whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and
+    ``off_count``. One in any other unit has those of ``on_level`` and ``off_level`` or of its noise at rest (see
     `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off``
-    and ``<stream>_contact_unit`` record which these were. A recording without a contact has a note.
+    and ``<stream>_contact_unit`` record them. A recording without a contact has a note.
+
+    Example: tacpipe segment contacts data/synced -o data/segments
     """
     import numpy as np
     import pyarrow as pa
@@ -111,7 +114,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
     notes = [] if len(intervals) else [_no_contact(params, units, limits, largest)]
     marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
-    return RecordingOutput(marked, _thresholds_told(units, limits), notes)
+    return RecordingOutput(marked, _threshold_attributes(units, limits), notes)
 
 
 @dataclass(frozen=True)
@@ -123,20 +126,22 @@ class SlipParams:
     """
 
     channel: str = ""  # column with the readings; empty for the only one whose quantity is proximity
-    cutoff_hz: PositiveFloat = 5.0  # of the low-pass before the rate is taken
-    # seconds after the grasp in which nothing slips yet: they give the noise and the level
-    still_s: PositiveFloat = 0.5
+    # cut-off of the low-pass filter applied before the rate is computed
+    cutoff_hz: Annotated[PositiveFloat, Unit("Hz")] = 5.0
+    # time after the grasp without slip, from which noise and level are estimated
+    still_s: Annotated[PositiveFloat, Unit("s")] = 0.5
     on_sigma: PositiveFloat = 5.0  # times the rate's noise, beyond which slip begins
     off_sigma: PositiveFloat = 2.0  # times the rate's noise, below which it ends
     on_frames: PositiveInt = 3  # rows that it must be beyond
     off_frames: PositiveInt = 5  # rows that it must be below
-    # counts a second; least noise of the rate: a reading's step of one count makes 10 of them
-    noise_floor: PositiveFloat = 3.0
-    level_count: PositiveFloat = 0.75  # counts; readings that have moved no further have not left their level yet
-    patch_mm: PositiveFloat = 25.0  # millimetres; an object that has slipped further is lost
-    count_per_mm: PositiveFloat = 8.0  # of the sensor
-    # counts; a reading of this or less is not a distance any more, the object is lost
-    saturated_count: NonNegativeFloat = 544.0
+    # least noise of the rate: a reading's step of one count makes 10 of them
+    noise_floor: Annotated[PositiveFloat, Unit("count/s")] = 3.0
+    # largest change of readings that counts as no change of level
+    level_count: Annotated[PositiveFloat, Unit("count")] = 0.75
+    patch_mm: Annotated[PositiveFloat, Unit("mm")] = 25.0  # slipped distance from which an object is lost
+    count_per_mm: Annotated[PositiveFloat, Unit("count/mm")] = 8.0  # sensitivity of the sensor
+    # largest reading of a lost object: nothing is within the sensor's range
+    saturated_count: Annotated[NonNegativeFloat, Unit("count")] = 544.0
 
     def check(self) -> None:
         """Refuse slips that end above where they begin."""
@@ -149,12 +154,14 @@ class SlipParams:
 
 @stage(version=1)
 def slips(params: SlipParams, recording: Recording) -> pa.Table:
-    """Mark where the held object slips or is dropped.
+    """Mark slips and drops of a held object.
 
-    Both follow from its distance to the wrist. Adds the labels ``slip``, from the whole recording, ``slip_online``,
-    from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each contact is a grasp, and a drop lasts
-    until the next one. Without the column ``contact`` all of the recording is one. Outside of contacts, after a drop
-    and where there is no reading nothing slips.
+    They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
+    recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each
+    contact is a grasp, and a drop lasts until the next one. Without the column ``contact`` all of the recording is one.
+    Outside of contacts, after a drop and where there is no reading nothing slips.
+
+    Example: tacpipe segment slips data/segments -o data/slips
     """
     import numpy as np
     import pyarrow as pa
@@ -203,8 +210,9 @@ class SlideParams:
     slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
     """
 
-    pressure_trigger: NonNegativeFloat = 40.0  # device counts of static pressure whose first crossing starts the slide
-    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; stated only where the arm was recorded
+    # static pressure whose first crossing starts the slide
+    pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
+    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; only where the arm was recorded
     steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
     # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
@@ -215,14 +223,16 @@ class SlideParams:
     spike_frames: PositiveInt = 7
     # scaled median absolute deviations of these rows, beyond which it is a spike
     spike_deviations: NonNegativeFloat = 5.0
-    # device counts that it must stand out by at least; touch changes readings by 0 to 235
-    spike_count: NonNegativeFloat = 255.0
-    speed_m_s: PositiveFloat = 0.025  # metres a second; the protocol's speed
+    # least height of a spike; contact changes readings by 0 to 235
+    spike_count: Annotated[NonNegativeFloat, Unit("count")] = 255.0
+    speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the protocol
     # fraction by which the slide's median speed may differ; published ones do by 0.016
     speed_tolerance: NonNegativeFloat = 0.05
-    min_s: NonNegativeFloat = 5.5  # seconds; a shorter slide is outside the protocol
-    pressure_low: NonNegativeFloat = 2.0  # device counts; with a mean pressure below this the finger hardly touched
-    pressure_high: NonNegativeFloat = 150.0  # device counts; with a mean pressure above this it was pressed too hard
+    min_s: Annotated[NonNegativeFloat, Unit("s")] = 5.5  # shortest slide within the protocol
+    # least mean pressure within the protocol; below, the finger hardly touched
+    pressure_low: Annotated[NonNegativeFloat, Unit("count")] = 2.0
+    # largest mean pressure within the protocol; above, the finger was pressed too hard
+    pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0
 
     def check(self) -> None:
         """Refuse a median of an even number of rows, and bounds of the pressure that leave nothing between them."""
@@ -239,13 +249,16 @@ class SlideParams:
 
 @stage(version=1)
 def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
-    """Cut each recording down to its slide.
+    """Cut out the slide of each recording.
 
-    All slides have the same number of frames; single wrong tactile readings are repaired. The slide starts where the
-    static pressure first reaches its trigger, and lasts to the end, whatever the pressure does after; where the arm was
-    recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``, its speed, force
-    and phase over the whole recording. A slide that differs from the protocol is marked ``outside_protocol`` and kept.
-    Recordings of sensors without static pressure stay whole.
+    All slides have the same number of frames, and single wrong tactile readings are replaced by a median.
+
+    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure goes
+    on; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``,
+    its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
+    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
+
+    Example: tacpipe segment slides data/touched -o data/slides
     """
     from tacpipe.channels import arm
     from tacpipe.channels.finger import finger, mended
@@ -333,8 +346,8 @@ def _given(params: Params, found: Thresholds) -> Thresholds:
     return found._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
 
 
-def _thresholds_told(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
-    """Return the attributes that state by which thresholds a stream in another unit than counts was segmented."""
+def _threshold_attributes(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
+    """Return the attributes that record by which thresholds a stream in another unit than counts was segmented."""
     told: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if unit != COUNT and math.isfinite(on):
@@ -392,7 +405,7 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
         return channel
     if len(found) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected from one. "
+            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected in one. "
             f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
     return found[0]

@@ -1,4 +1,4 @@
-"""Record trials of a simulated rig, with ground truth."""
+"""Simulate recordings of a rig, with ground truth."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tacpipe.plugins.constraints import (
     PositiveInt,
     Range,
     Seed,
+    Unit,
 )
 from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
@@ -23,12 +24,12 @@ Families = Annotated[str, CommaList(Literal["all", "box", "cylinder", "sphere", 
 
 @dataclass(frozen=True)
 class Params:
-    """What the simulated pick-and-move rig does, and how badly its streams are logged."""
+    """What the simulated pick-and-move rig does, and the noise and latency of its streams."""
 
     trials: PositiveInt = 24  # recordings
     seed: Seed = 0  # random seed
-    # seconds a recording: approach, grasp, lift and move, then further moves
-    duration_s: Annotated[float, Range(4)] = 12.0
+    # length of a recording: approach, grasp, lift and move, then further moves
+    duration_s: Annotated[float, Range(4), Unit("s")] = 12.0
     # how the arm moves: controlled (trapezoids), kinaesthetic (by hand), or mixed
     protocol: Literal["mixed", "controlled", "kinaesthetic"] = "mixed"
     # largest load of the plan over what friction holds; above 1 the plan makes it slip; 0: random
@@ -36,27 +37,32 @@ class Params:
     friction_scale: PositiveFloat = 1.0  # times the friction that was drawn; with 4 nothing ever slips
     grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip gives way, unannounced
     grip_loss: Fraction = 0.2  # fraction of the grip force that is lost then
-    lever_m: NonNegativeFloat = 0.0  # metres from the grasp to the centre of mass, sideways; twists the object
+    # sideways distance from the grasp to the centre of mass; it twists the object
+    lever_m: Annotated[NonNegativeFloat, Unit("m")] = 0.0
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep
-    tactile_rate_hz: PositiveFloat = 50.0  # frames a second of each tactile sensor
-    robot_rate_hz: PositiveFloat = 1000.0  # states a second of the arm
+    tactile_rate_hz: Annotated[PositiveFloat, Unit("Hz")] = 50.0  # frame rate of each tactile sensor
+    robot_rate_hz: Annotated[PositiveFloat, Unit("Hz")] = 1000.0  # rate of the arm's states
     # fraction of tactile frames that repeat the one before; 0.75 is like the 2021 rig
     hold_probability: Fraction = 0.07
     drop_probability: Fraction = 0.002  # fraction of samples that are lost
     # times the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
     noise_scale: NonNegativeFloat = 1.0
-    # milliseconds, mean and standard deviation of a tactile frame's way to the host
-    tactile_jitter_ms: NonNegativeFloat = 2.0
-    robot_jitter_ms: NonNegativeFloat = 0.5  # milliseconds, the same of an arm state or a proximity reading
-    clock_offset_ms: NonNegativeFloat = 80.0  # milliseconds, largest offset of the sensors' own clocks (t_device_ns)
-    clock_skew_ppm: NonNegativeFloat = 50.0  # parts per million, largest skew of a device's own clock
+    # mean and standard deviation of a tactile frame's latency
+    tactile_jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 2.0
+    # mean and standard deviation of the latency of an arm state or a proximity reading
+    robot_jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 0.5
+    # largest offset of the sensors' own clocks (t_device_ns)
+    clock_offset_ms: Annotated[NonNegativeFloat, Unit("ms")] = 80.0
+    clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # largest skew of a device's own clock
 
 
 @stage(version=2)
 def forward(params: Params, trial: Trial) -> RecordingOutput:
-    """Simulate trials that grasp, lift and move an object.
+    """Simulate grasp-lift-move trials, with ground truth.
 
-    Returns xela1, xela2, robot, proximity and, with ground truth, truth.
+    Each recording has the streams xela1, xela2, robot, proximity and, with ground truth, truth.
+
+    Example: tacpipe simulate forward --trials 12 --duration-s 6 -o data/recordings
     """
     from tacpipe.simulation.pick_and_move import Rig, simulate_trial
 
@@ -68,7 +74,7 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class MaterialParams:
-    """What the simulated rig of two unlike sensors slides over, and how precise the sensors are."""
+    """What the simulated rig of two unlike sensors slides over, and the noise of the sensors."""
 
     # recordings: a BioTac's and a RoboSkin's by turns, the materials in turn, so 40 are one of each
     trials: PositiveInt = 200
@@ -82,21 +88,23 @@ class MaterialParams:
     session_scale: NonNegativeFloat = 1.0
     # times what differs from reading to reading: noise, drift, each trial's own offsets
     noise_scale: NonNegativeFloat = 1.0
-    force_n: PositiveFloat = 1.0  # newton, mean force of a slide; it varies by 5 % from trial to trial
-    speed_m_s: PositiveFloat = 0.025  # metres a second, of the arm that draws the BioTac
-    # metres a second, mean speed of what slides over RoboSkin; it wanders by 30 %
-    roboskin_speed_m_s: PositiveFloat = 0.05
+    force_n: Annotated[PositiveFloat, Unit("N")] = 1.0  # mean force of a slide; it varies by 5 % from trial to trial
+    speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the arm that draws the BioTac
+    # mean speed of what slides over RoboSkin; it varies by 30 %
+    roboskin_speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.05
     pac: bool = True  # whether the BioTac's vibration channels are simulated; they are zero otherwise
     # every how many-th slide of a BioTac on a material has the arm's streams; 0: none
     arm_every: NonNegativeInt = 20
-    jitter_ms: NonNegativeFloat = 0.1  # milliseconds, mean and standard deviation of a reading's way to the host
+    jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 0.1  # mean and standard deviation of a reading's latency
 
 
 @stage(version=1)
 def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
-    """Simulate slides of a BioTac or RoboSkin over materials.
+    """Simulate slides of two unlike sensors over materials.
 
-    Returns the sensor's stream and, with ground truth, truth.
+    Each recording has the stream of its sensor, biotac or roboskin, and, with ground truth, truth.
+
+    Example: tacpipe simulate material --trials 96 --materials 4 -o data/touched
     """
     from tacpipe.simulation.slide import Rig, simulate_trial
 
@@ -108,7 +116,7 @@ def material(params: MaterialParams, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class TouchParams:
-    """What lies on the simulated table, how it is grasped, and how precise camera and fingertips are."""
+    """What lies on the simulated table, how it is grasped, and the noise of camera and fingertips."""
 
     trials: PositiveInt = 360  # recordings, each a grasp; the objects take turns
     seed: Seed = 0  # random seed
@@ -123,7 +131,7 @@ class TouchParams:
     effort_spread: NonNegativeFloat = 0.15
     # times the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
     noise_scale: NonNegativeFloat = 1.0
-    drift_count_day: NonNegativeFloat = 30.0  # counts a day by which the sensors drift, root mean square
+    drift_count_day: Annotated[NonNegativeFloat, Unit("count/day")] = 30.0  # root mean square drift of the sensors
     raw: bool = False  # the camera's whole view and the sensors over time, as before `segment grasps`
 
     def check(self) -> None:
@@ -134,9 +142,11 @@ class TouchParams:
 
 @stage(version=2)
 def touch(params: TouchParams, trial: Trial) -> RecordingOutput:
-    """Simulate grasps of objects on a table.
+    """Simulate grasps of objects seen by a depth camera.
 
-    Returns cloud, grasp, reading and, with ground truth, truth.
+    Each recording has the streams cloud, grasp, reading and, with ground truth, truth.
+
+    Example: tacpipe simulate touch --trials 96 --objects 1 -o data/pinched
     """
     from tacpipe.simulation.grasp import simulate_trial
     from tacpipe.simulation.grasp_scene import Rig

@@ -1,4 +1,7 @@
-"""Give each recording its role: train, val or test."""
+"""Assign each recording a role: train, val or test.
+
+Example: tacpipe split data/segments -o data/split
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ class Split:
     few_of: str = ""  # attribute=value of the recordings that few is about, as sensor=roboskin; empty for all
 
     def check(self) -> None:
-        """Refuse what states nothing without few, and an attribute without a value."""
+        """Refuse options that need few, and an attribute without a value."""
         if not self.few and (self.few_by or self.few_of):
             named = "few_by" if self.few_by else "few_of"
             raise UsageError(
@@ -73,7 +76,7 @@ class Kfold(Split):
     # kfold: each recording is tested in one of several folds
     scheme: Literal["kfold"] = "kfold"
     folds: Annotated[int, Range(2)] = 5  # number of parts
-    apart: str = ""  # attribute whose values are dealt out too, each unknown in one fold; empty for none
+    apart: str = ""  # attribute whose values are distributed too, each unknown in one fold; empty for none
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
 
 
 def _note(bare: Sequence[int], folds: int, recordings: int, val: float, enough: float | None) -> str:
-    """Return the sentence on folds without validation recordings; ``enough`` is a share that would leave none so."""
+    """Return the sentence on folds without validation recordings; ``enough`` is a fraction that would leave none so."""
     named = ", ".join(map(str, bare[:SHOWN])) + (f" and {len(bare) - SHOWN} more" if len(bare) > SHOWN else "")
     subject = f"Folds {named} of {folds} have" if len(bare) > 1 else f"Fold {named} of {folds} has"
     advice = f"Give --val {enough:g}" if enough else "Add recordings"

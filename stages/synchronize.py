@@ -1,13 +1,19 @@
-"""Bring the streams of each recording onto one clock."""
+"""Resample all streams of a recording onto one clock.
+
+The output has one table a recording and one row a grid point, over the time that all streams cover, with masks of
+repeated samples and of gaps.
+
+Example: tacpipe synchronize data/recordings -o data/synced
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins.constraints import PositiveFloat, Rate
+from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
 if TYPE_CHECKING:
@@ -20,7 +26,7 @@ if TYPE_CHECKING:
 
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin; they keep their names and have no masks
-DEVICE, SEQUENCE = "t_device_ns", "seq"  # what a device states of a sample; they stay as they are
+DEVICE, SEQUENCE = "t_device_ns", "seq"  # a device's own time and number of a sample; they stay as they are
 UNCERTAIN = "t_uncertain_ns"  # by how much a sample may be stamped late; the recorder's, and no channel
 AS_IT_STANDS = ("label", "time", "mask")  # quantities between whose samples there is nothing
 MEDIAN_NS = (
@@ -33,11 +39,12 @@ BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at
 class Params:
     """The grid, the clock that places samples on it, and what counts as a gap."""
 
-    rate_hz: Rate = 50.0  # points a second of the uniform grid
+    rate_hz: Rate = 50.0  # rate of the uniform grid
     # uniform; logged: at the master's own stamps; fresh: at those whose rows are not repeated samples
     grid: Literal["uniform", "logged", "fresh"] = "uniform"
     master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
-    gap_ms: PositiveFloat = 50.0  # milliseconds; a point between samples further apart than this is marked as in a gap
+    # longest time between samples without a gap; points in a longer one are marked
+    gap_ms: Annotated[PositiveFloat, Unit("ms")] = 50.0
     # time of a sample: device: its own stamp; arrival: when it came; auto: the device's where there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are
@@ -121,7 +128,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:
-    """Return a stream with its samples on the host's clock; ``clock`` states by which stamps."""
+    """Return a stream with its samples on the host's clock; ``clock`` names the stamps."""
     stream = _Stream(name, columns, _stamps(recording, name, columns), _held(columns))
     if clock == "arrival" or stream.truth:
         return stream
@@ -148,7 +155,7 @@ def _on_host_clock(
     if column.null_count or not pa.types.is_integer(column.type):
         raise TacpipeError(
             f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
-            f"it must be whole nanoseconds in each row. Fix it at the source, or take `--clock arrival`."
+            f"it must be whole nanoseconds in each row. Repair it at the source, or take `--clock arrival`."
         )
     device_ns = column.cast(pa.int64()).to_numpy()
     try:
@@ -185,7 +192,7 @@ def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
         row = int(back.argmax()) + 1
         raise TacpipeError(
             f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
-            f"{t_ns[row - 1]} to {t_ns[row]} ns. Fix its clock at the source, or exclude the recording."
+            f"{t_ns[row - 1]} to {t_ns[row]} ns. Repair its clock at the source, or exclude the recording."
         )
     return t_ns
 

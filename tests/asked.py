@@ -14,10 +14,10 @@ def asked(name: str, preset: str | None = None, /, **options: Any) -> Any:
     return params_of.build(name, registry.load(name), preset=preset, options=options)
 
 
-def fitting(name: str, usual: Mapping[str, Any], **changed: Any) -> dict[str, Any]:
-    """Return the params as a task reads them; of the ``usual`` ones those that the chosen architecture has."""
+def fitting(name: str, usual: Mapping[str, Any], **changed: Any) -> Any:
+    """Return the params of stage ``name``; of the ``usual`` ones those that the chosen architecture has."""
     stage = registry.load(name)
     tag = params_of.tag(stage) or ""
     chosen = changed.get(tag, usual.get(tag, (params_of.defaults(stage, tag) or [""])[0]))
     counting = {key: value for key, value in usual.items() if chosen in (params_of.having(stage, key) or [chosen])}
-    return params_of.to_json(asked(name, **{**counting, **changed}))
+    return asked(name, **{**counting, **changed})

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -21,14 +23,14 @@ from tacpipe.models.pointnet import HEADS
 from tacpipe.models.recurrent_autoencoder import DECODERS
 from tacpipe.plugins import fields, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.constraints import CommaList, Range
+from tacpipe.plugins.constraints import CommaList, Range, Unit
 from tacpipe.simulation.household import FAMILIES, MODULI_PA
 from tacpipe.simulation.slide import SPECTRA
 from tacpipe.simulation.trajectory import PROTOCOLS
 from tacpipe.tasks.forward.rows import ACTIONS
 from tacpipe.tasks.material.pairs import EVERY, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
-from tacpipe.tasks.touch.learning import LOSSES
+from tacpipe.tasks.touch.losses import LOSSES
 from tacpipe.training.scaling import KINDS
 from tests.conftest import Ran
 
@@ -44,10 +46,10 @@ FREE = {  # params that are any text, and why
     "split.by": "an attribute of recordings",
     "train.material.sensors": "sensors of recordings, which plug-ins may add",
     "train.material.quantities": "quantities of columns, which plug-ins may add",
-    "train.material.reduce": "a sensor of recordings",
-    "train.material.known": "a sensor of recordings",
-    "train.material.setting": "words for a report",
-    "train.touch.setting": "words for a report",
+    "train.material.subsample_sensor": "a sensor of recordings",
+    "train.material.frozen_sensor": "a sensor of recordings",
+    "train.material.run_label": "words for a report",
+    "train.touch.run_label": "words for a report",
     "report.title": "words for a report",
 }
 
@@ -63,7 +65,7 @@ def each() -> Iterator[tuple[str, Any, str, Any]]:
 def tagged(name: str, kind: Any) -> dict[str, Any]:
     """Return the option that chooses a kind of params, if there are several."""
     tag = params_of.tag(registry.load(name))
-    return {tag: get_args(fields.hints(kind)[tag])[0]} if tag else {}
+    return {tag: get_args(fields.bare(fields.hints(kind)[tag]))[0]} if tag else {}
 
 
 def outside(wanted: Any) -> Iterator[Any]:
@@ -155,7 +157,7 @@ def test_an_option_of_another_kind_of_params_is_refused_and_is_in_no_key(
     monkeypatch.chdir(tmp_path)
     for kind in params_of.kinds(stage):
         own = params_of.build(name, stage, options=tagged(name, kind))
-        assert set(params_of.to_json(own)) == set(fields.hints(kind))
+        assert set(params_of.to_input(own)) == set(fields.hints(kind))
         for other in params_of.kinds(stage):
             for field in set(fields.hints(other)) - set(fields.hints(kind)):
                 default = other.__dataclass_fields__[field].default
@@ -165,7 +167,7 @@ def test_an_option_of_another_kind_of_params_is_refused_and_is_in_no_key(
                 ran = call(f"{command(name, {})} --block own")
                 assert ran.code == 2
                 assert f"params.yaml, block own: {field} belongs to the {params_of.tag(stage)} " in ran.err
-                assert get_args(fields.hints(other)[params_of.tag(stage) or ""])[0] in ran.err
+                assert get_args(fields.bare(fields.hints(other)[params_of.tag(stage) or ""]))[0] in ran.err
 
 
 @pytest.mark.parametrize("name", STAGES)
@@ -204,7 +206,7 @@ def test_every_param_has_a_help_text(name: str) -> None:
         ("train.forward", "actions", ACTIONS),
         ("train.material", "decoder", DECODERS),
         ("train.material", "pairing", PAIRINGS),
-        ("train.material", "ratio", (100, 90, *EVERY)),
+        ("train.material", "subsample_percent", (100, 90, *EVERY)),
         ("train.material", "scaling", KINDS),
         ("train.touch", "inputs", MODES),
         ("train.touch", "normalisation", NORMALISATIONS),
@@ -220,7 +222,7 @@ def test_every_param_has_a_help_text(name: str) -> None:
     ],
 )
 def test_choices_are_those_that_the_code_behind_them_knows(name: str, field: str, known: Any) -> None:
-    assert set(get_args(params_of.fields(registry.load(name))[field])) == set(known)
+    assert set(get_args(fields.bare(params_of.fields(registry.load(name))[field]))) == set(known)
 
 
 def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
@@ -228,6 +230,90 @@ def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
     assert isinstance(families, CommaList) and set(get_args(families.of)) == {"all", *FAMILIES}
     search = fields.constraints(params_of.fields(registry.load("compress.autoencoder"))["search"])[0]
     assert isinstance(search, Range) and search.most == MOST
+
+
+UNITS = {  # the end of a name and the unit that help must show
+    **{"_s": "s", "_ms": "ms", "_mm": "mm", "_m": "m", "_hz": "Hz", "_n": "N", "_deg": "degrees", "_ppm": "ppm"},
+    **{"_count": "count", "_m_s": "m/s", "_count_day": "count/day", "_per_mm": "count/mm"},
+}
+
+
+def test_a_number_whose_name_ends_in_a_unit_shows_that_unit() -> None:
+    numbers = {(name, field): wanted for name, _, field, wanted in each() if fields.bare(wanted) in (int, float)}
+    ends = {key: max((end for end in UNITS if key[1].endswith(end)), key=len, default="") for key in numbers}
+    shown = {key: [one.name for one in fields.constraints(numbers[key]) if isinstance(one, Unit)] for key in numbers}
+    wrong = {key: shown[key] for key, end in ends.items() if end and shown[key] != [UNITS[end]]}
+    assert not wrong
+    assert sum(map(bool, ends.values())) > 30
+    assert fields.describe(numbers["synchronize", "gap_ms"]).endswith("(ms)")
+
+
+def test_each_param_of_a_model_is_in_one_panel_of_the_help() -> None:
+    for name in STAGES:
+        kinds, panels = params_of.kinds(registry.load(name)), params_of.panels(registry.load(name))
+        if not panels:
+            assert not name.startswith(("train.", "compress."))
+            continue
+        assert set(panels) == set(params_of.fields(registry.load(name))), name
+        assert set(panels.values()) <= {"Model", "Training", "Data"}
+        for kind in kinds:
+            declared = [
+                field for owner in kind.__mro__ for names in vars(owner).get("PANELS", {}).values() for field in names
+            ]
+            assert len(declared) == len(set(declared)), kind
+            assert kind.PANELS["Model"][0] == dataclasses.fields(kind)[0].name or name.startswith("compress.")
+
+
+@pytest.mark.parametrize("name", ["train.touch", "compress.autoencoder"])
+def test_the_options_of_a_command_know_their_panels(name: str) -> None:
+    import typer
+
+    from tacpipe.cli import stages
+
+    program = typer.Typer()
+    stages.add(program, name, "stage")
+    found = {param.name: getattr(param, "rich_help_panel", None) for param in typer.main.get_command(program).params}
+    panels = params_of.panels(registry.load(name))
+    assert {field: found[field] for field in panels} == panels
+
+
+def test_models_and_tasks_read_params_as_attributes_of_their_dataclasses() -> None:
+    root = Path(params_of.__file__).parents[1]
+    files = [file for part in ("tasks", "models", "codecs", "training") for file in (root / part).rglob("*.py")]
+    lookups = re.compile(r"\bparams(?:\[[\"']|\.get\()|\bparams: (?:Mapping|dict)\b|\bParams = (?:Mapping|dict)\b")
+    found = {file.name: lookups.findall(file.read_text(encoding="utf-8")) for file in files}
+    assert {name: texts for name, texts in found.items() if texts} == {}
+    assert len(files) > 50
+
+
+# ---- what help says of a stage
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_the_summary_of_a_stage_is_one_short_sentence_in_the_imperative(name: str) -> None:
+    summary = registry.summary(name)
+    assert len(summary) < 60 and summary.endswith(".") and "  " not in summary
+    verb = summary.split()[0]
+    assert (verb.endswith("ss") or not verb.endswith("s")) and verb not in ("Return", "The")
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_the_help_of_a_stage_ends_in_one_example_of_that_stage(name: str) -> None:
+    from tacpipe.cli import stages
+
+    _, *examples = stages._help(name, registry.load(name)).split(stages.EXAMPLE)
+    assert len(examples) == 1 and examples[0].startswith(f"tacpipe {name.replace('.', ' ')} ")
+
+
+def test_the_command_line_names_no_stage() -> None:
+    from tacpipe.cli import stages
+
+    texts = {
+        node.value for node in ast.walk(ast.parse(Path(stages.__file__).read_text())) if isinstance(node, ast.Constant)
+    }
+    # split is an option too, and train a role
+    groups = {name.partition(".")[0] for name in STAGES} | {name.rpartition(".")[2] for name in STAGES}
+    assert not {name for name in groups - {"split", "train"} if name in texts or f"data/{name}" in texts}
 
 
 # ---- what a lab typed
@@ -240,12 +326,21 @@ def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
         ("train material nowhere --split s --unpool rubbish", "--unpool belongs to the architecture raec"),
         ("train material nowhere --split s --hidden 77", "--hidden belongs to the architecture raec or x-lstm"),
         (
-            "train material nowhere --split s --architecture raec --agreement zzz",
-            "--agreement is 'zzz'; it must be one",
+            "train material nowhere --split s --architecture raec --alignment-loss zzz",
+            "--alignment-loss is 'zzz'; it must be one",
         ),
-        ("train material nowhere --split s --architecture raec --ratio 30", "--ratio is '30'; it must be one of 100"),
-        ("train material nowhere --split s --architecture raec --ratio 25", "ratio is 25 and no sensor is reduced"),
-        ("train material nowhere --split s --architecture raec --reduce biotac", "give --no-shuffle with --reduce"),
+        (
+            "train material nowhere --split s --architecture raec --subsample-percent 30",
+            "--subsample-percent is '30'; it must be one of 100",
+        ),
+        (
+            "train material nowhere --split s --architecture raec --subsample-percent 25",
+            "subsample_percent is 25 and no sensor",
+        ),
+        (
+            "train material nowhere --split s --architecture raec --subsample-sensor biotac",
+            "give --no-shuffle with --subsample-sensor",
+        ),
         ("train material nowhere --split s --preset paper --no-joint --pairing permuted", "pairing is permuted and"),
         ("train material nowhere --split s --architecture spectra --speeds biotac", "list of NAME=VALUE, each value a"),
         (
@@ -257,11 +352,17 @@ def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
         ("train forward nowhere --split s --epochs abc", "--epochs is 'abc'; it must be a whole number of 1 or more."),
         ("train forward nowhere --split s --preset paper --loss huber", "--loss belongs to the architecture auto, tax"),
         ("train touch nowhere --split s --targets thumb", "each item one of pdc_th, pdc_mf, e_th, e_mf"),
-        ("train touch nowhere --split s --preset paper --architecture strong", "no preset paper for the architecture"),
+        (
+            "train touch nowhere --split s --preset paper --architecture tree-ensemble",
+            "no preset paper for the architecture",
+        ),
         ("report nowhere --preset paper", "There is no preset paper for report; it has none."),
         ("report nowhere --traces -1", "--traces is -1; it must be a whole number of 0 or more."),
         ("synchronize nowhere --grid bogus --skip-bad", "--grid is 'bogus'; it must be one of uniform, logged, fresh."),
-        ("synchronize nowhere --rate-hz -5", "--rate-hz is -5; it must be a number above 0 and at most 1000000000."),
+        (
+            "synchronize nowhere --rate-hz -5",
+            "--rate-hz is -5; it must be a number above 0 and at most 1000000000 (Hz).",
+        ),
         ("synchronize nowhere --rate-hz nan", "--rate-hz is nan; it must be a number above 0 and"),
         ("synchronize nowhere --set rate_hz=-5", "--set rate_hz=-5: rate_hz is -5; it must be a number above 0 and"),
         ("synchronize nowhere --jobs -3", "--jobs is -3; it must be a whole number of 0 or more."),
@@ -390,5 +491,5 @@ def test_kinds_that_no_field_tells_apart_are_a_mistake_of_the_stage() -> None:
         params = One | Other
         function = test_kinds_that_no_field_tells_apart_are_a_mistake_of_the_stage
 
-    with pytest.raises(Exception, match="not tell them apart"):
+    with pytest.raises(Exception, match="size"):
         params_of.tag(Fake())  # type: ignore[arg-type]

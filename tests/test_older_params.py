@@ -9,20 +9,21 @@ from typing import Any
 
 import pytest
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch.params import Trees
 from tests.asked import asked
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade
 
-DEFAULTS = {  # digests of the defaults' JSON of stages that models carry in their chains or that make recordings
+DEFAULTS = {  # digests of the defaults' JSON, which is what keys hold
     "compress.autoencoder": "d1efe9c9001106e4",
     "compress.pca": "54bf97cb6ed2b442",
     "ingest.biotac-slide": "268722f9bc89446b",
@@ -37,7 +38,11 @@ DEFAULTS = {  # digests of the defaults' JSON of stages that models carry in the
     "simulate.forward": "c7b4e8b76d4c695a",
     "simulate.material": "166b49172d5bf574",
     "simulate.touch": "edc15a5626cb9e7a",
+    "split": "b74d573d7062b354",
     "synchronize": "0e50647ea7230139",
+    "train.forward": "d31d1b2ee2cee6b5",
+    "train.material": "9b431ab5d857947b",
+    "train.touch": "b780f0f9e97ab269",
 }
 BEFORE: dict[str, dict[str, Any]] = {  # all params of a stage, when they were of one kind and all stood in each key
     "train.forward": json.loads(
@@ -91,9 +96,71 @@ def test_an_identity_with_the_params_of_every_architecture_is_read(name: str, ch
     tag = params_of.tag(stage)
     assert tag is not None
     found = params_of.from_json(stage, {**BEFORE[name], tag: choice})
-    assert getattr(found, tag) == choice
     values = params_of.to_json(found)
+    assert values[tag] == choice
     assert all(values[key] == BEFORE[name][key] for key in set(values) & set(BEFORE[name]) - {tag})
+
+
+RENAMED = [  # stage, option, what is stored
+    ("train.material", {"run_label": "blocked"}, {"setting": "blocked"}),
+    (
+        "train.material",
+        {"architecture": "raec", "subsample_sensor": "biotac", "subsample_percent": 50, "shuffle": False},
+        {"reduce": "biotac", "ratio": 50},
+    ),
+    ("train.material", {"architecture": "raec", "frozen_sensor": "biotac"}, {"known": "biotac"}),
+    ("train.material", {"architecture": "raec", "alignment_loss": "contrast"}, {"agreement": "contrast"}),
+    ("train.touch", {"architecture": "tree-ensemble"}, {"architecture": "strong"}),
+    ("train.touch", {"architecture": "pointnet", "multi_target": False}, {"together": False}),
+    ("compress.pca", {"representation": "increments"}, {"of": "increments"}),
+    ("compress.autoencoder", {"representation": "increments"}, {"of": "increments"}),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "stored"), RENAMED)
+def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
+    name: str, options: dict[str, Any], stored: dict[str, Any]
+) -> None:
+    built, stage = asked(name, **options), registry.load(name)
+    values = params_of.to_json(built)
+    assert {key: values[key] for key in stored} == stored
+    assert params_of.from_json(stage, values) == built
+    assert {key: params_of.counting(stage, values)[key] for key in options} == options
+    assert {key: params_of.named(name, values)[key] for key in options} == options
+    assert {key: params_of.to_input(built)[key] for key in options} == options
+    with pytest.raises(UsageError):  # a former name is not an option
+        asked(name, **{**options, **stored})
+
+
+def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
+    from tacpipe.datasets.manifest import chain_difference
+    from tacpipe.tasks import opened
+
+    stored = params_of.to_json(asked("compress.pca", components=3, representation="increments"))
+    step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}
+    assert opened._command(step) == "compress pca --components 3 --representation increments"
+    other = {**step, "params": {**stored, "of": "levels"}}
+    assert "representation" in chain_difference([step], [other])
+    assert params_of.named("no.such.stage", {"of": "levels"}) == {"of": "levels"}
+
+
+def test_a_method_that_was_renamed_is_shown_by_its_name_of_today() -> None:
+    from tacpipe.cli import headline_table
+
+    assert headline_table.method("touch", "strong") == "tree-ensemble"
+    assert headline_table.method("touch", "pointnet") == "pointnet"
+    assert headline_table.method("forward", "taxelwise · raw") == "taxelwise · raw"
+
+
+def test_a_models_params_are_of_the_class_of_its_architecture_and_of_the_right_types() -> None:
+    union = registry.load("train.touch").params
+    assert params_of.read(union, {"architecture": "trees", "trees": 5, "gone": 1}, "config.json") == Trees(
+        architecture="trees", trees=5
+    )
+    with pytest.raises(TacpipeError, match=r"config\.json: architecture is 'oak'; .*tree-ensemble"):
+        params_of.read(union, {"architecture": "oak"}, "config.json")
+    with pytest.raises(TacpipeError, match=r"config\.json: trees is 'many'; .*whole number"):
+        params_of.read(union, {"architecture": "trees", "trees": "many"}, "config.json")
 
 
 def test_stored_values_are_read_without_the_checks_of_new_ones() -> None:
@@ -137,7 +204,7 @@ def test_a_classifier_of_before_is_evaluated_and_predicts(architecture: str, tmp
     assert material.predict(before, recordings, [1]).recordings
 
 
-@pytest.mark.parametrize("architecture", ["strong", "patches", "pointnet"])
+@pytest.mark.parametrize("architecture", ["tree-ensemble", "patches", "pointnet"])
 def test_a_model_of_touch_of_before_is_evaluated_and_predicts(architecture: str, tmp_path: Path) -> None:
     changed = handmade.POINTNET if architecture == "pointnet" else {"architecture": architecture}
     files, recordings = handmade.trained(tmp_path, **changed), handmade.recordings(6, 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from tacpipe import printable
@@ -11,13 +12,24 @@ from tacpipe.datasets import manifest
 from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline
+from tacpipe.plugins import params as params_of
 from tacpipe.store.store import locate
 
 
 def of_output(output: Path, file: str) -> list[Headline]:
     """Return the headlines that ``file`` of the dataset at ``output`` holds, whose bytes are verified; none without it."""
     found = manifest.find(output).manifest.files.get(file)
-    return headline.read(locate().read(found["digest"])) if found else []
+    return read(locate().read(found["digest"])) if found else []
+
+
+def read(content: bytes) -> list[Headline]:
+    """Return the headlines of a file, with today's names of methods: results keep the names that they were stored with."""
+    return [replace(one, method=method(one.task, one.method)) for one in headline.read(content)]
+
+
+def method(task: object, stored: object) -> str:
+    """Return today's name of a method of a task, an architecture that may have been renamed since it was stored."""
+    return str(params_of.named(f"train.{task}", {"architecture": stored})["architecture"])
 
 
 def show(headlines: Sequence[Headline]) -> None:

@@ -7,11 +7,13 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from tacpipe.cli import headline_table
 from tacpipe.datasets import manifest
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline
+from tacpipe.plugins import params as params_of
 from tacpipe.store.store import Store
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
@@ -39,7 +41,7 @@ def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
         "parameters": config.get("parameters") or _parameters(opened),
         "epochs": len(history) or None,
         "validation": config.get("validation") or _best(history),
-        "params": config.get("params", dict(opened.source.params)),
+        "params": params_of.named(opened.source.stage, config.get("params", opened.source.params)),
         "inputs": _inputs(opened.source.inputs, store),
         "chain": [f"{step['stage']} {step['version']}" for step in opened.source.chain],
     }
@@ -48,10 +50,10 @@ def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
 def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
     """Return what a person asks of a result: how the model compares with its baselines, on how much, and of which role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
-    headlines = headline.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
+    headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
     identity = _identity(store, found.digest)
     return {
-        **{name: config.get(name) for name in ("task", "architecture")},
+        **_architecture(config),
         "headline": None if headlines is None else [one.to_json() for one in headlines],
         "baselines": list(dict.fromkeys(row.name for one in headlines or () for row in one.baselines)),
         "evaluated_on": metrics.get("counts", {}),
@@ -125,11 +127,17 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
         yield name, str(value)
 
 
+def _architecture(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the task and today's name of the architecture that a configuration names; None where it names none."""
+    task, stored = config.get("task"), config.get("architecture")
+    return {"task": task, "architecture": None if stored is None else headline_table.method(task, stored)}
+
+
 def _learned(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return task, architecture, what was trained on, and what else a configuration states in few words."""
     trained = config.get("trained_on")
     return {
-        **{name: config.get(name) for name in ("task", "architecture")},
+        **_architecture(config),
         "trained_on": {
             "recordings": len(trained) if isinstance(trained, Mapping) else None,  # of all roles that training read
             "roles": {role: one for role, one in config.get("counts", {}).items() if role in _ROLES},

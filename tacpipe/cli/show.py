@@ -16,6 +16,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
+from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ROLES
 from tacpipe.recording import ending
 from tacpipe.store.store import locate
@@ -44,7 +45,12 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
         return {"kind": "model", **about, **model_overview.of_model(opened, store)}
     folds = _folds(opened)
     if folds:
-        return {"kind": "split", **about, "params": dict(opened.source.params), "folds": folds}
+        return {
+            "kind": "split",
+            **about,
+            "params": params_of.named(opened.source.stage, opened.source.params),
+            "folds": folds,
+        }
     return {
         "kind": "recordings",
         **about,

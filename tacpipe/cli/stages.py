@@ -22,31 +22,7 @@ from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage
 
-_PLACES = {  # what examples call the datasets
-    "ingest": "data/recordings",
-    "simulate": "data/recordings",
-    "synchronize": "data/synced",
-    "segment": "data/segments",
-    "split": "data/split",
-    "compress": "data/latents",
-    "segment.grasps": "data/grasps",
-    "segment.slides": "data/slides",
-    "train": "models/forward",
-    "train.material": "models/material",
-    "evaluate": "results/forward",
-    "report": "report.html",
-}
-_BEFORE = {
-    "synchronize": "recordings",
-    "segment": "synced",
-    "segment.grasps": "recordings",
-    "segment.slides": "recordings",
-    "train.material": "slides",
-    "split": "segments",
-    "compress": "segments",
-    "train": "latents",
-    "evaluate": "latents",
-}
+EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
 _CHECKED = {"jobs": NonNegativeInt, "fold": NonNegativeInt | None, "role": Literal["train", "val", "test"] | None}
 
 
@@ -78,7 +54,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         options={field: _parsed(given[field], params_of.fields(stage)[field]) for field in named},
     )
     if given["print_params"]:
-        terminal.result(json.dumps(params_of.to_json(params), indent=1))
+        terminal.result(json.dumps(params_of.to_input(params), indent=1))
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
@@ -175,6 +151,7 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
 
 def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
+    panels = params_of.panels(stage)
     found = []
     for name, wanted in fields.items():
         kind = fields_of.bare(wanted)
@@ -184,7 +161,9 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         annotation = bool | None if kind is bool else list[str] | None if many else str | None  # parsed as --set is
         text = _about(stage, name, helps.get(name, ""))
         metavar = None if kind is bool else _metavar(wanted)
-        option = typer.Option(None, *flags, help=text, show_default=False, metavar=metavar)
+        option = typer.Option(
+            None, *flags, help=text, show_default=False, metavar=metavar, rich_help_panel=panels.get(name)
+        )
         found.append(_parameter(name, annotation, option))
     more: list[tuple[str, Any, Any]] = [
         (
@@ -257,18 +236,23 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 
 def _help(name: str, stage: AnyStage) -> str:
-    text = inspect.cleandoc(stage.function.__doc__ or sys.modules[stage.function.__module__].__doc__ or "")
-    return f"{text}\n\nExample: {example(name, stage)}"
+    """Return the docstring of a stage: that of its module where the command is the stage alone, else of its function.
+
+    Its last paragraph is an example; one is made of the stage's arguments where it has none.
+    """
+    own, module = stage.function.__doc__, sys.modules[stage.function.__module__].__doc__
+    text = inspect.cleandoc((own or module if "." in name else module or own) or "")
+    return text if EXAMPLE in text else f"{text}\n\n{EXAMPLE}{example(name, stage)}"
 
 
 def example(name: str, stage: AnyStage) -> str:
-    """Return a command line that shows the stage at work."""
-    group = name.partition(".")[0]
-    words = ["tacpipe", *name.split(".")]
+    """Return a command line that shows the stage at work, as its arguments allow."""
     kinds = set(stage.arguments.values())
+    words = ["tacpipe", *name.split(".")]
     words += ["published/recordings"] if "Files" in kinds else []
-    words += ["models/forward"] if stage.reads_model else []
-    words += [f"data/{_BEFORE.get(name, _BEFORE.get(group, 'recordings'))}"] if kinds & {"Recording", "Dataset"} else []
-    words += ["results/forward"] if "Datasets" in kinds else []
+    words += ["models/model"] if stage.reads_model else []
+    words += ["data/recordings"] if kinds & {"Recording", "Dataset"} else []
+    words += ["results/one", "results/two"] if "Datasets" in kinds else []
     words += ["--split", "data/split"] if stage.needs_split or stage.reads_model else []
-    return " ".join([*words, "-o", _PLACES.get(name, _PLACES.get(group, "data/out"))])
+    output = "data/recordings" if kinds & {"Files", "Trial"} else f"data/{name.rpartition('.')[2]}"
+    return " ".join([*words, "-o", output])

@@ -45,7 +45,7 @@ class Autoencoder:
     encoder: Layers
     decoder: Layers
     frames: int = 1  # rows in a row that it reads
-    of: str = frame_stacking.LEVELS
+    representation: str = frame_stacking.LEVELS
     measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "autoencoder"
 
@@ -60,7 +60,7 @@ class Autoencoder:
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        inputs = frame_stacking.inputs(values, begins, self.of, self.frames)
+        inputs = frame_stacking.inputs(values, begins, self.representation, self.frames)
         return encode_finite(self.project, inputs, len(self.latents))
 
     def project(self, inputs: Floats) -> Floats:
@@ -68,7 +68,7 @@ class Autoencoder:
         return _through(self.encoder, scaled(inputs, self.mean_count, self.scale_count))
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the newest frame's counts that latents represent as float64, (…, latent) to (…, channel)."""
+        """Return the newest frame's counts that latents decode to as float64, (…, latent) to (…, channel)."""
         *first, (weight, bias) = self.decoder
         newest = (*first, (weight[-len(self.channels) :], bias[-len(self.channels) :]))
         decoded = _through(newest, latents.reshape(-1, latents.shape[-1]).astype(np.float32))
@@ -80,7 +80,7 @@ class Autoencoder:
         content = {
             **self.measured,
             "kind": self.kind,
-            "of": self.of,
+            "of": self.representation,
             "frames": self.frames,
             "channels": list(self.channels),
             "layout": [dict(one) for one in self.layout],

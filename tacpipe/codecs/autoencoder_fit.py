@@ -1,8 +1,8 @@
 """The training of an autoencoder, and the search for the best of some networks under one budget.
 
 Rows of all but the held-out training recordings are learned, and the mean squared error of giving the held-out ones
-back, all frames of them, in units of each channel's scale, says when to stop and which network is best. Recordings of
-the role val are not touched, so that they judge a forecaster that stands behind the codec.
+back, all frames of them, in units of each channel's scale, decides when to stop and which network is best. Recordings of
+the role val are not touched, so that they can evaluate a forecaster trained behind the codec.
 
 Networks of increments have no biases: a row that does not move has latents 0 and comes back as 0, so that increments
 that are added up do not drift.
@@ -44,7 +44,7 @@ class Network:
 
     hidden: tuple[int, ...]
     learning_rate: float
-    weight_decay: float  # of Adam: this share of a weight is added to its gradient
+    weight_decay: float  # of Adam: this fraction of a weight is added to its gradient
 
 
 def networks(
@@ -83,7 +83,7 @@ def fit(
     workspace: Path,
     *,
     components: int,
-    of: str = frame_stacking.LEVELS,
+    representation: str = frame_stacking.LEVELS,
 ) -> Autoencoder:
     """Return the codec of ``components`` latents whose network, of those ``tried``, gives held-out rows back best.
 
@@ -105,15 +105,17 @@ def fit(
             f"An autoencoder cannot be fitted on {len(train)} rows and stopped by {len(val)}. Give it longer training "
             "recordings with contact."
         )
-    mean, scale = standard(train[:, -width:], of)
+    mean, scale = standard(train[:, -width:], representation)
     learned, watched = (torch.from_numpy(scaled(part, mean, scale)) for part in (train, val))
     found = [
-        _trained(learned, watched, network, schedule, workspace / f"{index:02d}", components, of)
+        _trained(learned, watched, network, schedule, workspace / f"{index:02d}", components, representation)
         for index, network in enumerate(tried)
     ]
     best = min(range(len(found)), key=lambda index: _lowest(found[index]))
     encoder, decoder = (_layers(found[best].weights, part) for part in ("encoder", "decoder"))
-    codec = Autoencoder(rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, of)
+    codec = Autoencoder(
+        rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
+    )
     told = [
         _told(network, one) | {"kept": at == best} for at, (network, one) in enumerate(zip(tried, found, strict=True))
     ]
@@ -153,7 +155,7 @@ def _trained(
     schedule: loop.Schedule,
     workspace: Path,
     components: int,
-    of: str,
+    representation: str,
 ) -> loop.Trained:
     widths = (learned.shape[1], *network.hidden, components)
 
@@ -165,7 +167,7 @@ def _trained(
         return loop.Part(len(rows), loss)
 
     return loop.train(
-        lambda: _Mirrored(widths, bias=of == frame_stacking.LEVELS),
+        lambda: _Mirrored(widths, bias=representation == frame_stacking.LEVELS),
         loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace,
@@ -178,14 +180,14 @@ def _lowest(trained: loop.Trained) -> float:
 
 
 def _told(network: Network, trained: loop.Trained) -> dict[str, Any]:
-    """Return what the record of the search says of a network; no seconds, which are never the same."""
+    """Return the record of a network in the search; no seconds, which are never the same."""
     return {
         "hidden": list(network.hidden),
-        "learning_rate": measures.told(network.learning_rate),
-        "weight_decay": measures.told(network.weight_decay),
+        "learning_rate": measures.rounded(network.learning_rate),
+        "weight_decay": measures.rounded(network.weight_decay),
         "parameters": sum(value.numel() for value in trained.weights.values()),
         "epochs": len(trained.history),
-        "val_loss": measures.told(_lowest(trained)),
+        "val_loss": measures.rounded(_lowest(trained)),
     }
 
 

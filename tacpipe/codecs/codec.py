@@ -27,8 +27,8 @@ class Codec(Protocol):
         """The word that `load` knows it by."""
 
     @property
-    def of(self) -> str:
-        """What latents stand for: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
+    def representation(self) -> str:
+        """What latents encode: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -45,13 +45,13 @@ class Codec(Protocol):
     def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
         """Return the latents of counts above rest, (time, channel) to (time, latent), float32.
 
-        ``begins`` (time,) says where a stretch of rows that follow one another begins; None: at the first row alone.
+        ``begins`` (time,) marks where a stretch of rows that follow one another begins; None: at the first row alone.
         A row's latents depend on rows of its stretch up to it, never on later ones; where one of those that it reads is
         not finite they are NaN.
         """
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts that latents stand for, (…, latent) to (…, channel): levels or increments, as ``of`` says."""
+        """Return decoded counts, (…, latent) to (…, channel): levels or increments, whichever ``representation`` is."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Raw:
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
     kind: str = "raw"
-    of: str = LEVELS
+    representation: str = LEVELS
 
     @property
     def latents(self) -> tuple[str, ...]:
@@ -79,13 +79,13 @@ class Raw:
 
 
 def decode_ahead(codec: Codec, latents: Floats, last: Floats) -> Floats:
-    """Return the counts above rest that latents of the rows to come stand for, shape (window, step, channel).
+    """Return the counts above rest that latents of future rows decode to, shape (window, step, channel).
 
     ``latents`` is (window, step, latent), its first step the row after ``last``, which is (window, channel) in counts
     above rest. A codec of increments adds them up onto ``last``; one of levels does not look at it.
     """
     decoded = codec.decode(latents)
-    return last[:, None] + np.cumsum(decoded, axis=1) if codec.of == INCREMENTS else decoded
+    return last[:, None] + np.cumsum(decoded, axis=1) if codec.representation == INCREMENTS else decoded
 
 
 def encode_finite(project: Callable[[Floats], Floats], inputs: Floats, width: int) -> Floats:

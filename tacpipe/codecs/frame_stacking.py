@@ -20,26 +20,26 @@ Flags = NDArray[np.bool_]
 LEVELS, INCREMENTS = "levels", "increments"
 
 
-def check(of: str) -> None:
-    """Raise `TacpipeError` unless ``of`` is levels or increments."""
-    if of not in (LEVELS, INCREMENTS):
-        raise TacpipeError(f"of is {of!r}; a codec is fitted on {LEVELS} or {INCREMENTS}.")
+def check(representation: str) -> None:
+    """Raise `TacpipeError` unless ``representation`` is levels or increments."""
+    if representation not in (LEVELS, INCREMENTS):
+        raise TacpipeError(f"representation is {representation!r}; a codec is fitted on {LEVELS} or {INCREMENTS}.")
 
 
-def inputs(values: Floats, begins: Flags | None, of: str, frames: int) -> Floats:
+def inputs(values: Floats, begins: Flags | None, representation: str, frames: int) -> Floats:
     """Return what a codec reads of each row of ``values`` (time, channel): (time, frames * channel), newest frame last.
 
-    ``of`` is levels, ``values`` as they are, or increments, what was added since the row before. ``begins`` (time,)
-    says where a stretch begins; None: at the first row alone. Rows at the start of a stretch repeat its first frame, and
-    the increment there is 0. Raises `TacpipeError` for another ``of``.
+    ``representation`` is levels, ``values`` as they are, or increments, what was added since the row before. ``begins``
+    (time,) marks where a stretch begins; None: at the first row alone. Rows at the start of a stretch repeat its first
+    frame, and the increment there is 0. Raises `TacpipeError` for another ``representation``.
 
     >>> inputs(np.array([[1.0], [4.0], [9.0]]), None, "increments", 2).tolist()
     [[0.0, 0.0], [0.0, 3.0], [3.0, 5.0]]
     """
-    check(of)
+    check(representation)
     rows = np.arange(len(values))
     first = np.zeros_like(rows) if begins is None else np.maximum.accumulate(np.where(begins, rows, 0))
-    if of == INCREMENTS:
+    if representation == INCREMENTS:
         with np.errstate(
             invalid="ignore"
         ):  # a row that is not finite has no increment, at the start of a stretch either

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
 NAMES = ("reconstruction", "latent_covariance", "search")
-DIGITS = 6  # that are told; beyond them the order of additions shows, which the number of threads changes
+DIGITS = 6  # that are stored; beyond them the order of additions matters, which the number of threads changes
 
 
 class Fitted(Protocol):
@@ -36,7 +36,7 @@ class Fitted(Protocol):
         """Return the latents (row, latent) of finite rows (row, frames * channel)."""
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts that latents stand for."""
+        """Return the counts that latents decode to."""
 
 
 def reconstructions(codec: Fitted, train: Floats, val: Floats) -> dict[str, dict[str, float]]:
@@ -51,8 +51,8 @@ def reconstruction(codec: Fitted, inputs: Floats) -> dict[str, float]:
     error = codec.decode(codec.project(inputs).astype(np.float32)) - newest
     return {
         "rows": len(inputs),
-        "mse_standardised": told(float(np.square(error / codec.scale_count).mean())),
-        "mae_counts": told(float(np.abs(error).mean())),
+        "mse_standardised": rounded(float(np.square(error / codec.scale_count).mean())),
+        "mae_counts": rounded(float(np.abs(error).mean())),
     }
 
 
@@ -63,10 +63,10 @@ def covariance(codec: Fitted, inputs: Floats) -> list[list[float]]:
     return (found.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no minus before a 0
 
 
-def told(value: float) -> float:
-    """Return ``value`` with as many digits as are told.
+def rounded(value: float) -> float:
+    """Return ``value`` rounded to the stored digits.
 
-    >>> told(0.123456789)
+    >>> rounded(0.123456789)
     0.123457
     """
     return float(f"{value:.{DIGITS}g}")

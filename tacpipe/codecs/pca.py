@@ -44,7 +44,7 @@ class PCA:
     scale_count: Floats  # (channel,)
     components: Floats  # (latent, channel)
     explained_ratio: Floats  # (component,), of all components, kept or not
-    of: str = frame_stacking.LEVELS
+    representation: str = frame_stacking.LEVELS
     measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "pca"
 
@@ -59,14 +59,16 @@ class PCA:
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        return encode_finite(self.project, frame_stacking.inputs(values, begins, self.of, 1), len(self.components))
+        return encode_finite(
+            self.project, frame_stacking.inputs(values, begins, self.representation, 1), len(self.components)
+        )
 
     def project(self, inputs: Floats) -> Floats:
-        """Return the latents (row, latent) of finite rows (row, channel), levels or increments as ``of`` states."""
+        """Return the latents (row, latent) of finite rows (row, channel) of the codec's ``representation``."""
         return ((inputs - self.mean_count) / self.scale_count) @ self.components.T
 
     def decode(self, latents: Floats) -> Floats:
-        """Return the counts that latents represent as float64, (…, latent) to (…, channel)."""
+        """Return the counts that latents decode to as float64, (…, latent) to (…, channel)."""
         return (latents @ self.components) * self.scale_count + self.mean_count
 
     def to_files(self) -> dict[str, bytes]:
@@ -74,7 +76,7 @@ class PCA:
         content = {
             **self.measured,
             "kind": self.kind,
-            "of": self.of,
+            "of": self.representation,
             "channels": list(self.channels),
             "layout": [dict(one) for one in self.layout],
             "latents": len(self.components),
@@ -111,23 +113,25 @@ def fit(
     *,
     components: int = 20,
     variance: float = 0.0,
-    of: str = frame_stacking.LEVELS,
+    representation: str = frame_stacking.LEVELS,
 ) -> PCA:
-    """Return the codec fitted on ``inputs``, shape (row, channel), counts above rest or increments as ``of`` says.
+    """Return the codec fitted on ``inputs`` (row, channel), counts above rest or their increments (``representation``).
 
-    It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this share of the variance.
+    It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this fraction of the variance.
     A channel that never moves gets the scale 1. The sign of each component is such that its largest weight is positive.
-    Raises `TacpipeError` for a count or share that the data cannot give.
+    Raises `TacpipeError` for a count or fraction that the data cannot give.
     """
     rows, width = inputs.shape
     most = min(rows - 1, width)
     if most < 1:
         raise TacpipeError(f"A codec cannot be fitted on {rows} rows. Give it training recordings with contact.")
     if not 0 <= variance < 1:
-        raise TacpipeError(f"variance is {variance}; it is a share between 0 and 1. Use 0 to count components instead.")
+        raise TacpipeError(
+            f"variance is {variance}; it must be a fraction between 0 and 1. Use 0 to count components instead."
+        )
     if variance == 0 and not 1 <= components <= most:
         raise TacpipeError(f"components is {components}; {rows} rows of {width} channels give 1 to {most}.")
-    mean, scale = standard(inputs, of)
+    mean, scale = standard(inputs, representation)
     # scikit-learn's PCA always takes the mean off, which increments keep; the triangle of a QR has the same singular
     # values and right vectors as all the rows, and as few rows as there are channels.
     triangle = np.linalg.qr((inputs - mean) / scale, mode="r")
@@ -140,12 +144,18 @@ def fit(
     weights = weights[:kept]  # (latent, channel)
     largest = np.take_along_axis(weights, np.abs(weights).argmax(axis=1)[:, None], axis=1)
     return PCA(
-        tuple(channels), tuple(layout), mean, scale, weights * np.where(largest < 0, -1.0, 1.0), ratio[:most], of
+        tuple(channels),
+        tuple(layout),
+        mean,
+        scale,
+        weights * np.where(largest < 0, -1.0, 1.0),
+        ratio[:most],
+        representation,
     )
 
 
 def fit_and_measure(
-    rows: TrainingRows, *, components: int = 20, variance: float = 0.0, of: str = frame_stacking.LEVELS
+    rows: TrainingRows, *, components: int = 20, variance: float = 0.0, representation: str = frame_stacking.LEVELS
 ) -> PCA:
     """Return the codec fitted on ``rows`` of all recordings, with its measures.
 
@@ -153,11 +163,13 @@ def fit_and_measure(
     the same recordings is, so that the two compare. Without any held out, ``val`` is left out.
     """
     everything = rows.of(rows.inputs.keys())
-    codec = fit(everything, rows.channels, rows.layout, components=components, variance=variance, of=of)
+    codec = fit(
+        everything, rows.channels, rows.layout, components=components, variance=variance, representation=representation
+    )
     train, val = rows.parts
     kept = len(codec.components)
     if len(val) and len(train) > kept:
-        judged = fit(train, rows.channels, rows.layout, components=kept, of=of)
+        judged = fit(train, rows.channels, rows.layout, components=kept, representation=representation)
     else:
         judged, train, val = codec, everything, everything[:0]
     measured = {

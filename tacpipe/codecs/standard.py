@@ -19,7 +19,7 @@ def still(values: Floats, channels: Sequence[str]) -> list[str]:
     return [name for name, moves in zip(channels, _moves(values), strict=True) if not moves]
 
 
-def standard(values: Floats, of: str) -> tuple[Floats, Floats]:
+def standard(values: Floats, representation: str) -> tuple[Floats, Floats]:
     """Return mean and scale of each channel in counts, (channel,) each, of training rows ``values`` (time, channel).
 
     The scale is the standard deviation, and 1 for a channel that never moves. Increments keep the mean 0, so that rows
@@ -31,7 +31,7 @@ def standard(values: Floats, of: str) -> tuple[Floats, Floats]:
             f"None of the {values.shape[1]} tactile channels moves in {len(values)} training rows, so there is nothing "
             "to compress. Give training recordings with contact."
         )
-    mean = values.mean(axis=0) if of == LEVELS else np.zeros(values.shape[1])
+    mean = values.mean(axis=0) if representation == LEVELS else np.zeros(values.shape[1])
     return mean, np.where(moves, values.std(axis=0), 1.0)
 
 

@@ -43,8 +43,10 @@ def _tried(read: Callable[[], Codec]) -> Codec:
     """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` where they do not."""
     with model_files.validated("the codec"), np.errstate(all="ignore"):
         codec = read()
-        if codec.of not in (LEVELS, INCREMENTS) or not all(isinstance(name, str) for name in codec.channels):
-            raise ValueError(f"it is of {codec.of} and of {len(codec.channels)} channels")
+        if codec.representation not in (LEVELS, INCREMENTS) or not all(
+            isinstance(name, str) for name in codec.channels
+        ):
+            raise ValueError(f"it is of {codec.representation} and of {len(codec.channels)} channels")
         if len(codec.layout) != len(codec.channels) or not all(isinstance(one, Mapping) for one in codec.layout):
             raise ValueError(f"{len(codec.channels)} channels lie in {len(codec.layout)} places")
         row = np.zeros((1, len(codec.channels)))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
-LAYOUT = ("stream", "taxel", "axis")  # field metadata that says where a channel sits
+LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes where a channel lies
 
 
 def metadata(field: pa.Field) -> dict[str, str]:

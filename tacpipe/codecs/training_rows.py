@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
-HELD_OUT = 0.15  # share of the training recordings that a codec is measured on
+HELD_OUT = 0.15  # fraction of the training recordings that a codec is measured on
 log = logging.getLogger(__name__)
 
 
@@ -57,14 +57,14 @@ class TrainingRows:
         return np.concatenate([np.zeros((0, width)), *(self.inputs[name] for name in sorted(names))])
 
 
-def read(shards: Mapping[str, Recording], of: str, frames: int = 1) -> TrainingRows:
-    """Return the rows of recordings that a codec ``of`` levels or increments of some ``frames`` is fitted on.
+def read(shards: Mapping[str, Recording], representation: str, frames: int = 1) -> TrainingRows:
+    """Return the rows of recordings that a codec of a ``representation`` and some ``frames`` is fitted on.
 
     A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Warns of
     channels that never move while others do. Raises `TacpipeError` where there is no recording or no tactile channel,
     and naming the recording whose channels are others.
     """
-    frame_stacking.check(of)
+    frame_stacking.check(representation)
     if not shards:
         raise TacpipeError("There is no training recording to fit a codec on. Make a split that has some.")
     channels: tuple[str, ...] | None = None
@@ -77,7 +77,7 @@ def read(shards: Mapping[str, Recording], of: str, frames: int = 1) -> TrainingR
             channels, layout = found, tuple(tactile.layout(table.schema, found))
         try:
             check_channels(channels, found)
-            inputs[name] = _usable(table, channels, of, frames)
+            inputs[name] = _usable(table, channels, representation, frames)
         except TacpipeError as error:
             raise TacpipeError(f"{name}: {error}") from error
     if not channels:
@@ -87,11 +87,11 @@ def read(shards: Mapping[str, Recording], of: str, frames: int = 1) -> TrainingR
     return rows
 
 
-def _usable(table: pa.Table, channels: tuple[str, ...], of: str, frames: int) -> Floats:
+def _usable(table: pa.Table, channels: tuple[str, ...], representation: str, frames: int) -> Floats:
     """Return the rows (row, frames * channel) of a recording that a codec may be fitted on."""
     counts = tactile.above_rest(table, channels)
     counts[tactile.gaps(table)] = np.nan  # what is made of such a row is not finite either
-    made = frame_stacking.inputs(counts, frame_stacking.breaks(tactile.times(table)), of, frames)
+    made = frame_stacking.inputs(counts, frame_stacking.breaks(tactile.times(table)), representation, frames)
     usable = np.isfinite(made).all(axis=1)
     if "contact" in table.column_names:
         usable &= table.column("contact").to_numpy() >= 0

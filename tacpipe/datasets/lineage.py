@@ -9,6 +9,7 @@ from tacpipe import printable
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed
 from tacpipe.store.store import Store, locate
 
@@ -44,7 +45,7 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
     return {
         "stage": manifest.stage,
         "version": manifest.version,
-        "params": dict(manifest.params),
+        "params": params_of.named(manifest.stage, manifest.params),
         "digest": manifest.digest,
         "manifest": name,
         "path": places.get(name),
@@ -84,10 +85,11 @@ def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
         found.append(f"stage: {before.stage} became {now.stage}")
     if before.version != now.version:
         found.append(f"version: {before.version} became {now.version}")
+    old, new = (params_of.named(one.stage, one.params) for one in (before, now))
     found += [
-        f"params.{name}: {before.params.get(name)} became {now.params.get(name)}"
-        for name in sorted({*before.params, *now.params})
-        if before.params.get(name) != now.params.get(name)
+        f"params.{name}: {old.get(name)} became {new.get(name)}"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name)
     ]
     found += _compared("sources", dict(before.sources), dict(now.sources))
     for argument in sorted({*before.inputs, *now.inputs}):

@@ -281,13 +281,16 @@ def chain_difference(wanted: Sequence[Mapping[str, Any]], found: Sequence[Mappin
     >>> chain_difference([step], [{**step, "params": {"rate_hz": 100.0}}])
     'synchronize has rate_hz 100.0 instead of 50.0'
     """
+    from tacpipe.plugins import params as params_of
+
     for ours, theirs in zip(wanted, found, strict=False):
         if ours["stage"] != theirs["stage"]:
             return f"{theirs['stage']} is where {ours['stage']} should be"
         if ours["version"] != theirs["version"]:
             return f"{ours['stage']} has version {theirs['version']} instead of {ours['version']}"
-        for name in sorted({*ours["params"], *theirs["params"]}):
-            left, right = ours["params"].get(name), theirs["params"].get(name)
+        mine, other = (params_of.named(step["stage"], step["params"]) for step in (ours, theirs))
+        for name in sorted({*mine, *other}):
+            left, right = mine.get(name), other.get(name)
             if left != right:
                 return f"{ours['stage']} has {name} {right} instead of {left}"
         if ours["fitted"] != theirs["fitted"]:

@@ -13,7 +13,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError
@@ -21,7 +21,7 @@ from tacpipe.formats.folders import require, text, valid
 from tacpipe.io import regular
 from tacpipe.io.files import walk
 from tacpipe.io.hashing import remembered_file_digest
-from tacpipe.plugins.constraints import NonNegativeFloat
+from tacpipe.plugins.constraints import NonNegativeFloat, Unit
 from tacpipe.plugins.stage import Files, RecordingOutput, stage
 from tacpipe.printable import plain
 
@@ -41,7 +41,8 @@ POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the 
 class Params:
     """What counts as a grasp of the cloud."""
 
-    beside_mm: NonNegativeFloat = 20.0  # millimetres that a grasp point may lie from the nearest point of the cloud
+    # largest distance of a grasp point from the nearest point of the cloud
+    beside_mm: Annotated[NonNegativeFloat, Unit("mm")] = 20.0
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:

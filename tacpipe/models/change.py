@@ -15,13 +15,13 @@ from tacpipe.models.windows import Windows, held, motion
 
 MOTION, UP = 15, 3
 CELLS = ("gru", "lstm", "tcn")
-CLIPPED = 8.0  # standard deviations beyond which an input tells no more: jumps of a sensor must not rule a window
+CLIPPED = 8.0  # standard deviations to which inputs are clipped: a jump of a sensor must not dominate a window
 
 
 class ChangeForecast(nn.Module):
     """What all of them share: scales fitted on training windows, the loss, and the step from change to touch.
 
-    ``increments`` says that features are changes from row to row already; then the change itself is what is told.
+    ``increments`` says that features are changes from row to row already; then the change itself is predicted.
     """
 
     change_only = True
@@ -85,15 +85,15 @@ class SequenceForecast(ChangeForecast):
     def __init__(self, features: int, *, cell: str, hidden: int, **shared: object) -> None:
         """Make a model of random weights that begins at persistence."""
         super().__init__(features, **shared)  # type: ignore[arg-type]
-        told = MOTION + UP
-        past = 2 * features + 2 + told  # change against now, level, held, finger, arm
+        arm = MOTION + UP
+        past = 2 * features + 2 + arm  # change against now, level, held, finger, arm
         self.cell = cell
         if cell == "tcn":
             self.inward = nn.Linear(past + 1, hidden)
             self.blocks = nn.ModuleList(_Block(hidden, 2**level) for level in range(4))
         else:
             recurrent = nn.GRU if cell == "gru" else nn.LSTM
-            self.encoder, self.decoder = recurrent(past, hidden), recurrent(told, hidden)
+            self.encoder, self.decoder = recurrent(past, hidden), recurrent(arm, hidden)
         self.head = nn.Linear(hidden, features)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)

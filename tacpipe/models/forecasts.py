@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -18,10 +18,12 @@ AUTO, TAXELWISE, RECURRENT = "auto", "taxelwise", "recurrent"
 ELSE = "gru"  # what auto is where the taxelwise model cannot read what there is
 ARCHITECTURES = (TAXELWISE, *CELLS, RECURRENT)
 Layout = Sequence[Mapping[str, str]]
+Loss = Literal["absolute", "huber", "squared"]
+AnyLoss = Literal["auto", "absolute", "huber", "squared"]
 
 
 class RecurrentForecast(nn.Module):
-    """The paper's model between its scalings: features and poses to [-1, 1] and back; it tells levels, not changes."""
+    """The paper's model between its scalings: features and poses to [-1, 1] and back; it predicts levels, not changes."""
 
     change_only = False
     touch_centre: Tensor
@@ -62,26 +64,41 @@ class RecurrentForecast(nn.Module):
         return predicted
 
 
-def build(params: Mapping[str, Any], features: int, layout: Layout, *, changes: bool) -> nn.Module:
-    """Return a forecaster of random weights for ``features`` latents or channels.
+def build(
+    architecture: str,
+    features: int,
+    layout: Layout,
+    *,
+    hidden: int,
+    context: int,
+    horizon: int,
+    dropout: float,
+    loss: str,
+    changes: bool = False,
+) -> ChangeForecast:
+    """Return a model of change of random weights for ``features`` latents or channels.
 
-    ``params`` has architecture, hidden, context and horizon, and but for the recurrent model dropout and loss;
-    ``layout`` says where each channel sits; ``changes`` that features are increments already. Raises `TacpipeError` for
+    ``layout`` describes where each channel lies; ``changes``: features are increments already. Raises `TacpipeError` for
     an architecture that is unknown and for a representation that it cannot read.
     """
-    architecture = params["architecture"]
-    if architecture not in ARCHITECTURES:
-        raise TacpipeError(f"There is no architecture {architecture!r}; there are {', '.join(ARCHITECTURES)}.")
-    if architecture == RECURRENT:
-        return RecurrentForecast(features, params["hidden"])
-    sizes = {name: params[name] for name in ("hidden", "dropout", "loss", "context", "horizon")}
     if architecture in CELLS:
-        return SequenceForecast(features, cell=architecture, increments=changes, **sizes)
-    return TaxelwiseForecast(layout, **sizes)
+        return SequenceForecast(
+            features,
+            cell=architecture,
+            increments=changes,
+            hidden=hidden,
+            dropout=dropout,
+            loss=loss,
+            context=context,
+            horizon=horizon,
+        )
+    if architecture == TAXELWISE:
+        return TaxelwiseForecast(layout, hidden=hidden, dropout=dropout, loss=loss, context=context, horizon=horizon)
+    raise TacpipeError(f"There is no architecture {architecture!r}; there are {', '.join((TAXELWISE, *CELLS))}.")
 
 
-def resolved_loss(loss: str, *, changes: bool) -> str:
-    """Return the loss that ``auto`` is; ``changes`` says that features are increments already.
+def resolved_loss(loss: AnyLoss, *, changes: bool) -> Loss:
+    """Return the loss that ``auto`` is; ``changes``: features are increments already.
 
     Where a sensor repeats samples most increments are 0, and so is their median, which is all that the absolute error
     teaches.
@@ -89,7 +106,7 @@ def resolved_loss(loss: str, *, changes: bool) -> str:
     >>> resolved_loss("auto", changes=True), resolved_loss("auto", changes=False), resolved_loss("squared", changes=True)
     ('huber', 'absolute', 'squared')
     """
-    if loss != AUTO:
+    if loss != "auto":
         return loss
     return "huber" if changes else "absolute"
 

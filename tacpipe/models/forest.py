@@ -1,6 +1,6 @@
 """Extremely randomised trees (Geurts et al., Extremely randomized trees, 2006), fitted by scikit-learn and kept as arrays.
 
-What scikit-learn keeps of a forest is a pickle, which nobody should open that comes from a stranger. Kept here are the
+What scikit-learn keeps of a forest is a pickle, which may run code when an untrusted one is opened. Kept here are the
 cuts and the means of the leaves, from which the same values follow, to the seven digits of a float32.
 """
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 Floats = NDArray[np.float64]
 
-FEATURES = 0.4  # share of all features that is tried at a cut
+FEATURES = 0.4  # fraction of all features that is tried at a cut
 LEAF = -1  # in place of a child where there is none
 
 
@@ -35,7 +35,7 @@ class Forest:
     def fitted(
         cls, rows: Floats, values: Floats, *, trees: int, leaf: int, seed: int, features: float = FEATURES
     ) -> Forest:
-        """Return a forest that tells ``values`` (row, value) of ``rows`` (row, feature); a leaf has ``leaf`` or more."""
+        """Return a forest that predicts ``values`` (row, value) of ``rows`` (row, feature); a leaf has ``leaf`` or more."""
         from sklearn.ensemble import ExtraTreesRegressor
 
         forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=features, random_state=seed)
@@ -84,7 +84,7 @@ class Forest:
         return np.stack([self.values[at].mean(axis=0, dtype=np.float64) for at in node])
 
     def times(self, unit: Floats) -> Forest:
-        """Return the forest that tells the same values (value,) in another unit: each multiplied by its ``unit``."""
+        """Return the forest that predicts the same values (value,) in another unit: each multiplied by its ``unit``."""
         return replace(self, values=(self.values * unit).astype(np.float32))
 
     def tensors(self) -> dict[str, Tensor]:
@@ -94,7 +94,7 @@ class Forest:
         return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in kept.items()}
 
     def check(self, features: int, values: int) -> None:
-        """Raise `ValueError` unless trees of so many ``features`` tell so many ``values``, and each way down them ends.
+        """Raise `ValueError` unless trees of so many ``features`` predict so many ``values``, and each way down them ends.
 
         As they are grown a child stands behind its parent: nodes that lead back to one another would be gone round for ever.
         """

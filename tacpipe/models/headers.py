@@ -121,7 +121,7 @@ def build(kind: str, channels: int, unpool: str = "nearest") -> Plain | Perceptr
 def chosen(given: str, sensors: Mapping[str, int]) -> dict[str, str]:
     """Return the header of each sensor; ``given`` is text like ``biotac=none,roboskin=cnn`` and may leave some out.
 
-    ``sensors`` has the number of channels. A grid of triangles gets a convolution where nothing is said, others none.
+    ``sensors`` has the number of channels. A grid of triangles gets a convolution by default, others none.
 
     >>> chosen("biotac=mlp", {"biotac": 19, "roboskin": 60})
     {'biotac': 'mlp', 'roboskin': 'cnn'}

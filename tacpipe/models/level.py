@@ -1,7 +1,7 @@
-"""What the mean level alone tells: linear discriminant analysis of each channel's mean over the slide.
+"""Classification by the mean level alone: linear discriminant analysis of each channel's mean over the slide.
 
 It sees neither texture nor time, only how hard and where the finger was pressed. Whatever it gets right, contact
-conditions or drift give away, so every classifier is held against it. The covariance within classes is shrunk towards
+conditions or drift give away, so every classifier is compared with it. The covariance within classes is shrunk towards
 a multiple of the identity by as much as Ledoit and Wolf (A well-conditioned estimator for large-dimensional covariance
 matrices, 2004) find best, because a few slides a class do not determine it.
 """
@@ -58,7 +58,7 @@ class Level:
         gain = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 1e-9 * (1 + np.abs(centre)))
         moves = gain > 0
         if not moves.any():
-            raise TacpipeError("All slides have the same mean levels, so nothing distinguishes classes by them.")
+            raise TacpipeError("All slides have the same mean levels, so they do not distinguish classes.")
         found = LinearDiscriminantAnalysis(
             solver="lsqr", shrinkage="auto", priors=np.full(len(classes), 1 / len(classes))
         )

@@ -1,4 +1,4 @@
-"""The linear forecasts that every forecaster is held against: a mean, a damped trend and three least-squares maps.
+"""The linear forecasts that every forecaster is compared with: a mean, a damped trend and three least-squares maps.
 
 Windows come as three arrays: ``past`` (window, context, channel), counts above rest, newest last; ``motion`` (window,
 context + horizon, state), the arm's state at the same steps and then its plan; ``ahead`` (window, horizon, channel),
@@ -98,7 +98,7 @@ class Baselines:
         means = [one.mean(axis=0, dtype=np.float64) for one in training]
         centre = _features(means[0][None], means[1][None])[0]
         bias = (means[2] - means[0][-1]).ravel()
-        sums, judged = (_Sums.over(part, centre, bias) for part in (training, validation))
+        sums, evaluated = (_Sums.over(part, centre, bias) for part in (training, validation))
         blind = centre.size - horizon * motion.shape[2]  # features that do not know the plan
         shared = _Shared.of(sums, centre, bias, (context - 1, channels, horizon))
         phi, lag = shared.damped_trend()
@@ -109,8 +109,8 @@ class Baselines:
             lag,
             shared_weight.astype(np.float32),
             shared_bias.astype(np.float32),
-            _ridge(sums.first(blind), judged.first(blind), centre[:blind], bias),
-            _ridge(sums, judged, centre, bias),
+            _ridge(sums.first(blind), evaluated.first(blind), centre[:blind], bias),
+            _ridge(sums, evaluated, centre, bias),
         )
 
     @property
@@ -218,7 +218,7 @@ class _Shared:
 
     @classmethod
     def of(cls, sums: _Sums, centre: Floats, bias: Floats, shape: tuple[int, int, int]) -> _Shared:
-        """Return what the blocks of each channel with itself say; ``shape`` is context - 1, channel and horizon."""
+        """Return the sums of the blocks of each channel with itself; ``shape`` is context - 1, channel and horizon."""
         before, channels, horizon = shape
         changes = before * channels  # which come first among the features
         x, y = centre[:changes].reshape(before, channels), bias.reshape(horizon, channels)
@@ -253,8 +253,8 @@ class _Shared:
         return weight, y - x @ weight
 
 
-def _ridge(sums: _Sums, judged: _Sums, centre: Floats, bias: Floats) -> Map:
-    """Return the ridge regression whose alpha has the least squared error on the windows of ``judged``.
+def _ridge(sums: _Sums, evaluated: _Sums, centre: Floats, bias: Floats) -> Map:
+    """Return the ridge regression whose alpha has the least squared error on the windows of ``evaluated``.
 
     With the features' matrix Q diag(v) Q', the weights are Q diag(1 / (v + alpha)) Q' xy: what is costly does not
     depend on alpha, neither for the weights nor for their error on other windows.
@@ -265,8 +265,8 @@ def _ridge(sums: _Sums, judged: _Sums, centre: Floats, bias: Floats) -> Map:
     values, vectors = np.linalg.eigh(sums.xx * np.outer(gain, gain))
     turn = gain[:, None] * vectors  # from standardised features to where their matrix is diagonal
     xy = turn.T @ sums.xy
-    bent = (turn.T @ judged.xx @ turn) * (xy @ xy.T)
-    straight = np.einsum("fy,fy->f", xy, turn.T @ judged.xy)
+    bent = (turn.T @ evaluated.xx @ turn) * (xy @ xy.T)
+    straight = np.einsum("fy,fy->f", xy, turn.T @ evaluated.xy)
     shrinks = [1 / (np.maximum(values, 0) + alpha) for alpha in ALPHAS]
     errors = [shrink @ bent @ shrink - 2 * shrink @ straight for shrink in shrinks]  # less what no alpha changes
     best = int(np.argmin(errors))

@@ -127,7 +127,7 @@ class _Layer(torch.autograd.Function):
         for total, given in ((dh, by_hidden), (dh, None if by_states is None else by_states[-1]), (dc, by_cell)):
             if given is not None:
                 total += given
-        told = None if by_states is None else by_states.unbind()
+        later = None if by_states is None else by_states.unbind()
         by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # of all three weights, as they were multiplied
         needs = ctx.needs_input_grad
         by_inputs = _empty(gates, steps, windows, from_input.shape[1]) if needs[0] else None
@@ -147,8 +147,8 @@ class _Layer(torch.autograd.Function):
                 of_cell.mul_(dc[:, None])
                 of_output.mul_(dh)
                 dc.mul_(forgets[step])
-                if step and told is not None:
-                    torch.addmm(told[step - 1], row, from_state, out=dh)
+                if step and later is not None:
+                    torch.addmm(later[step - 1], row, from_state, out=dh)
                 elif step:
                     torch.mm(row, from_state, out=dh)
             flat = by_gates.view(-1, gates.shape[-1])

@@ -2,7 +2,7 @@
 
 Contact depends on the surface about the contact, its curvature, slope and edges, and on sizes in metres. So points are
 read in the axes of the grasp, those about each contact through layers of their own, and the grasp's own sizes beside
-them. Moving object, hand and wrist together changes nothing of what is read. Two backbones tell of a patch:
+them. Moving object, hand and wrist together changes nothing of what is read. Two backbones describe a patch:
 
 - ``points``: every point alone, as in PointNet;
 - ``edges``: every point with its nearest neighbours (EdgeConv; Wang et al., Dynamic graph CNN, 2019).

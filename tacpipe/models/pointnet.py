@@ -1,6 +1,6 @@
 """PointNet for touch (Zapata-Impata et al., Generation of tactile data from 3D vision and target robotic grasps, 2020).
 
-Every point goes through the same layers, the largest value of each of 1,024 channels over the cloud tells of the whole,
+Every point goes through the same layers, the largest value of each of 1,024 channels over the cloud describes the whole,
 and fully connected layers make touch of it and of the grasp (Qi et al., PointNet, CVPR 2017). The trunk is that of the
 group's published code: one learned transform of all input channels, and no loss that keeps it orthogonal.
 """

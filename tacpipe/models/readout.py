@@ -4,7 +4,7 @@ Ridge regression: each class has a target of +1 on its own slides and -1 on all 
 and Kennard, Ridge Regression, 1970; as a readout of random patterns in Dempster, Schmidt and Webb, MiniRocket, 2021,
 section 3.3). Features are standardised, and there are many more of them than slides. So all is done with the slides'
 inner products K = Q diag(v) Q': the error of a slide that is left out is alpha c_i / (1 - h_ii), where c = (K + alpha)^-1 y,
-and h_ii is the slide's own weight in its fitted value, the share 1 / n of the intercept among it (Golub, Heath and Wahba,
+and h_ii is the slide's own weight in its fitted value, the fraction 1 / n of the intercept among it (Golub, Heath and Wahba,
 Generalized Cross-Validation, 1979, section 1). One decomposition serves all alphas.
 
 Nearest mean: linear discriminant analysis with the covariance within classes made regular by a multiple of the identity

@@ -25,7 +25,7 @@ DECODERS = ("D1", "D2")
 
 @dataclass(frozen=True)
 class Shape:
-    """What a sensor's network reads and states, and how it is built."""
+    """What a sensor's network reads and returns, and how it is built."""
 
     channels: int
     classes: int
@@ -37,12 +37,12 @@ class Shape:
     dropout: float = 0.0  # fraction of the latents left out before the classifier in each training step
 
 
-class Told(NamedTuple):
-    """What a network says of slides."""
+class NetworkOutput(NamedTuple):
+    """The output of a network for slides."""
 
     latents: Tensor  # (slide, latent)
     scores: Tensor  # (slide, class)
-    frames: Tensor | None  # the slides made again (time, slide, channel); None where there is no decoder
+    frames: Tensor | None  # the reconstructed slides (time, slide, channel); None where there is no decoder
 
 
 class RecurrentAutoencoder(nn.Module):
@@ -62,11 +62,11 @@ class RecurrentAutoencoder(nn.Module):
         self.decoder = nn.LSTM(1 if shape.decoder == "D1" else shape.hidden, shape.hidden)
         self.to_features = nn.Linear(shape.hidden, width)
 
-    def forward(self, frames: Tensor, *, decode: bool = True) -> Told:
-        """Return what is told of slides ``frames`` (time, slide, channel); without ``decode`` no frames."""
+    def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
+        """Return the output for slides ``frames`` (time, slide, channel); without ``decode`` no frames."""
         last = _through(self.encoder, self.header.encode(frames))[-1]  # (slide, hidden)
         latents = self.to_latents(last)
-        return Told(latents, self.classify(latents), self._decoded(latents, len(frames)) if decode else None)
+        return NetworkOutput(latents, self.classify(latents), self._decoded(latents, len(frames)) if decode else None)
 
     def classify(self, latents: Tensor) -> Tensor:
         """Return the scores (slide, class) of latents (slide, latent), of this sensor or of another."""
@@ -93,10 +93,10 @@ class RecurrentClassifier(nn.Module):
         self.encoder = nn.LSTM(self.header.width, shape.hidden)
         self.classifier = nn.Linear(shape.hidden, shape.classes)
 
-    def forward(self, frames: Tensor, *, decode: bool = True) -> Told:
-        """Return what is told of slides ``frames`` (time, slide, channel); it never makes frames again."""
+    def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
+        """Return the output for slides ``frames`` (time, slide, channel), which has no frames."""
         last = _through(self.encoder, self.header.encode(frames))[-1]
-        return Told(last, self.classify(last), None)
+        return NetworkOutput(last, self.classify(last), None)
 
     def classify(self, latents: Tensor) -> Tensor:
         """Return the scores (slide, class) of last states (slide, hidden)."""

@@ -1,10 +1,10 @@
-"""What a slide tells of a surface, in terms that unlike sensors share: how strong waves of each length are.
+"""What a slide shows of a surface, in terms that unlike sensors share: how strong waves of each length are.
 
 A wave of the surface with k periods a metre shakes a sensor that slides at v metres a second with f = k v hertz. Over
-spatial frequency k, the spectra of one material are therefore alike whatever sensor felt it, at whatever speed and rate,
-up to what the sensor itself does to each k: its gain, and its aperture, which passes the share exp(-2 (pi sigma k)^2) of
+spatial frequency k, the spectra of one material are therefore alike whatever sensor recorded it, at whatever speed and rate,
+up to what the sensor itself does to each k: its gain, and its aperture, which passes the fraction exp(-2 (pi sigma k)^2) of
 an amplitude. Both are offsets of the logarithm. All sensors are read over the same way and in the same bands, so that
-they tell waves apart equally well, and only where all of them take samples densely enough.
+they separate waves equally well, and only where all of them take samples densely enough.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from tacpipe.errors import TacpipeError
 Floats = NDArray[np.floating[Any]]
 
 BANDS = 16
-PERIODS = 3.0  # of the longest wave in the way; a slower one cannot be told from a change of pressure
-HIGHEST = 0.6  # share of the spatial frequency above which a sensor would take a wave for a longer one
+PERIODS = 3.0  # of the longest wave in the way; a slower one cannot be separated from a change of pressure
+HIGHEST = 0.6  # fraction of the spatial frequency above which a sensor would take a wave for a longer one
 LINES = 4  # spatial frequencies at which a band is read
-LEADING = 0.3  # share of the channels that are read, those pressed most; the others may not touch at all
-HOP = 0.25  # by which windows are apart, as a share of their length
+LEADING = 0.3  # fraction of the channels that are read, those pressed most; the others may not touch at all
+HOP = 0.25  # by which windows are apart, as a fraction of their length
 ROUNDING = 1 / 12  # counts^2, power of whole counts' rounding: no spectrum lies below
 READ = 256  # slides that are read at once
 
 
 @dataclass(frozen=True)
-class Felt:
+class Sampling:
     """How a sensor's slides come about."""
 
     frames: int
@@ -51,19 +51,19 @@ class Felt:
 
 @dataclass(frozen=True)
 class Bands:
-    """The way over which spectra are taken and the bands of spatial frequency that they are told in."""
+    """The way over which spectra are taken and the bands of spatial frequency."""
 
     way_m: float
     edges_per_m: Floats  # (band + 1,)
 
     @classmethod
-    def common(cls, sensors: Sequence[Felt], number: int = BANDS) -> Bands:
+    def common(cls, sensors: Sequence[Sampling], number: int = BANDS) -> Bands:
         """Return ``number`` bands, alike on a logarithmic scale, that all sensors can be read in.
 
-        They begin at `PERIODS` in the shortest slide's way and end at the share `HIGHEST` of the lowest frequency that
-        a sensor could tell from others. Raises `TacpipeError` where nothing lies between.
+        They begin at `PERIODS` in the shortest slide's way and end at the fraction `HIGHEST` of the lowest frequency that
+        a sensor could separate from others. Raises `TacpipeError` where nothing lies between.
 
-        >>> Bands.common([Felt(400, 100.0, 0.025), Felt(75, 50.0, 0.05)]).edges_per_m[[0, -1]].round(3).tolist()
+        >>> Bands.common([Sampling(400, 100.0, 0.025), Sampling(75, 50.0, 0.05)]).edges_per_m[[0, -1]].round(3).tolist()
         [40.0, 300.0]
         """
         way_m = min(one.way_m for one in sensors)

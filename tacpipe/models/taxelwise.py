@@ -1,7 +1,7 @@
 """One network for all taxels: what a taxel does next, as factors of the taxel times factors of the motion.
 
 The taxels of one kind of sensor are alike, so one small network reads each of them: its own history and level, what its
-sensors feel on the whole, and a learned trait of its place. It gives factors φ (axis, rank). A recurrent network goes
+sensors measure on the whole, and a learned trait of its place. It gives factors φ (axis, rank). A recurrent network goes
 over the plan and gives factors ψ (rank) a step. The change is Σ_rank φ ψ, so the taxels are read once for all steps, each
 step rests on the plan up to it, and a step before a new frame is due can be closed for all taxels at once (`gate`):
 skins are logged faster than they are read, and until the next frame comes nothing changes.
@@ -19,16 +19,16 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models.change import CLIPPED, MOTION, UP, ChangeForecast, closing, spread
 from tacpipe.models.windows import Windows, held
 
-TRAITS = 16  # numbers that tell one place on the sensors from another
+TRAITS = 16  # numbers that identify a place on the sensors
 RANK = 32
-LAGS = (9, 7, 5, 3, 1)  # rows before now whose touch is compared with now; frames are held, so neighbours tell the same
+LAGS = (9, 7, 5, 3, 1)  # rows before now whose touch is compared with now; frames are held, so neighbours repeat
 
 
 class TaxelwiseForecast(ChangeForecast):
     """Reads raw channels; begins at persistence."""
 
     axis_scale: Tensor
-    told_mean: Tensor
+    told_mean: Tensor  # of the inputs of the whole; stored models have this name
     told_scale: Tensor
 
     def __init__(self, layout: Sequence[Mapping[str, str]], *, hidden: int, **shared: Any) -> None:
@@ -38,13 +38,15 @@ class TaxelwiseForecast(ChangeForecast):
         self.lags = [lag for lag in LAGS if lag < self.context]
         own = 2 * (len(self.lags) + 1) * self.axes
         whole = self.sensors * 2 * (len(self.lags) + 1) * self.axes
-        told = whole + UP + self.context * (MOTION + 2)
+        inputs = whole + UP + self.context * (MOTION + 2)
         self.register_buffer("axis_scale", torch.ones(self.axes))
         self.register_buffer("own_mean", torch.zeros(own))
         self.register_buffer("own_scale", torch.ones(own))
-        self.register_buffer("told_mean", torch.zeros(told))
-        self.register_buffer("told_scale", torch.ones(told))
-        self.whole = nn.Sequential(nn.Linear(told, hidden), nn.GELU(), self.drop, nn.Linear(hidden, hidden), nn.GELU())
+        self.register_buffer("told_mean", torch.zeros(inputs))
+        self.register_buffer("told_scale", torch.ones(inputs))
+        self.whole = nn.Sequential(
+            nn.Linear(inputs, hidden), nn.GELU(), self.drop, nn.Linear(hidden, hidden), nn.GELU()
+        )
         self.traits = nn.Parameter(0.3 * torch.randn(self.sensors * self.taxels, TRAITS))
         self.own, self.from_whole = nn.Linear(own, hidden), nn.Linear(hidden, hidden)
         self.from_traits = nn.Linear(TRAITS, hidden)
@@ -70,11 +72,11 @@ class TaxelwiseForecast(ChangeForecast):
 
     def forward(self, windows: Windows) -> Tensor:
         """Return the touch to come (horizon, window, channel), in counts above rest."""
-        own, told = (
+        own, whole_inputs = (
             ((values - getattr(self, f"{name}_mean")) / getattr(self, f"{name}_scale")).clamp(-CLIPPED, CLIPPED)
             for name, values in zip(("own", "told"), self._read(windows), strict=True)
         )
-        whole = self.drop(self.whole(told))  # (window, hidden)
+        whole = self.drop(self.whole(whole_inputs))  # (window, hidden)
         hidden = self.own(own) + self.from_whole(whole)[:, None] + self.from_traits(self.traits)
         hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._kept(hidden)))
         hidden = hidden * self._kept(hidden)
@@ -96,22 +98,22 @@ class TaxelwiseForecast(ChangeForecast):
         return kept
 
     def _read(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Return what is told of each taxel (window, taxel, …) and of the whole (window, …)."""
+        """Return the inputs of each taxel (window, taxel, …) and of the whole (window, …)."""
         touch = windows.touch
         lags = torch.tensor([windows.context - 1 - lag for lag in self.lags], dtype=torch.long)
         change = self._by_taxel(touch[-1] - touch[lags])  # (lag, window, taxel, axis)
         level = self._by_taxel(touch[-1:])
         plain = torch.cat([change, level]) / self.axis_scale
-        # a change of a few counts and one of thousands both tell; the logarithm of either is an ordinary number
+        # a change of a few counts and one of thousands both matter; the logarithm of either is an ordinary number
         fine = torch.cat([torch.asinh(8 * change / self.change_scale), torch.asinh(2 * level / self.change_scale)])
         own = torch.cat([fine, plain]).permute(1, 2, 0, 3).flatten(2)  # (window, taxel, lag and axis)
         sensors = plain.view(
             *plain.shape[:2], self.sensors, self.taxels, self.axes
         )  # (lag, window, sensor, taxel, axis)
-        felt = torch.cat([sensors.mean(3), sensors.std(3)], -1).permute(1, 0, 2, 3).flatten(1)
+        load = torch.cat([sensors.mean(3), sensors.std(3)], -1).permute(1, 0, 2, 3).flatten(1)
         steps, up = self.arm(windows)
         past = steps[: windows.context].transpose(0, 1).flatten(1)
-        return own, torch.cat([felt, up, past, closing(windows).T, 1 - held(touch).T], -1)
+        return own, torch.cat([load, up, past, closing(windows).T, 1 - held(touch).T], -1)
 
 
 def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:

@@ -1,12 +1,12 @@
-"""What sensors can tell one another of classes: features of the same kind, each sensor's changed in a way of its own.
+"""What sensors can learn of classes from one another: features of the same kind, each sensor's changed in a way of its own.
 
-In sensor s, slides of class c have features N(m_sc, W_s). What another sensor t knows of the class says where m_sc is to
+In sensor s, slides of class c have features N(m_sc, W_s). What another sensor t knows of the class predicts where m_sc is to
 be expected: in each feature alone at ``a + g m_tc``, give or take a variance b. The offset a and the gain g are fitted
-on the classes that both were told, the gain drawn towards that of all features, for these classes are few; b is the mean
+on the classes that both learned, the gain drawn towards that of all features, for these classes are few; b is the mean
 squared error on each of these classes when it is left out of the fit. Several sensors' expectations count by 1 / b; where
 none knows the class, it is expected like the sensor's own classes, with the variance between them.
 
-What the sensor itself was told then corrects the expectation, by the rule of Bayes: n slides of mean x give
+What the sensor itself learned then corrects the expectation, by the rule of Bayes: n slides of mean x give
 ``V = (B^-1 + n W^-1)^-1`` and ``m = V (B^-1 p + n W^-1 x)``, and a new slide of the class is N(m, W + V). So one rule names
 classes of many slides, of few, and of none: the wider a class is expected to lie, the less is made of a slide near its
 middle. W is shrunk as by Ledoit and Wolf (A well-conditioned estimator for large-dimensional covariance matrices, 2004).
@@ -26,13 +26,15 @@ from tacpipe.errors import TacpipeError
 Floats = NDArray[np.floating[Any]]
 Labels = NDArray[np.integer[Any]]
 
-SHARED = 3  # fewest classes that tell how two sensors differ
-PULL = 0.5  # of the gain of all features on that of each, as a share of a feature's mean sum of squares
-STEADY = 1e-4  # share of a covariance's mean variance that is added to each variance: features may depend on each other
+SHARED = 3  # fewest classes from which the difference of two sensors is fitted
+PULL = 0.5  # of the gain of all features on that of each, as a fraction of a feature's mean sum of squares
+STEADY = (
+    1e-4  # fraction of a covariance's mean variance that is added to each variance: features may depend on each other
+)
 
 
 @dataclass(frozen=True)
-class Told:
+class Labelled:
     """Labelled slides of a sensor: features (slide, feature) and classes (slide,)."""
 
     features: Floats
@@ -67,25 +69,25 @@ class Transfer:
     expected: Gaussians  # nothing of a class that no other sensor knows
 
     @classmethod
-    def fit(cls, own: Told, others: Sequence[Told] = ()) -> Transfer:
-        """Return what a sensor of which the labelled slides ``own`` are known can tell, with the help of ``others``.
+    def fit(cls, own: Labelled, others: Sequence[Labelled] = ()) -> Transfer:
+        """Return what a sensor of which the labelled slides ``own`` are known can classify, with the help of ``others``.
 
         Raises `TacpipeError` where arrays do not fit one another, values are not finite, no class has two slides, the
-        sensor was told fewer than two classes, or fewer than `SHARED` of those of another sensor.
+        sensor has fewer than two classes, or fewer than `SHARED` of those of another sensor.
         """
         for one in (own, *others):
             _check(one, own.features.shape[-1])
         classes = np.unique(np.concatenate([one.labels for one in (own, *others)]))
         means = _means(own, classes)
         within = _within(own)
-        told = np.isfinite(means[:, 0])
+        learned = np.isfinite(means[:, 0])
         expected, variance = _expected(means, [_means(other, classes) for other in others])
         foreign = np.isfinite(expected[:, 0])
-        prior = np.where(foreign[:, None], expected, means[told].mean(axis=0))
-        spread = np.where(foreign[:, None], variance, means[told].var(axis=0, ddof=1) + _least(within))
+        prior = np.where(foreign[:, None], expected, means[learned].mean(axis=0))
+        spread = np.where(foreign[:, None], variance, means[learned].var(axis=0, ddof=1) + _least(within))
         mean, covariance = prior.copy(), within + np.stack([np.diag(one) for one in spread])
         borrowed = Gaussians(np.where(foreign[:, None], prior, 0), np.where(foreign[:, None, None], covariance, 0))
-        for index in np.flatnonzero(told):
+        for index in np.flatnonzero(learned):
             wide = np.diag(spread[index])
             trust = wide @ np.linalg.inv(wide + within / (own.labels == classes[index]).sum())
             mean[index] += trust @ (means[index] - prior[index])
@@ -114,14 +116,14 @@ class Transfer:
 def _expected(means: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
     """Return where other sensors' class means make one expect those of a sensor, and the variance of that.
 
-    All are (class, feature), NaN in the rows of classes that a sensor was not told, or that no other one knows.
+    All are (class, feature), NaN in the rows of classes that a sensor did not learn, or that no other one knows.
     """
     weight, total = np.zeros(means.shape), np.zeros(means.shape)
     for other in others:
         both = np.isfinite(means[:, 0]) & np.isfinite(other[:, 0])
         if both.sum() < SHARED:
             raise TacpipeError(
-                f"Two sensors were given {both.sum()} classes in common; {SHARED} at least show how they differ. Record "
+                f"Two sensors learned {both.sum()} classes in common; {SHARED} at least show how they differ. Record "
                 "more with both, or learn for each sensor alone."
             )
         there, here = other[both], means[both]
@@ -137,7 +139,7 @@ def _expected(means: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
 
 
 def _mapped(there: Floats, here: Floats, features: Floats) -> Floats:
-    """Return features of one sensor as another's, by the means (class, feature) of classes that both were told."""
+    """Return features of one sensor as another's, by the means (class, feature) of classes that both learned."""
     centre, target = there.mean(axis=0), here.mean(axis=0)
     squares = np.square(there - centre).sum(axis=0)
     products = ((there - centre) * (here - target)).sum(axis=0)
@@ -147,21 +149,21 @@ def _mapped(there: Floats, here: Floats, features: Floats) -> Floats:
     return found
 
 
-def _means(told: Told, classes: Labels) -> Floats:
+def _means(slides: Labelled, classes: Labels) -> Floats:
     """Return the mean features of each class (class, feature), NaN where a class has no slide."""
-    found = np.full((len(classes), told.features.shape[1]), np.nan)
+    found = np.full((len(classes), slides.features.shape[1]), np.nan)
     for index, one in enumerate(classes):
-        if (told.labels == one).any():
-            found[index] = told.features[told.labels == one].mean(axis=0)
+        if (slides.labels == one).any():
+            found[index] = slides.features[slides.labels == one].mean(axis=0)
     return found
 
 
-def _within(told: Told) -> Floats:
+def _within(slides: Labelled) -> Floats:
     """Return the covariance (feature, feature) of features within classes."""
     from sklearn.covariance import ledoit_wolf
 
-    classes, index = np.unique(told.labels, return_inverse=True)
-    left = told.features - _means(told, classes)[index]
+    classes, index = np.unique(slides.labels, return_inverse=True)
+    left = slides.features - _means(slides, classes)[index]
     spread = left.std(axis=0)
     spread = np.where(spread > 0, spread, 1.0)
     shrunk, _ = ledoit_wolf(left / spread, assume_centered=True)
@@ -174,18 +176,18 @@ def _least(within: Floats) -> float:
     return float(STEADY * np.trace(within) / len(within))
 
 
-def _check(told: Told, number: int) -> None:
-    """Refuse slides that tell nothing of classes."""
-    shape, classes = told.features.shape, len(np.unique(told.labels))
-    if len(shape) != 2 or told.labels.shape != shape[:1] or shape[1] != number:
+def _check(slides: Labelled, number: int) -> None:
+    """Refuse slides that do not distinguish classes."""
+    shape, classes = slides.features.shape, len(np.unique(slides.labels))
+    if len(shape) != 2 or slides.labels.shape != shape[:1] or shape[1] != number:
         raise TacpipeError(
-            f"Features of {shape} and labels of {told.labels.shape} do not fit one another; they must be "
+            f"Features of {shape} and labels of {slides.labels.shape} do not fit one another; they must be "
             f"(slide, {number}) and (slide,)."
         )
-    if classes < 2 or len(told.labels) == classes:
+    if classes < 2 or len(slides.labels) == classes:
         raise TacpipeError(
-            f"{len(told.labels)} slides of {classes} classes do not show how classes differ; give two classes or more, and "
+            f"{len(slides.labels)} slides of {classes} classes do not show how classes differ; give two or more classes and "
             "two slides of one of them."
         )
-    if not np.isfinite(told.features).all():
+    if not np.isfinite(slides.features).all():
         raise TacpipeError("Some features are not finite. Look for slides with gaps, and leave these out.")

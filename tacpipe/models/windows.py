@@ -53,7 +53,7 @@ def motion(windows: Windows) -> tuple[Tensor, Tensor]:
     """Return motion in the frame that the hand has now (context + horizon, window, 12), and up in it (window, 3).
 
     Columns: where the hand is from now, m; how it is turned from now, as the vector part of the rotation's skew
-    symmetric half; velocity, m/s; angular velocity, rad/s. Neither place nor heading of the arm is told: the load on a
+    symmetric half; velocity, m/s; angular velocity, rad/s. Neither place nor heading of the arm is an input: the load on a
     fingertip follows from weight and acceleration as the hand sees them.
     """
     position, quaternions = windows.arm[..., :3], windows.arm[..., 3:POSE]
@@ -75,7 +75,7 @@ def motion(windows: Windows) -> tuple[Tensor, Tensor]:
 
 
 def without_plan(windows: Windows) -> Windows:
-    """Return the windows with every row of the plan replaced by the last row of the past: nothing is told of it."""
+    """Return the windows with every row of the plan replaced by the last row of the past: the model reads nothing of it."""
     now = windows.arm[windows.context - 1 : windows.context]
     return windows._replace(arm=torch.cat([windows.arm[: windows.context], now.expand(windows.horizon, -1, -1)]))
 

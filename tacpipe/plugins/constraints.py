@@ -1,12 +1,13 @@
-"""What a param may be beyond its type: stands in ``Annotated``, is checked where params are built and shown in help.
+"""What a param may be beyond its type: metadata of ``Annotated``, checked where params are built and shown in help.
 
-``rate_hz: Annotated[float, Range(above=0)] = 50.0``, or ``rate_hz: PositiveFloat = 50.0``. A choice is a ``Literal``.
+``pressure: Annotated[float, Unit("count"), Range(0, 4095)] = 40.0``, or ``rate_hz: PositiveFloat = 50.0``. A choice is a
+``Literal``. `StoredAs` names a param that was renamed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from tacpipe.plugins import fields
@@ -104,11 +105,41 @@ class Assignments:
         return f"a {between}-separated list of NAME=VALUE, each value {fields.describe(self.of)}"
 
 
+@dataclass(frozen=True)
+class Unit:
+    """The unit of a number: ``"mm"``, ``"Hz"``, or ``"count"`` for the device's own."""
+
+    name: str
+
+    def allows(self, value: float) -> bool:
+        """Return True: a unit restricts nothing."""
+        return True
+
+    def describe(self, kind: str) -> str:
+        """Return the kind of number with its unit.
+
+        >>> Unit("mm").describe(Range(above=0).describe("a number"))
+        'a number above 0 (mm)'
+        """
+        return f"{kind} ({self.name})"
+
+
+@dataclass(frozen=True)
+class StoredAs:
+    """How a renamed param is written in keys, manifests and models: by the name, and the choices, that it had before.
+
+    A new name in code and on the command line then changes no key, and what was stored before is still read.
+    """
+
+    name: str
+    choices: Mapping[str, str] = field(default_factory=dict)  # today's choice to that which is stored
+
+
 PositiveInt = Annotated[int, Range(1)]
 NonNegativeInt = Annotated[int, Range(0)]
 PositiveFloat = Annotated[float, Range(above=0)]
 NonNegativeFloat = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]  # what numpy, torch and scikit-learn take
-Rate = Annotated[float, Range(above=0, most=1_000_000_000)]  # Hz; stamps are whole nanoseconds
+Rate = Annotated[float, Range(above=0, most=1_000_000_000), Unit("Hz")]  # stamps are whole nanoseconds
 Names = Annotated[str, CommaList()]

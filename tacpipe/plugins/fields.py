@@ -25,7 +25,7 @@ _UNIONS = (typing.Union, types.UnionType)
 
 @runtime_checkable
 class Constraint(Protocol):
-    """What stands in ``Annotated`` beside a type and allows some of its values."""
+    """Metadata of ``Annotated`` that allows some values of a type."""
 
     def allows(self, value: Any) -> bool:
         """Return whether a value of the type is allowed."""
@@ -56,17 +56,21 @@ def bare(wanted: Any) -> Any:
 
 def constraints(wanted: Any) -> list[Constraint]:
     """Return the constraints of an annotation, also of one that None is the only alternative to."""
+    return [one for one in metadata(wanted) if isinstance(one, Constraint)]
+
+
+def metadata(wanted: Any) -> tuple[Any, ...]:
+    """Return what follows the type in ``Annotated``, also where None is the only alternative; empty for other types."""
     kinds = [kind for kind in get_args(wanted) if kind is not types.NoneType] if get_origin(wanted) in _UNIONS else []
     if len(kinds) == 1:
-        return constraints(kinds[0])
-    found = get_args(wanted)[1:] if get_origin(wanted) is Annotated else ()
-    return [one for one in found if isinstance(one, Constraint)]
+        return metadata(kinds[0])
+    return get_args(wanted)[1:] if get_origin(wanted) is Annotated else ()
 
 
 def check(value: Any, wanted: Any, name: str, where: str = "") -> Any:
     """Return ``value`` as the annotation ``wanted`` has it, an int as a float where one is wanted.
 
-    ``name`` and ``where`` say in messages what holds the value. Raises `UsageError` where it is not allowed.
+    ``name`` and ``where`` name in messages what holds the value. Raises `UsageError` where it is not allowed.
     """
     fitted = _fit(value, wanted, f"{where}, {name}" if where else name)
     if fitted is REFUSED:
@@ -113,8 +117,8 @@ def filled(kind: type[Any], values: Mapping[str, Any], where: str, noun: str = "
 
 def unknown(key: Any, known: Mapping[str, Any], where: str, noun: str) -> UsageError:
     """Return the error for a name that is not among those known."""
-    told = plain(key) if isinstance(key, str) else excerpt(key)
-    return UsageError(f"{where}: there is no {noun} {told}; there are {', '.join(known) or 'none'}.")
+    shown_key = plain(key) if isinstance(key, str) else excerpt(key)
+    return UsageError(f"{where}: there is no {noun} {shown_key}; there are {', '.join(known) or 'none'}.")
 
 
 def parsed(text: str, wanted: Any) -> Any:
@@ -141,10 +145,10 @@ def describe(wanted: Any) -> str:
     ('one of a, b', 'a whole number', 'a list, each item a number')
     """
     if get_origin(wanted) is Annotated:
-        told = describe(get_args(wanted)[0])
+        text = describe(get_args(wanted)[0])
         for constraint in constraints(wanted):
-            told = constraint.describe(told)
-        return told
+            text = constraint.describe(text)
+        return text
     if get_origin(wanted) is Literal:
         return "one of " + ", ".join(map(str, get_args(wanted)))
     if get_origin(wanted) in _UNIONS:

@@ -3,7 +3,8 @@
 A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
 same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
 one by default; a field that the chosen class does not have is refused, and is not part of a key. A method ``check`` may
-refuse values that do not go together; stored params are read back without it.
+refuse values that do not go together; stored params are read back without it. ``PRESETS`` holds named sets of values,
+``PANELS`` the names of the fields that each panel of the help shows.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular, yaml_text
 from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins.constraints import StoredAs
 from tacpipe.plugins.fields import filled as filled
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.printable import excerpt, listed
@@ -80,8 +82,11 @@ def build(
 
 def kinds(stage: AnyStage) -> tuple[Kind, ...]:
     """Return the dataclasses that a stage's params may be, the default one first."""
-    found = stage.params
-    return get_args(found) if get_origin(found) in (typing.Union, types.UnionType) else (found,)
+    return _members(stage.params)
+
+
+def _members(union: Any) -> tuple[Kind, ...]:
+    return get_args(union) if get_origin(union) in (typing.Union, types.UnionType) else (union,)
 
 
 def tag(stage: AnyStage) -> str | None:
@@ -89,14 +94,24 @@ def tag(stage: AnyStage) -> str | None:
     several = kinds(stage)
     if len(several) == 1:
         return None
-    name = dataclasses.fields(several[0])[0].name
-    choices = [get_args(fields_of.hints(kind).get(name)) for kind in several]
+    name = _tag_name(several)
+    choices = [_choices(kind, name) for kind in several]
     if not all(choices) or len({choice for some in choices for choice in some}) < sum(map(len, choices)):
         raise TacpipeError(
             f"The params of {stage.function.__name__} are of {len(several)} kinds, and their first field, {name}, does "
             f"not distinguish them: it must be a Literal in each, with choices that no other has."
         )
     return name
+
+
+def _tag_name(several: Sequence[Kind]) -> str:
+    return dataclasses.fields(several[0])[0].name
+
+
+def _choices(kind: Kind, name: str) -> tuple[Any, ...]:
+    """Return the choices of the tag ``name`` that a kind has; empty where its field is not a Literal."""
+    wanted = fields_of.bare(fields_of.hints(kind).get(name))
+    return get_args(wanted) if get_origin(wanted) is Literal else ()
 
 
 def fields(stage: AnyStage) -> dict[str, Any]:
@@ -110,7 +125,7 @@ def having(stage: AnyStage, field: str) -> list[str]:
     owners = [kind for kind in several if field in fields_of.hints(kind)]
     if name is None or len(owners) == len(several):
         return []
-    return [str(choice) for kind in owners for choice in get_args(fields_of.hints(kind)[name])]
+    return [str(choice) for kind in owners for choice in _choices(kind, name)]
 
 
 def defaults(stage: AnyStage, field: str) -> list[Any]:
@@ -125,6 +140,17 @@ def presets(stage: AnyStage) -> list[str]:
     return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
 
 
+def panels(stage: Stage) -> dict[str, str]:
+    """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses declare; no panel for others."""
+    found: dict[str, str] = {}
+    for kind in kinds(stage):
+        for owner in kind.__mro__:
+            declared: Mapping[str, Sequence[str]] = vars(owner).get("PANELS", {})
+            for panel, names in declared.items():
+                found |= {name: panel for name in names if name not in found}
+    return found
+
+
 def added(default: Any) -> Any:
     """Return a field that was added to params later: in keys only where it is not its default.
 
@@ -134,13 +160,21 @@ def added(default: Any) -> Any:
 
 
 def to_json(params: Any) -> dict[str, Any]:
-    """Return the params as they stand in keys and manifests; those `added` only where they are not the default."""
+    """Return the params as keys, manifests and models hold them: `StoredAs` names, `added` ones only if not the default."""
     silent = {
         field.name
         for field in dataclasses.fields(params)
         if field.metadata.get("added") and getattr(params, field.name) == field.default
     }
     values = {name: value for name, value in dataclasses.asdict(params).items() if name not in silent}
+    return _stored(
+        type(params), {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+    )
+
+
+def to_input(params: Any) -> dict[str, Any]:
+    """Return the params by the names and choices that options, ``params.yaml`` and ``--set`` have."""
+    values = dataclasses.asdict(params)
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
@@ -151,24 +185,112 @@ def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
     Raises `TacpipeError` where a stage that works recording by recording has no such field: its result would be
     stored under a name that is not its own.
     """
-    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), kinds(stage)[0])
+    kind, current = _current(kinds(stage), values)
+    kind = kind or kinds(stage)[0]
     known = fields_of.hints(kind)
-    gone = sorted(set(values) - set(fields(stage)))
+    gone = sorted(set(current) - set(fields(stage)))
     if gone and stage.mapped:
         raise TacpipeError(
-            f"What is stored was made by another version of {stage.function.__name__}, with the param {gone[0]}, which "
+            f"What is stored was computed by another version of {stage.function.__name__}, with the param {gone[0]}, which "
             f"this version does not have. Run the stage again, or use that version."
         )
-    return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in values.items() if k in known})
+    return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in current.items() if k in known})
 
 
 def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of stored params that the chosen kind has; older versions stored those of all kinds.
+    """Return those of stored params that the chosen kind has, by today's names; older versions stored those of all kinds.
 
     All of them are returned where the tag names no kind, as of a plug-in that is not installed.
     """
-    kind = next((one for one in kinds(stage) if _holds(one, tag(stage), values)), None)
-    return {name: value for name, value in values.items() if kind is None or name in fields_of.hints(kind)}
+    kind, current = _current(kinds(stage), values)
+    return {name: value for name, value in current.items() if kind is None or name in fields_of.hints(kind)}
+
+
+def named(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return stored params by today's names and choices; as they are where the ``stage`` is not installed."""
+    from tacpipe.plugins import registry
+
+    try:
+        found = kinds(registry.load(stage))
+    except TacpipeError:
+        return dict(values)
+    return _current(found, values)[1]
+
+
+def read(union: Any, values: Mapping[str, Any], where: str) -> Any:
+    """Return the params, of a dataclass or of one of a ``union``, that a model's configuration holds.
+
+    It may be of an older version: fields that are missing have their default, those that are gone are left out, and types
+    alone are checked, for ranges and choices may have been others. Raises `TacpipeError`, which begins with ``where``,
+    for a value of another type and where the tag names none of the union.
+    """
+    several = _members(union)
+    kind, current = _current(several, values)
+    if kind is None:
+        name = _tag_name(several)
+        choices = [str(choice) for one in several for choice in _choices(one, name)]
+        found = excerpt(values.get(_stored_name(several[0], name)))
+        raise TacpipeError(f"{where}: {name} is {found}; it must be one of {', '.join(choices)}.")
+    known = fields_of.hints(kind)
+    fitted = {name: _of_type(value, known[name], name, where) for name, value in current.items() if name in known}
+    return kind(**fitted)
+
+
+def _of_type(value: Any, wanted: Any, name: str, where: str) -> Any:
+    """Return ``value`` as the type of an annotation, whatever its constraints; raises `TacpipeError` for another type."""
+    kind = fields_of.bare(wanted)
+    if get_origin(kind) is Literal:
+        kind = typing.Union[tuple({type(choice) for choice in get_args(kind)})]  # noqa: UP007
+    optional = wanted if fields_of.fits(None, wanted) else kind
+    try:
+        return fields_of.check(value, kind if value is not None else optional, name, where)
+    except UsageError as error:  # of a file, not of a command
+        raise TacpipeError(str(error)) from None
+
+
+# ---- names as they are stored
+
+
+def _stored_as(kind: Kind, name: str) -> StoredAs:
+    marks = [mark for mark in fields_of.metadata(fields_of.hints(kind)[name]) if isinstance(mark, StoredAs)]
+    return marks[0] if marks else StoredAs(name)
+
+
+def _stored_name(kind: Kind, name: str) -> str:
+    return _stored_as(kind, name).name
+
+
+def _stored(kind: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return params of ``kind`` by the names and choices that are stored."""
+    found = {}
+    for name, value in values.items():
+        mark = _stored_as(kind, name)
+        found[mark.name] = mark.choices.get(value, value) if isinstance(value, str) else value
+    return found
+
+
+def _current(several: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind | None, dict[str, Any]]:
+    """Return the kind that stored params are of, and these by today's names and choices; None where there is no such kind.
+
+    A name that the kind does not have is that of another kind, or stays as it is.
+    """
+    name = _tag_name(several) if len(several) > 1 else None
+    chosen = next((one for one in several if name is None or _tagged(one, name, values)), None)
+    order = [one for one in (chosen, *several) if one is not None]
+    found = {}
+    for stored, value in values.items():
+        marks = [(field, _stored_as(kind, field)) for kind in order for field in fields_of.hints(kind)]
+        field, mark = next((one for one in marks if one[1].name == stored), (stored, StoredAs(stored)))
+        choices = {old: new for new, old in mark.choices.items()}
+        found[field] = choices.get(value, value) if isinstance(value, str) else value
+    return chosen, found
+
+
+def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:
+    """Return whether stored params name a choice of the tag ``name`` that ``kind`` has."""
+    mark = _stored_as(kind, name)
+    stored = values.get(mark.name)
+    return stored in [mark.choices.get(choice, choice) for choice in _choices(kind, name)]
 
 
 def comments(stage: AnyStage) -> dict[str, str]:
@@ -221,12 +343,12 @@ def _named(stage: AnyStage, given: Sequence[_Given]) -> Kind:
     for one in given:
         if one.key == name:
             value = fields_of.check(one.value, fields(stage)[name], one.name, one.place)
-            found = next(kind for kind in kinds(stage) if value in get_args(fields_of.hints(kind)[name]))
+            found = next(kind for kind in kinds(stage) if value in _choices(kind, str(name)))
     return found
 
 
 def _holds(kind: Kind, name: str | None, values: Mapping[str, Any]) -> bool:
-    return name is None or values.get(name) in get_args(fields_of.hints(kind)[name])
+    return name is None or values.get(name) in _choices(kind, name)
 
 
 def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
@@ -239,8 +361,8 @@ def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, An
     if given.key in known:
         wanted = known[given.key]
         if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
-            told = f"with {name} {current} it must be {fields_of.describe(wanted)}"
-            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {told}.")
+            rule = f"with {name} {current} it must be {fields_of.describe(wanted)}"
+            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {rule}.")
         return fields_of.check(given.value, wanted, given.name, given.place)
     owners = having(stage, given.key)
     raise UsageError(
@@ -265,8 +387,8 @@ def _fields(several: tuple[Kind, ...]) -> Mapping[str, Any]:
 
 def _joined(several: Sequence[Any]) -> Any:
     """Return one annotation that allows what any of several does."""
-    if all(get_origin(one) is Literal for one in several):
-        return Literal[tuple(dict.fromkeys(choice for one in several for choice in get_args(one)))]
+    if all(get_origin(fields_of.bare(one)) is Literal for one in several):
+        return Literal[tuple(dict.fromkeys(choice for one in several for choice in get_args(fields_of.bare(one))))]
     return several[0] if len(several) == 1 else typing.Union[tuple(several)]  # noqa: UP007
 
 
@@ -284,7 +406,7 @@ def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_G
         have = f"it has {', '.join(presets(stage))}" if presets(stage) else "it has none"
         raise UsageError(f"There is no preset {preset} for {name}; {have}.")
     if preset not in there:
-        choices = _or(list(map(str, get_args(fields_of.hints(kind).get(tag(stage) or "")))))
+        choices = _or(list(map(str, _choices(kind, tag(stage) or ""))))
         have = f"it has {', '.join(there)}" if there else "it has none"
         raise UsageError(f"There is no preset {preset} for the {tag(stage)} {choices} of {name}; {have}.")
     return [_Given(f"preset {preset} of {name}", key, value) for key, value in there[preset].items()]

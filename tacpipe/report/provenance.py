@@ -8,6 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets.origin import PUBLISHED
+from tacpipe.plugins import params as params_of
 from tacpipe.report import markup
 
 if TYPE_CHECKING:
@@ -31,12 +32,17 @@ def published(result: Dataset, sets: Collection[str]) -> bool:
     return bool(named) and all(one and set(one.split(",")) <= set(sets) for one in named)
 
 
+def _params(step: Tree) -> dict[str, Any]:
+    """Return the params of a step of a chain by today's names."""
+    return params_of.named(str(step.get("stage")), step.get("params") or {})
+
+
 def section(manifest: Tree) -> str:
     """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
     steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
     rows = []
     for step in steps:
-        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in (step.get("params") or {}).items())
+        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in _params(step).items())
         fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
         rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
     table = markup.table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows)

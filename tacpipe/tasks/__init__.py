@@ -1,1 +1,1 @@
-"""One question a file: how its model is trained and judged."""
+"""One question a file: how its model is trained and evaluated."""

@@ -63,9 +63,9 @@ def _command(step: Mapping[str, Any]) -> str:
     """Return the command of a link of a chain, with the params that are not the default."""
     from tacpipe.plugins import params, registry
 
-    usual = params.to_json(params.from_json(registry.load(step["stage"]), {}))
+    usual = params.to_input(params.from_json(registry.load(step["stage"]), {}))
     words = [step["stage"].replace(".", " ")]
-    for name, value in step["params"].items():
+    for name, value in params.named(step["stage"], step["params"]).items():
         if usual.get(name) != value:
             option = name.replace("_", "-")
             words.append(f"--{'' if value else 'no-'}{option}" if isinstance(value, bool) else f"--{option} {value}")

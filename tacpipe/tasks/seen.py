@@ -1,4 +1,4 @@
-"""What a model has seen, so that it is never judged on it as if it had not."""
+"""The recordings that a model was trained on, which its evaluation reports apart."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 def seen(now: Mapping[str, str], before: Mapping[str, str]) -> dict[str, str]:
     """Return the digests of all recordings that a model was trained on, by name.
 
-    ``now`` are those of this training, ``before`` those of the model that it began with: these say so in their names.
+    ``now`` are those of this training, ``before`` those of the model that it began with: their names are marked.
 
     >>> seen({"a": "1"}, {"a": "1", "b": "2"})
     {'b of the model before': '2', 'a': '1'}

@@ -23,7 +23,7 @@ from tacpipe.io.progress import bar
 from tacpipe.models.tensors import under
 from tacpipe.training import checkpoint
 
-RISE = 0.3  # share of all epochs over which the learning rate of a cycle rises
+RISE = 0.3  # fraction of all epochs over which the learning rate of a cycle rises
 Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
 Line = dict[str, Any]  # of the history: what became of an epoch, as JSON holds it
 
@@ -180,7 +180,7 @@ def train(
 ) -> Trained:
     """Return the best weights of the model that ``build`` makes, trained to lower the loss of ``work``.
 
-    ``weight_decay`` is Adam's: this share of each weight is added to its gradient. Weights that need no gradient stay.
+    ``weight_decay`` is Adam's: this fraction of each weight is added to its gradient. Weights that need no gradient stay.
     Goes on from the checkpoint in ``workspace`` if there is one. Leaves torch's own generator as it was.
     Raises `TacpipeError` where the loss is no longer finite.
     """

@@ -39,7 +39,7 @@ def training(of: str = "levels", frames: int = 1) -> TrainingRows:
 
 def fit(folder: Path, of: str = "levels", frames: int = 1, hidden: str = "16,8", search: int = 0) -> Autoencoder:
     tried = autoencoder_fit.networks(frames, hidden, search)
-    return autoencoder_fit.fit(training(of, frames), tried, SCHEDULE, folder, components=4, of=of)
+    return autoencoder_fit.fit(training(of, frames), tried, SCHEDULE, folder, components=4, representation=of)
 
 
 def in_torch(layers: tuple[tuple[np.ndarray, np.ndarray], ...]) -> nn.Sequential:
@@ -107,7 +107,7 @@ def test_rows_that_are_not_finite_have_no_latents_and_long_ones_are_done_in_piec
 
 
 def test_of_increments_a_row_that_does_not_move_has_latents_0_and_comes_back_as_0(tmp_path: Path) -> None:
-    fitted = fit(tmp_path, of="increments")
+    fitted = fit(tmp_path, "increments")
     latents = fitted.encode(np.full((5, 12), 700.0), CHANNELS)
     assert np.array_equal(latents, np.zeros((5, 4)))
     assert np.array_equal(fitted.decode(latents), np.zeros((5, 12)))

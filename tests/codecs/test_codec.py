@@ -11,7 +11,7 @@ WALKS = np.cumsum(np.random.default_rng(2).normal(size=(4, 30, 6)), axis=1) * 20
 def latents_and_codec(of: str) -> tuple[np.ndarray, codec.Codec]:
     levels = np.concatenate(WALKS)
     rows = np.concatenate(np.diff(WALKS, axis=1)) if of == "increments" else levels
-    fitted = pca.fit(rows, CHANNELS, [], components=6, of=of)
+    fitted = pca.fit(rows, CHANNELS, [], components=6, representation=of)
     return np.stack([fitted.encode(walk, CHANNELS) for walk in WALKS]), fitted
 
 
@@ -29,7 +29,7 @@ def test_latents_of_levels_are_counts_whatever_the_last_frame_was() -> None:
 
 def test_channels_themselves_are_levels_and_stay() -> None:
     raw = codec.Raw(tuple(CHANNELS), ())
-    assert raw.of == "levels"
+    assert raw.representation == "levels"
     assert np.array_equal(raw.encode(WALKS[0], CHANNELS, np.ones(30, dtype=bool)), WALKS[0].astype(np.float32))
     assert np.array_equal(codec.decode_ahead(raw, WALKS, WALKS[:, 0]), WALKS)
 

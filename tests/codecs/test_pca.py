@@ -69,7 +69,7 @@ def test_components_of_increments_are_the_right_singular_vectors_of_increments_w
     steps = values() + 50
     scale = steps.std(axis=0)
     oracle = np.linalg.svd(steps / scale, full_matrices=False)[2][:3]
-    fitted = fit(steps, components=3, of="increments")
+    fitted = fit(steps, components=3, representation="increments")
     signs = np.sign((fitted.components * oracle).sum(axis=1))
     assert np.allclose(fitted.components, oracle * signs[:, None])
     assert np.array_equal(fitted.mean_count, np.zeros(6))
@@ -78,7 +78,7 @@ def test_components_of_increments_are_the_right_singular_vectors_of_increments_w
 def test_a_codec_of_increments_encodes_what_a_row_adds_and_decodes_to_that() -> None:
     walk = np.cumsum(values(rows=40), axis=0)
     steps = np.diff(walk, axis=0)
-    fitted = fit(steps, components=6, of="increments")
+    fitted = fit(steps, components=6, representation="increments")
     latents = fitted.encode(walk, CHANNELS)
     assert np.array_equal(latents[0], np.zeros(6))
     assert np.allclose(fitted.decode(latents)[1:], steps, atol=1e-2)
@@ -91,7 +91,7 @@ def test_rows_that_are_not_finite_have_no_latents() -> None:
     content[4, 1], content[9, 0] = np.nan, np.inf
     levels = fit(values(), components=3).encode(content, CHANNELS)
     assert np.flatnonzero(np.isnan(levels).all(axis=1)).tolist() == [4, 9]
-    increments = fit(values(), components=3, of="increments").encode(content, CHANNELS)
+    increments = fit(values(), components=3, representation="increments").encode(content, CHANNELS)
     assert np.flatnonzero(np.isnan(increments).all(axis=1)).tolist() == [4, 5, 9, 10]
     assert np.isfinite(np.delete(increments, [4, 5, 9, 10], axis=0)).all()
 

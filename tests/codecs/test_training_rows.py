@@ -10,8 +10,8 @@ from tacpipe.codecs.training_rows import TrainingRows
 from tests.stages.learning_fakes import CHANNELS, FakeShard, motion, table
 
 
-def read(*shards: FakeShard, of: str = "levels", frames: int = 1) -> TrainingRows:
-    return training_rows.read({shard.name: shard for shard in shards}, of, frames)  # type: ignore[misc]
+def read(*shards: FakeShard, representation: str = "levels", frames: int = 1) -> TrainingRows:
+    return training_rows.read({shard.name: shard for shard in shards}, representation, frames)  # type: ignore[misc]
 
 
 def counts(rows: int = 20, seed: int = 0) -> np.ndarray:
@@ -34,7 +34,7 @@ def test_a_frame_before_contact_counts_and_one_in_a_gap_leaves_out_what_is_made_
     contact, gap = np.zeros(20), np.zeros(20, dtype=bool)
     contact[:4], gap[12] = -1, True
     shard = FakeShard("a", table(values, contact=contact, gap=gap))
-    steps = read(shard, of="increments").inputs["a"]
+    steps = read(shard, representation="increments").inputs["a"]
     kept = [row for row in range(4, 20) if row not in (12, 13)]
     assert np.allclose(steps, np.diff(values, axis=0, prepend=values[:1])[kept])
     pairs = read(shard, frames=3).inputs["a"]

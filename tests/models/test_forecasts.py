@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import ChangeForecast
-from tacpipe.models.forecasts import ARCHITECTURES, build
+from tacpipe.models.forecasts import ARCHITECTURES, RecurrentForecast, build
 from tacpipe.models.taxelwise import grid
 from tacpipe.models.windows import ARM, POSE, Windows
 from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
@@ -18,22 +18,28 @@ from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
 CHANGE = [name for name in ARCHITECTURES if name != "recurrent"]
 
 
-def params(architecture: str, **changed: Any) -> dict[str, Any]:
-    sizes = {"hidden": 12, "dropout": 0.2, "loss": "absolute", "context": CONTEXT, "horizon": HORIZON}
-    return {"architecture": architecture, **sizes, **changed}
+SIZES: dict[str, Any] = {"hidden": 12, "dropout": 0.2, "loss": "absolute", "context": CONTEXT, "horizon": HORIZON}
+
+
+def built(architecture: str, *, changes: bool = False, **changed: Any) -> Any:
+    """A model of random weights."""
+    sizes = {**SIZES, **changed}
+    if architecture == "recurrent":
+        return RecurrentForecast(len(LAYOUT), sizes["hidden"])
+    return build(architecture, len(LAYOUT), LAYOUT, changes=changes, **sizes)
 
 
 def model(architecture: str, *, changes: bool = False, trained: bool = False, **changed: Any) -> nn.Module:
     """A calibrated model in evaluation mode; one that was ``trained`` no longer has a head of zeros."""
     torch.manual_seed(0)
-    asked = params(architecture, **changed)
-    made = build(asked, len(LAYOUT), LAYOUT, changes=changes)
-    given = windows(context=asked["context"], horizon=asked["horizon"])
-    made.calibrate(given, ahead(given))  # type: ignore[operator]
+    made = built(architecture, changes=changes, **changed)
+    given = windows()
+    made.calibrate(given, ahead(given))
     if trained:
         for weight in made.parameters():
             nn.init.normal_(weight, std=0.3)
-    return made.eval()
+    evaluated: nn.Module = made.eval()
+    return evaluated
 
 
 def change(made: nn.Module, given: Windows) -> Tensor:
@@ -107,21 +113,20 @@ def test_channels_that_never_move_do_not_divide_by_zero(architecture: str) -> No
     touch[..., 3] = 7.0
     arm = given.arm[:1].expand(CONTEXT + HORIZON, -1, -1)
     still = given._replace(touch=touch, arm=arm, finger=torch.zeros_like(given.finger))
-    made = build(params(architecture), len(LAYOUT), LAYOUT, changes=False)
+    made = built(architecture)
     for target in (ahead(still), still.touch[-1].expand(HORIZON, -1, -1)):
-        made.calibrate(still, target)  # type: ignore[operator]
+        made.calibrate(still, target)
         assert all(value.isfinite().all() for value in made.state_dict().values())
         assert made(still).isfinite().all()
-        assert made.loss(still, target).isfinite()  # type: ignore[operator]
+        assert made.loss(still, target).isfinite()
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize(("count", "context", "horizon"), [(1, 1, 1), (1, 5, 4), (3, 1, 2), (2, 2, 1)])
 def test_the_smallest_windows_and_batches_work(architecture: str, count: int, context: int, horizon: int) -> None:
     given = windows(count, context=context, horizon=horizon)
-    sizes = params(architecture, context=context, horizon=horizon)
-    made = build(sizes, len(LAYOUT), LAYOUT, changes=False)
-    made.calibrate(given, ahead(given))  # type: ignore[operator]
+    made = built(architecture, context=context, horizon=horizon)
+    made.calibrate(given, ahead(given))
     found = made(given)
     assert found.shape == (horizon, count, len(LAYOUT))
     assert found.isfinite().all()
@@ -147,7 +152,7 @@ def test_scales_of_the_recurrent_model_map_the_training_range_to_one() -> None:
 
 @pytest.mark.parametrize(("features", "hidden"), [(20, 200), (12, 16), (96, 8)])
 def test_the_recurrent_model_has_as_many_parameters_as_its_equations(features: int, hidden: int) -> None:
-    made = build(params("recurrent", hidden=hidden), features, (), changes=False)
+    made = RecurrentForecast(features, hidden)
     inputs = features + POSE
     lstm = 4 * hidden * (inputs + hidden) + 2 * 4 * hidden
     assert sum(weight.numel() for weight in made.parameters()) == 2 * lstm + features * hidden + features
@@ -168,20 +173,14 @@ def test_neither_place_nor_heading_of_the_arm_changes_a_forecast(architecture: s
 
 
 @pytest.mark.parametrize(
-    ("changed", "features", "layout", "told"),
-    [
-        (
-            {"architecture": "transformer"},
-            12,
-            LAYOUT,
-            "There is no architecture 'transformer'; there are taxelwise, gru",
-        ),
-        ({"architecture": "taxelwise"}, 6, (), "the recordings hold latents. Train it on segments without a codec"),
-    ],
+    ("architecture", "features", "layout", "named"),
+    [("transformer", 12, LAYOUT, "'transformer'; there are taxelwise, gru"), ("taxelwise", 6, (), "latents")],
 )
-def test_what_cannot_be_built_is_said(changed: dict[str, Any], features: int, layout: Any, told: str) -> None:
-    with pytest.raises(TacpipeError, match=told):
-        build({**params("gru"), **changed}, features, layout, changes=False)
+def test_an_architecture_that_is_unknown_or_cannot_read_the_channels_is_refused(
+    architecture: str, features: int, layout: Any, named: str
+) -> None:
+    with pytest.raises(TacpipeError, match=named):
+        build(architecture, features, layout, **SIZES)
 
 
 def test_every_loss_is_known_to_every_change_model() -> None:

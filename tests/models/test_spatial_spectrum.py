@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.spatial_spectrum import BANDS, Bands, Felt
+from tacpipe.models.spatial_spectrum import BANDS, Bands, Sampling
 
-FINGER, FOREARM = Felt(400, 100.0, 0.025), Felt(75, 50.0, 0.05)
+FINGER, FOREARM = Sampling(400, 100.0, 0.025), Sampling(75, 50.0, 0.05)
 COMMON = Bands.common([FINGER, FOREARM])
 
 
-def slides(felt: Felt, surface: dict[float, float], channels: int = 6, count: int = 4, seed: int = 0) -> np.ndarray:
+def slides(felt: Sampling, surface: dict[float, float], channels: int = 6, count: int = 4, seed: int = 0) -> np.ndarray:
     """Slides (slide, time, channel) over waves of given periods a metre and amplitudes in counts, on 1,000 counts."""
     rng = np.random.default_rng(seed)
     at_m = np.arange(felt.frames)[:, None] / felt.rate_hz * felt.speed_m_s
@@ -24,7 +24,7 @@ def slides(felt: Felt, surface: dict[float, float], channels: int = 6, count: in
     return found
 
 
-def read(felt: Felt, given: np.ndarray, bands: Bands = COMMON) -> np.ndarray:
+def read(felt: Sampling, given: np.ndarray, bands: Bands = COMMON) -> np.ndarray:
     return bands.log_power(given, felt.rate_hz, felt.speed_m_s)
 
 
@@ -45,7 +45,7 @@ def test_bands_are_those_that_every_sensor_can_tell() -> None:
 def test_a_wave_of_the_surface_is_in_its_band_at_any_speed_and_rate(
     per_m: float, speed_m_s: float, rate_hz: float
 ) -> None:
-    felt = Felt(int(0.08 / speed_m_s * rate_hz) + 1, rate_hz, speed_m_s)
+    felt = Sampling(int(0.08 / speed_m_s * rate_hz) + 1, rate_hz, speed_m_s)
     found = read(felt, slides(felt, {per_m: 100.0}))[:, :-1]
     if felt.highest_per_m > 300:
         nearest = np.abs(np.log(centres()[found.argmax(axis=1)] / per_m))
@@ -111,4 +111,4 @@ def test_slides_that_cannot_be_read_are_refused() -> None:
     with pytest.raises(TacpipeError, match="not finite"):
         read(FINGER, np.full((2, 400, 3), np.nan))
     with pytest.raises(TacpipeError, match=r"goes 0\.075 m and shows waves of more than 40 periods a metre"):
-        Bands.common([FINGER, FOREARM, Felt(400, 10.0, 0.1)])
+        Bands.common([FINGER, FOREARM, Sampling(400, 10.0, 0.1)])

@@ -8,20 +8,22 @@ from scipy.stats import multivariate_normal
 from sklearn.covariance import LedoitWolf
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.transfer import STEADY, Gaussians, Told, Transfer
+from tacpipe.models.transfer import STEADY, Gaussians, Labelled, Transfer
 
 WIDE, CLASSES = 5, 10
 MEANS = 2 * np.random.default_rng(0).normal(size=(CLASSES, WIDE))
 
 
-def told(classes: object, each: int, gain: float = 1.0, offset: float = 0.0, noise: float = 0.3, seed: int = 1) -> Told:
+def told(
+    classes: object, each: int, gain: float = 1.0, offset: float = 0.0, noise: float = 0.3, seed: int = 1
+) -> Labelled:
     """Slides of some classes, as a sensor with this gain and offset in every feature feels them."""
     labels = np.repeat(np.array(classes), each)
     rng = np.random.default_rng(seed)
-    return Told(offset + gain * MEANS[labels] + noise * rng.normal(size=(len(labels), WIDE)), labels)
+    return Labelled(offset + gain * MEANS[labels] + noise * rng.normal(size=(len(labels), WIDE)), labels)
 
 
-def named(of: Transfer, gaussians: Gaussians, slides: Told) -> float:
+def named(of: Transfer, gaussians: Gaussians, slides: Labelled) -> float:
     """The share of slides named rightly."""
     return float((of.classes[gaussians.scores(slides.features).argmax(axis=1)] == slides.labels).mean())
 
@@ -47,10 +49,10 @@ def test_sensors_that_have_nothing_in_common_expect_nothing_of_one_another() -> 
     right = []
     for seed in range(20):
         shuffled = np.random.default_rng(seed).permutation(strange)
-        own = Told(shuffled[np.repeat(np.arange(6), 8)], np.repeat(np.arange(6), 8))
+        own = Labelled(shuffled[np.repeat(np.arange(6), 8)], np.repeat(np.arange(6), 8))
         rng = np.random.default_rng([seed, 1])
-        found = Transfer.fit(Told(own.features + 0.1 * rng.normal(size=own.features.shape), own.labels), [other])
-        right.append(named(found, found.expected, Told(shuffled[6:], np.arange(6, CLASSES))))
+        found = Transfer.fit(Labelled(own.features + 0.1 * rng.normal(size=own.features.shape), own.labels), [other])
+        right.append(named(found, found.expected, Labelled(shuffled[6:], np.arange(6, CLASSES))))
     assert np.mean(right) < 0.2  # chance is 0.1
 
 
@@ -74,7 +76,7 @@ def test_a_few_slides_correct_what_is_expected_by_the_rule_of_bayes() -> None:
 
 def test_many_slides_of_its_own_outweigh_what_others_expect() -> None:
     wrong = told(range(CLASSES), 8, seed=2)
-    wrong = Told(np.random.default_rng(3).permutation(wrong.features), wrong.labels)
+    wrong = Labelled(np.random.default_rng(3).permutation(wrong.features), wrong.labels)
     own = told(range(CLASSES), 500)
     found = Transfer.fit(own, [wrong])
     means = np.stack([own.features[own.labels == one].mean(axis=0) for one in range(CLASSES)])
@@ -96,7 +98,7 @@ def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
 def test_the_more_exact_of_two_sensors_counts_more() -> None:
     exact, vague = told(range(CLASSES), 20, noise=0.01, seed=2), told(range(CLASSES), 20, seed=3)
     rng = np.random.default_rng(4)
-    vague = Told(vague.features + rng.normal(size=(CLASSES, WIDE))[vague.labels], vague.labels)
+    vague = Labelled(vague.features + rng.normal(size=(CLASSES, WIDE))[vague.labels], vague.labels)
     own = told(range(6), 20, noise=0.01)
     errors = {
         name: np.abs(Transfer.fit(own, others).known.mean[6:] - MEANS[6:]).mean()
@@ -134,13 +136,13 @@ def test_tensors_hold_everything() -> None:
 
 
 def test_slides_that_teach_nothing_are_refused() -> None:
-    with pytest.raises(TacpipeError, match="told 2 classes in common; 3 at least"):
+    with pytest.raises(TacpipeError, match=" 2 classes in common; 3 "):
         Transfer.fit(told(range(4), 4), [told(range(2, 8), 4)])
     with pytest.raises(TacpipeError, match="8 slides of 1 classes do not show"):
         Transfer.fit(told([3], 8))
     with pytest.raises(TacpipeError, match="4 slides of 4 classes do not show"):
         Transfer.fit(told(range(4), 1))
     with pytest.raises(TacpipeError, match=r"must be \(slide, 5\) and \(slide,\)"):
-        Transfer.fit(told(range(4), 4), [Told(np.zeros((4, 3)), np.arange(4))])
+        Transfer.fit(told(range(4), 4), [Labelled(np.zeros((4, 3)), np.arange(4))])
     with pytest.raises(TacpipeError, match="not finite"):
-        Transfer.fit(Told(np.full((8, WIDE), np.nan), np.arange(8) % 4))
+        Transfer.fit(Labelled(np.full((8, WIDE), np.nan), np.arange(8) % 4))

@@ -157,10 +157,10 @@ def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_w
 def _spread_over_draws(network: Any, made: Any) -> float:
     from tacpipe.tasks.touch import grasps as grasps_of
     from tacpipe.tasks.touch import members
-    from tacpipe.tasks.touch.learning import told
+    from tacpipe.tasks.touch.losses import output
 
     some = grasps_of.read(made)
     (member,) = network.members
     drawn = members.sources(member.params, some)
-    visits = [told(member.network, drawn.fixed(range(len(some)), visit)).detach().numpy() for visit in range(8)]
-    return float(np.std(visits, axis=0).mean() / np.std(member.scale.apply(some.felt["pdc_th"])))
+    visits = [output(member.network, drawn.fixed(range(len(some)), visit)).detach().numpy() for visit in range(8)]
+    return float(np.std(visits, axis=0).mean() / np.std(member.scale.apply(some.readings["pdc_th"])))

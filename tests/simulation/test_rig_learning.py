@@ -22,7 +22,7 @@ from tacpipe.simulation import taxels, trajectory
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, told
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, predicted
 from tests.asked import fitting
 from tests.stages.conftest import FakeShard as Recording
 from tests.stages.learning_fakes import FakeShard, dataset
@@ -101,7 +101,7 @@ def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     starts = track.starts(forecaster.context, forecaster.horizon)
     chosen = starts if everywhere else starts[aloft(shard, starts)]
-    parts = list(told(forecaster, track, chosen))
+    parts = list(predicted(forecaster, track, chosen))
     return {
         name: np.concatenate(
             [np.square(some.predictions[name].count - some.truth.count).mean(axis=2) for some in parts]
@@ -198,7 +198,7 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     """The pull of the object over the pressure of the fingers, in counts, and the truth's friction in the same unit."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     ahead = np.full_like(track.tactile, np.nan)
-    for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+    for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
         ahead[some.now] = some.predictions[MODEL].count[:, -1]
     felt = pull_over_pressure(track.tactile)
     pull = np.hypot(column(shard, "gt_force_x_n"), column(shard, "gt_force_z_n"))
@@ -264,7 +264,7 @@ def altered(shard: FakeShard, change: dict[str, Floats]) -> FakeShard:
 def said(forecaster: Forecaster, shard: FakeShard) -> tuple[NDArray[np.int64], Floats]:
     """The rows at which predictions are made, and these (window, step, channel)."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
-    parts = list(told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
+    parts = list(predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
     counts = np.concatenate([some.predictions[MODEL].count for some in parts])
     return np.concatenate([some.now for some in parts]), counts
 
@@ -304,7 +304,7 @@ def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
     for index in range(9, 14):
         shard = loaded(index)
         track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
-        for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             for name, found in squared.items():
                 found.append(np.square(some.predictions[name].count - some.truth.count)[..., own].mean(axis=2))
     model, baseline = (np.concatenate(squared[name]).mean(axis=0) / noise for name in (MODEL, BASELINE))  # (step,)

@@ -110,7 +110,7 @@ def test_rows_that_are_not_finite_get_latents_that_are_not() -> None:
 
 
 def test_increments_do_not_reach_across_a_gap_in_time() -> None:
-    files = fitted(*RECORDINGS, of="increments")
+    files = fitted(*RECORDINGS, representation="increments")
     whole = RECORDINGS[0].content
     cut = FakeShard("cut", whole.take([*range(20), *range(30, 80)]))
     latents = compressed(cut, files)["z00"].to_numpy()
@@ -121,7 +121,7 @@ def test_increments_do_not_reach_across_a_gap_in_time() -> None:
 
 
 def test_codec_json_says_what_latents_stand_for_and_what_is_lost() -> None:
-    told = json.loads(fitted(*RECORDINGS, of="increments")["codec.json"])
+    told = json.loads(fitted(*RECORDINGS, representation="increments")["codec.json"])
     assert (told["kind"], told["of"], told["latents"], len(told["explained_ratio"])) == ("pca", "increments", 3, 12)
     assert told["reconstruction"]["val"].keys() == {"rows", "mse_standardised", "mae_counts"}
     assert np.shape(told["latent_covariance"]) == (3, 3)
@@ -151,9 +151,9 @@ def test_a_rig_with_other_channels_is_refused_by_an_autoencoder_too(tmp_path: Pa
         AUTOENCODER(AUTOENCODER.params(), FakeShard("small", table(np.zeros((9, 6)))), files)
 
 
-@pytest.mark.parametrize("how", [{"of": "speed"}, {"of": ""}])
+@pytest.mark.parametrize("how", [{"representation": "speed"}, {"representation": ""}])
 def test_another_kind_of_value_is_refused_before_anything_is_fitted(tmp_path: Path, how: dict[str, str]) -> None:
-    with pytest.raises(TacpipeError, match=r"^of is .*; a codec is fitted on levels or increments"):
+    with pytest.raises(TacpipeError, match=r"^representation is .*levels.*increments"):
         fitted(*RECORDINGS, **how)
-    with pytest.raises(TacpipeError, match=r"^of is .*; a codec is fitted on levels or increments"):
+    with pytest.raises(TacpipeError, match=r"^representation is .*levels.*increments"):
         learned(tmp_path, *RECORDINGS, **how)

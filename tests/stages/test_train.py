@@ -48,7 +48,7 @@ def test_the_default_model_follows_what_the_dataset_holds(tmp_path: Path) -> Non
     for kind, given in (
         ("raw", dataset(*shards)),
         ("levels", compressed(*shards)),
-        ("increments", compressed(*shards, of="increments")),
+        ("increments", compressed(*shards, representation="increments")),
     ):
         config = json.loads(STAGE(params, given, given, tmp_path / kind).files["config.json"])
         assert config["params"]["architecture"] == config["architecture"]

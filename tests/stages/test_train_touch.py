@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
+from tacpipe.plugins.params import to_json
 from tests.asked import asked
 from tests.conftest import Lab
 from tests.tasks.touch.handmade import dataset, recordings
@@ -24,11 +24,11 @@ TREES = "--architecture trees --trees 5 --leaf 2"
 
 
 def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
-    params = asked("train.touch", trees=6, leaf=2, setting="blocked")
+    params = asked("train.touch", trees=6, leaf=2, run_label="blocked")
     files = STAGE(params, recordings(), dataset(), tmp_path).files
     assert set(files) == {"config.json", "model.safetensors", "baselines.safetensors"}
     config = json.loads(files["config.json"])
-    assert config["params"] == dataclasses.asdict(params)
+    assert config["params"] == to_json(params)
     assert (config["task"], config["architecture"], config["split"]) == ("touch", "strong", "blocked")
 
 
@@ -53,7 +53,7 @@ def test_presets_name_params_that_exist_and_train(preset: str, architecture: str
 def test_the_papers_preset_is_what_the_letter_says() -> None:
     params = asked("train.touch", "paper")
     assert (params.points, params.batch, params.epochs, params.learning_rate) == (750, 10, 250, 0.01)
-    assert (params.normalisation, params.head, params.loss, params.together) == ("minmax", "fc3", "rmse", False)
+    assert (params.normalisation, params.head, params.loss, params.multi_target) == ("minmax", "fc3", "rmse", False)
     assert (params.cycle, params.weight_decay, params.patience, params.select) == (False, 0, 0, "last")
 
 
@@ -83,7 +83,7 @@ def test_a_model_from_the_store_tells_the_touch_of_a_grasp_and_refuses_what_is_n
 def _refuses(lab: Lab) -> None:
     """Params off end with code 2 and a sentence, grasps off with code 1, and neither leaves a model."""
     for words, code, sentence in (
-        ("--architecture tree", 2, "architecture is 'tree'; it must be one of strong"),
+        ("--architecture tree", 2, "architecture is 'tree'; it must be one of tree-ensemble"),
         ("--targets thumb", 2, "targets is 'thumb'"),
         ("--leaf -1", 2, "leaf is -1"),
         ("--select best --architecture patches", 1, "No recording has the role val"),

@@ -12,7 +12,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
-from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.model import ForwardModel
 from tests.conftest import Lab
 
 
@@ -60,7 +60,7 @@ def test_a_predictor_of_touch_predicts_from_python_what_the_command_writes_to_th
 
 
 def test_the_steps_from_python_are_those_of_the_command() -> None:
-    steps = inspect.signature(Forecaster.predict).parameters["steps"].default
+    steps = inspect.signature(ForwardModel.predict).parameters["steps"].default
     assert ",".join(map(str, steps)) == registry.load("predict").params().steps
 
 

@@ -68,16 +68,16 @@ def aligned(run: Run) -> list[float]:
 
 def few_slides(methods: Sequence[Method]) -> str:
     """Return accuracy over the number of training slides, a figure a sensor; empty where all have as many."""
-    chosen = [one for one in methods if one.differs_only("few", "reduce")]
+    chosen = [one for one in methods if one.differs_only("few", "subsample_sensor")]
     drawn = []
     for sensor in tables.sensors_of(chosen):
         points: dict[str, _Points] = {}
         for method in chosen:
-            fewer = {method.settings["reduce"], method.settings["few_of"]} - {""}
+            fewer = {method.settings["subsample_sensor"], method.settings["few_of"]} - {""}
             if fewer <= {sensor}:
                 _add(points, method.line, method, sensor)
             if fewer == {sensor}:  # such a line ends where all sensors have all slides
-                loose = ("few", "few_of", "reduce", "ratio")
+                loose = ("few", "few_of", "subsample_sensor", "subsample_percent")
                 for one in chosen:
                     if one.plain and one.key_without(*loose) == method.key_without(*loose):
                         _add(points, method.line, one, sensor)

@@ -9,15 +9,15 @@ from typing import Any
 from tacpipe.report.material.methods import Method, Run, Tree, base_name, ordered, shown
 from tacpipe.report.naming import distinct_names
 
-# In these, runs of one method may differ; setting and quantities are given as split and vibration.
-_NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "setting", "quantities")
+# In these, runs of one method may differ; run_label and quantities are shown as split and vibration.
+_NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "run_label", "quantities")
 _CLOSED = {  # all that has an effect on what is fitted in closed form
     "minirocket": ("features", "use_validation", "labels"),
     "spectra": ("speeds", "use_validation", "labels", "hold_out"),
 }
 _RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
-_PAIRS = ("alignment_weight", "align_from", "agreement")  # of no effect where sensors learn alone
-_USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be stated
+_PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # of no effect where sensors learn alone
+_USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be said
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
@@ -47,27 +47,27 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
 def _settings(run: Run) -> dict[str, Any]:
     """Return all that makes a method but the number of its slides; what is of no effect is left out."""
     config, params, architecture = run.config, run.params, run.architecture
-    known = str(params.get("known", ""))
+    frozen = str(params.get("frozen_sensor", ""))
     joint = bool(config.get("joint", architecture == "raec" and params.get("joint", False)))
     closed = _CLOSED.get(architecture)
-    ratio = 100 if closed else int(params.get("ratio", 100))
+    ratio = 100 if closed else int(params.get("subsample_percent", 100))
     idle = {
         *_NO_METHOD,
         "features",
         "use_validation",
         "speeds",
-        *((_RAECS + _PAIRS) if architecture == "x-lstm" else () if joint or known else _PAIRS),
+        *((_RAECS + _PAIRS) if architecture == "x-lstm" else () if joint or frozen else _PAIRS),
     }
     split, layout = _place(run)
     return {
         **{name: value for name, value in params.items() if (name in closed if closed else name not in idle)},
         "architecture": architecture,
         "joint": joint,
-        "known": bool(known),  # each run reports on the sensor that was mapped, so both are one method
-        "pairing": str(params.get("pairing", "random")) if joint or known else "random",
+        "frozen_sensor": bool(frozen),  # each run tells of the sensor that was mapped, so both are one method
+        "pairing": str(params.get("pairing", "random")) if joint or frozen else "random",
         "labels": str(params.get("labels", "true")),
-        "reduce": str(params.get("reduce", "")) if ratio < 100 else "",
-        "ratio": ratio if params.get("reduce") else 100,
+        "subsample_sensor": str(params.get("subsample_sensor", "")) if ratio < 100 else "",
+        "subsample_percent": ratio if params.get("subsample_sensor") else 100,
         "hold_out": "" if architecture == "minirocket" else str(params.get("hold_out", "")),
         "vibration": "vibration" in config.get("quantities", str(params.get("quantities", "")).split(",")),
         "layout": layout,

@@ -24,7 +24,7 @@ _ARCHITECTURES = {"minirocket": "MiniRocket", "x-lstm": "X-LSTM", "raec": "RAEC"
 _PLAIN = {
     "pairing": ("random", "fixed"),
     "labels": ("true",),
-    "reduce": ("",),
+    "subsample_sensor": ("",),
     "hold_out": ("",),
     "few": ("",),
     "elsewhere": (False,),
@@ -74,9 +74,11 @@ class Run:
         if self.architecture == "minirocket" and params.get("use_validation") and params.get("labels") != "permuted":
             watched = self.config["counts"].get("val", {})
             return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
-        ratio = int(params.get("ratio", 100))
+        ratio = int(params.get("subsample_percent", 100))
         return {
-            sensor: kept(count, int(params.get("batch", 32)), ratio) if sensor == params.get("reduce") else count
+            sensor: kept(count, int(params.get("batch", 32)), ratio)
+            if sensor == params.get("subsample_sensor")
+            else count
             for sensor, count in self.trained.items()
         }
 
@@ -108,9 +110,9 @@ class Method:
     @property
     def line(self) -> str:
         """Its name but for the number of slides: what a curve over that is called."""
-        parts = [base_name({**self.settings, "few": "", "reduce": ""})]
+        parts = [base_name({**self.settings, "few": "", "subsample_sensor": ""})]
         parts += [mark for mark in self.marks if not mark.endswith("shuffle")]
-        if self.settings["joint"] and (self.settings["few_of"] or self.settings["reduce"]):
+        if self.settings["joint"] and (self.settings["few_of"] or self.settings["subsample_sensor"]):
             parts.append("other sensor whole")
         if not self.settings.get("shuffle", True):
             parts.append("fixed batches")
@@ -188,7 +190,7 @@ def base_name(settings: Tree, variants: bool = True) -> str:
     """Return the name that a method has before it is derived from others like it."""
     architecture = str(settings["architecture"])
     name = _ARCHITECTURES.get(architecture, architecture)
-    if settings["known"]:
+    if settings["frozen_sensor"]:
         name = "mapping to known space"
     elif settings["joint"]:
         name += " joint"
@@ -203,8 +205,8 @@ def base_name(settings: Tree, variants: bool = True) -> str:
         parts.append("permuted pairs")
     if settings["labels"] == "permuted":
         parts.append("permuted labels")
-    if settings["reduce"]:
-        parts.append(f"{shown(settings['reduce'])} {settings['ratio']} %")
+    if settings["subsample_sensor"]:
+        parts.append(f"{shown(settings['subsample_sensor'])} {settings['subsample_percent']} %")
     if settings["hold_out"]:
         for one in str(settings["hold_out"]).split(";"):
             sensor, _, materials = one.strip().partition("=")

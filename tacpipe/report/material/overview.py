@@ -87,7 +87,7 @@ def _pooled(methods: Sequence[Method]) -> str:
         if any(LEVEL in run.predictions.predicted for run in runs)
         else "",
         "Mapping to a known space is reported for the sensor that was mapped to the other's."
-        if any(one.settings["known"] for one in methods)
+        if any(one.settings["frozen_sensor"] for one in methods)
         else "",
         printed.BASIS if published else "",
     ]

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -82,9 +85,9 @@ def _counted(table: pa.Table, config: Mapping[str, Any]) -> NDArray[np.bool_]:
     """Return which rows count (slide,)."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = table["material"].to_numpy()
-    params = config.get("params", {})
+    params = params_of.counting(registry.load("train.material"), config.get("params", {}))
     counted: NDArray[np.bool_] = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
-    counted &= sensors != str(params.get("known", ""))
+    counted &= sensors != str(params.get("frozen_sensor", ""))
     for sensor, held in config.get("held_out", {}).items():
         counted &= ~((sensors == sensor) & np.isin(materials, held))
     if params.get("drop_last"):

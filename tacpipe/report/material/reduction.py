@@ -22,10 +22,10 @@ def tables(methods: Sequence[Method]) -> str:
     A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
     """
-    chosen = [one for one in methods if one.differs_only("reduce", "few")]
+    chosen = [one for one in methods if one.differs_only("subsample_sensor", "few")]
     if not all(one.published for one in chosen):
         return ""
-    described = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("reduce", "few_of")}
+    described = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("subsample_sensor", "few_of")}
     return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in described)
 
 
@@ -35,7 +35,11 @@ def _table(methods: Sequence[Method], reduced: str) -> str:
     rows = []
     for ratio in printed.RATIOS:
         slides = kept(whole, BATCH, ratio)
-        same = [one for one in methods if (one.settings["reduce"], one.settings["ratio"]) == (reduced, ratio)]
+        same = [
+            one
+            for one in methods
+            if (one.settings["subsample_sensor"], one.settings["subsample_percent"]) == (reduced, ratio)
+        ]
         fewer = [one for one in methods if one.settings["few"] and _as_many(one, slides, reduced)]
         row = [f"{ratio} %", str(slides)]
         for (kind, sensor), paper in zip(columns, printed.REDUCED[reduced][ratio], strict=True):

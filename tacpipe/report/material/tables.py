@@ -80,7 +80,7 @@ def elsewhere(methods: Sequence[Method]) -> str:
 def swaps(methods: Sequence[Method]) -> str:
     """Return Table II: accuracy before and after classifiers are exchanged; empty where none were."""
     held = [one for one in methods if any(SWAPPED in run.predictions.predicted for run in one.runs)]
-    held = [one for one in held if (one.plain or comparison.control(one)) and not one.settings["known"]]
+    held = [one for one in held if (one.plain or comparison.control(one)) and not one.settings["frozen_sensor"]]
     sensors = sensors_of(held)
     rows = []
     for method in held:

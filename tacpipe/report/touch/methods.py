@@ -23,9 +23,9 @@ Tree = Mapping[str, Any]
 
 PAPERS_SETS = ("vision2tactile",)  # whose paper's tables and figures stand next to ours
 PAPERS = "pointnet"  # the architecture of the paper
-DEFAULT = "strong"  # the one that is trained where none is named
+DEFAULT = "tree-ensemble"  # the one that is trained where none is named
 NAMES = {PAPERS: "PointNet"}
-_NO_METHOD = ("seed", "setting", "baselines")  # runs of one method may differ in these; the setting is given as split
+_NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class Run:
     @property
     def architecture(self) -> str:
         """The kind of model."""
-        return str(self.config.get("architecture", self.params.get("architecture", "")))
+        stored = self.config.get("architecture", self.config.get("params", {}).get("architecture", ""))
+        return str(params_of.named("train.touch", {"architecture": stored})["architecture"])
 
     @property
     def split(self) -> str:
@@ -198,8 +199,8 @@ def _settings(run: Run) -> dict[str, Any]:
         params["colour"] = str(params.pop("inputs", "")).startswith("rgb")
     if not str(params.get("inputs", "")).endswith("pose") and params.get("normalisation") != "wrist":
         params.pop("wrist", None)  # nothing reads it
-    if not params.get("together", True):  # trees are one model of all targets
-        params.pop("targets", None)  # one network a target: others next to it change nothing
+    if not params.get("multi_target", True):  # trees are one model of all targets
+        params.pop("targets", None)  # one network a target: others beside it change nothing
     return {**params, "architecture": run.architecture, "split": run.split, "simulated": run.simulated}
 
 

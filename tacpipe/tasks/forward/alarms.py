@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tacpipe.signals import anticipation, holds
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Told
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Predicted
 from tacpipe.tasks.forward.tracks import Track
 
 Floats = NDArray[np.floating[Any]]
@@ -22,7 +22,7 @@ WATCHED = (MODEL, BASELINE, "damped_trend", "last_value_linear", "ridge", "ridge
 
 @dataclass
 class Loads:
-    """The mean count of each sensor's axes on all rows, and what was stated of it at the last step of the horizon."""
+    """The mean count of each sensor's axes on all rows, and its predictions at the last step of the horizon."""
 
     layout: Layout
     horizon: int
@@ -32,7 +32,7 @@ class Loads:
     steps_s: list[float] = field(default_factory=list)
 
     def begin(self, track: Track) -> None:
-        """Add the rows of a recording, of which nothing has been stated yet."""
+        """Add the rows of a recording, without predictions yet."""
         truth = self._loads(track.tactile)
         offset = max((int(one[-1]) + 1 for one in self.groups if len(one)), default=0)
         self.truth.append(np.where(track.usable[:, None], truth, np.nan))
@@ -42,8 +42,8 @@ class Loads:
         for name in WATCHED:
             self.ahead.setdefault(name, []).append(np.full_like(truth, np.nan))
 
-    def add(self, some: Told) -> None:
-        """Note what was stated of some windows of the recording that was begun last."""
+    def add(self, some: Predicted) -> None:
+        """Add the predictions for some windows of the recording that was begun last."""
         for name, prediction in some.predictions.items():
             if name in WATCHED:
                 self.ahead[name][-1][some.now] = self._loads(prediction.count[:, -1])
@@ -60,12 +60,12 @@ class Loads:
             ).tolist()
             for name, ahead in self._said()
         }
-        # JSON holds no infinity: a level that is never reached states the same
+        # JSON holds no infinity: null stands in its place
         levels = {name: [value if math.isfinite(value) else None for value in values] for name, values in theta.items()}
         return {"sd": sd.tolist(), "theta": levels}
 
     def scored(self, levels: Mapping[str, Any]) -> dict[str, dict[str, float | int | None]]:
-        """Return how each predictor predicted changes with the ``levels`` that `calibrated` gave."""
+        """Return how well each predictor predicted changes with the ``levels`` that `calibrated` gave."""
         if not levels or not self.truth:
             return {}
         truth, groups, sd = np.concatenate(self.truth), np.concatenate(self.groups), np.array(levels["sd"])

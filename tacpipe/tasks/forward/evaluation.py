@@ -1,4 +1,4 @@
-"""How a forecaster is judged: on every window of recordings, beside all that it has to beat."""
+"""Evaluation of a forecaster: on every window of recordings, next to its baselines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tacpipe.tasks.forward import metrics, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
-from tacpipe.tasks.forward.predictors import told
+from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.training import HISTORY, check_codec
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating[Any]]
 
-TOLD_STEPS = (1, 3, 5, 10)  # whose predictions are stored; 3, 5 and 10 are those of the paper's figures
+STORED_STEPS = (1, 3, 5, 10)  # whose predictions are stored; 3, 5 and 10 are those of the paper's figures
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
-    """Return metrics, tables and predictions of a model, its files given, on ``recordings``, beside its baselines.
+    """Return metrics, tables and predictions of a model, its files given, on ``recordings``, next to its baselines.
 
     Every window without a gap counts, in contact or not. Errors in counts are against the tactile channels themselves,
-    whatever the codec lost. Recordings that the model was trained or stopped on are told by their digests and reported
+    whatever the codec lost. Recordings that the model was trained or stopped on are recognised by their digests and reported
     apart, and so are objects that it was trained on and others. Raises `TacpipeError` where the recordings are not what
     the model reads.
     """
@@ -48,12 +48,12 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         check_rate(track, forecaster)
         trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
         starts = track.starts(forecaster.context, forecaster.horizon)
-        steps = [step for step in TOLD_STEPS if step <= forecaster.horizon]
+        steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
         stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
         if not trial.seen:
             loads.begin(track)
         begins = 0
-        for some in told(forecaster, track, starts):
+        for some in predicted(forecaster, track, starts):
             trial.add(some.predictions, some.truth, forecaster.feature_half)
             ends = begins + len(some.now)
             stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
@@ -104,15 +104,15 @@ def _prediction_table(
 def check_rate(track: Track, forecaster: Forecaster) -> None:
     """Refuse a track whose grid is not the one the model was trained on."""
     trained, rate_hz = forecaster.config["timeline"], float(forecaster.config["rate_hz"])
-    told = f"--rate-hz {rate_hz:g}" if trained == "uniform" else f"--grid {trained}"
+    option = f"--rate-hz {rate_hz:g}" if trained == "uniform" else f"--grid {trained}"
     if track.timeline != trained:
         raise TacpipeError(
             f"{track.name} has a {track.timeline} grid and the model was trained on a {trained} one, so a step is "
-            f"another time. Synchronize it with {told}."
+            f"another time. Synchronize it with {option}."
         )
     found = tracks.rate_hz([track]) if trained == "uniform" else 0.0
     if found and rate_hz and abs(found - rate_hz) > 0.01 * rate_hz:
         raise TacpipeError(
             f"{track.name} has {found:g} rows a second and the model was trained at {rate_hz:g}. "
-            f"Synchronize it with {told}."
+            f"Synchronize it with {option}."
         )

@@ -1,11 +1,11 @@
-"""A trained model with all that it needs to read arrays: codec, scalings, length of its windows, baselines."""
+"""A trained model that reads arrays, with its params, codec, scalings and baselines; `model` adds what reads recordings."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, cast, overload
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -20,23 +20,19 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import ARM, POSE, Windows, motion
+from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.params import Change, Params
 from tacpipe.tasks.forward.rows import acted
-from tacpipe.tasks.opened import Chain, opened
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.tasks.opened import Chain
 
 Floats = NDArray[np.floating[Any]]
 Config = dict[str, Any]
 
 TASK = "forward"
-STEPS = (1, 3, 5, 10)  # ahead, that are predicted unless others are asked for, as by `tacpipe predict`
 FAR = 0.95  # quantile over channels of the levels of a training row, of which the largest is kept
 FARTHEST = 2.0  # times that, beyond which the median level of a window is no level above rest
 NEEDED: dict[str, model_files.Kind] = {
@@ -52,7 +48,7 @@ CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safe
 
 
 class WindowArrays(NamedTuple):
-    """Windows of a recording, as `Forecaster.predict` reads them."""
+    """Windows of a recording, as `Forecaster.predict_windows` reads them."""
 
     window: Floats  # (window, context, column): `window_columns`, `derived_columns`, width of the gripper in m
     plan: Floats  # (window, horizon, column): `plan_columns`, `derived_columns`
@@ -61,10 +57,11 @@ class WindowArrays(NamedTuple):
 
 @dataclass(frozen=True)
 class Forecaster:
-    """Reads windows of touch and arm, and states touch."""
+    """Predicts future tactile signals of windows of past ones, past motion and planned motion."""
 
     model: nn.Module
-    config: Config
+    params: Params
+    config: Config  # as it is stored
     codec: codecs.Codec
     baselines: Baselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
@@ -73,17 +70,17 @@ class Forecaster:
     @property
     def context(self) -> int:
         """How many rows of the past the model reads."""
-        return int(self.config["context"])
+        return self.params.context
 
     @property
     def horizon(self) -> int:
         """How many steps ahead it predicts."""
-        return int(self.config["horizon"])
+        return self.params.horizon
 
     @property
     def actions(self) -> str:
-        """What it is informed of the plan: planned, none or shuffled."""
-        return str(self.config["params"]["actions"])
+        """What it reads of the plan: planned, none or shuffled."""
+        return self.params.actions
 
     @property
     def orientation(self) -> Floats:
@@ -114,14 +111,14 @@ class Forecaster:
         return (*tracks.VELOCITY, *tracks.TURNING)
 
     @property
-    def tells_change(self) -> bool:
-        """Whether it states what is added to the last row, rather than levels."""
+    def predicts_change(self) -> bool:
+        """Whether it predicts what is added to the last row, rather than levels."""
         return bool(self.model.change_only)
 
     @property
     def lossy(self) -> bool:
         """Whether its features are levels that a codec made, so that the last row too comes back as another."""
-        return self.codec.kind != "raw" and self.codec.of != INCREMENTS
+        return self.codec.kind != "raw" and self.codec.representation != INCREMENTS
 
     @property
     def feature_half(self) -> Floats:
@@ -140,7 +137,7 @@ class Forecaster:
         return None if found is None else float(found)
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Forecaster:
+    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
         """Return the forecaster among a model's files. Raises `TacpipeError` where they are of another task.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
@@ -150,27 +147,26 @@ class Forecaster:
         if config["task"] != TASK:
             raise TacpipeError(f"This model was trained for {plain(config['task'])}, not for {TASK}.")
         config = model_files.tree(files, CONFIG, NEEDED)
+        params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))
         codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else stored.load(files)
-        model = model_files.filled(
-            lambda: network(config["params"], codec), model_files.tensors(files[WEIGHTS], WEIGHTS)
-        )
+        model = model_files.filled(lambda: network(params, codec), model_files.tensors(files[WEIGHTS], WEIGHTS))
         with model_files.validated("the model"):
             found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
             codec_files = (
                 {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
             )
             baselines = None if found is None else Baselines.from_tensors(found)
-            made = cls(model.eval(), config, codec, baselines, codec_files, chain)
+            made = cls(model.eval(), params, config, codec, baselines, codec_files, chain)
             made._try()
         return made
 
     def _try(self) -> None:
-        """Foretell a window of nothing, and raise where a part does not fit another."""
+        """Predict a window of zeros, and raise where a part does not fit another."""
         fits = {
-            "the context": self.context == self.config["params"]["context"] > 0,
-            "the horizon": self.horizon == self.config["params"]["horizon"] > 0,
+            "the context": self.context == self.config["context"] > 0,
+            "the horizon": self.horizon == self.config["horizon"] > 0,
             "the scaling": self.feature_half.shape == (len(self.codec.latents),)
             and self.channel_scale.shape == (len(self.codec.channels),),
             "the orientation": self.orientation.shape == (4,) and bool(self.orientation.any()),
@@ -184,76 +180,33 @@ class Forecaster:
         if self.baselines is not None:
             parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
             moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
-            told = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
-            if any(one.shape != (1, self.horizon, touch.shape[2]) for one in told.values()):
+            predicted = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
+            if any(one.shape != (1, self.horizon, touch.shape[2]) for one in predicted.values()):
                 raise ValueError("the baselines predict another number of steps or channels")
 
-    @overload
-    def predict(self, recordings: Dataset | Recording, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
-
-    @overload
-    def predict(self, window: Floats, plan: Floats, /) -> Floats: ...
-
-    def predict(
-        self, given: Dataset | Recording | Floats, plan: Floats | None = None, /, *, steps: Sequence[int] = STEPS
-    ) -> pa.Table | Floats:
-        """Return predicted touch: of a dataset or one of its ``shards`` as a table, of arrays as an array.
-
-        **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes
-        and ``tacpipe.open(OUTPUT).table()`` reads: ``recording``, ``t_ns`` (when it was known) and for each channel and each
-        of ``steps`` the counts above rest that many rows later, as ``xela1_taxel01_z_t5``, float32; a row a window.
-        ``.to_pandas()`` makes a frame of it. Raises `UsageError` where the recordings did not go through the stages that
-        the model was trained behind, `TacpipeError` for a step beyond the horizon.
-
-        **Arrays**, for controllers: ``window`` (context, column) or (window, context, column), newest row last, has
-        `window_columns` or these, `derived_columns` and the width of the gripper; ``plan`` (horizon, column) or (window,
-        horizon, column), the rows to come, has `plan_columns`, or these and `derived_columns`. `windows` makes both of a
-        recording. Velocities that are left out are differences of the poses. Returns counts above rest, float64 (horizon,
-        channel) or (window, horizon, channel).
-
-        Raises `TacpipeError` for other shapes, for values that are not finite, and for raw counts instead of counts above
-        rest: where the median of a window's counts, by absolute value over rows and channels, is more than twice
-        `largest_level`, half of all channels are further from rest than in training hardly any channel ever was. Offsets
-        of a XELA uSkin are at least four times `largest_level` on 52 published trials; true windows reach 0.9 of it if
-        the model was trained on the weakest of these trials alone, and 0.1 if on all. An offset below twice
-        `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
-        """
-        if plan is None:
-            from tacpipe.io.parquet import one_after_another
-            from tacpipe.tasks.forward import prediction  # which reads this module
-
-            recordings = opened(cast("Dataset | Recording", given), self.chain)
-            return one_after_another(prediction.tables(self, recordings, sorted(set(steps))))
-        window = np.asarray(given)
+    def predict_windows(self, window: Floats, plan: Floats) -> Floats:
+        """Return predicted counts above rest of arrays; `model.ForwardModel.predict` describes both."""
+        window = np.asarray(window)
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         predicted = self._of_arrays(touch, arm, finger)
         return predicted[0] if single else predicted
 
-    def windows(self, recording: Recording) -> WindowArrays:
-        """Return all windows of a recording as `predict` reads them: ``window``, ``plan`` and ``t_ns``, when each was known.
-
-        Rows in gaps are in none of them. The recorded motion represents the plan. Raises as `predict`.
-        """
-        from tacpipe.tasks.forward import prediction  # which reads this module
-
-        return prediction.inputs(self, opened(recording.alone, self.chain))
-
     def _of_arrays(self, touch: Floats, arm: Floats, finger: Floats) -> Floats:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
         read = Windows(*(torch.from_numpy(np.ascontiguousarray(one.swapaxes(0, 1))) for one in (latent, arm, finger)))
-        return self.decoded(self.told(read), touch[:, -1], latent[:, -1])
+        return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: Floats) -> None:
-        """Refuse windows (window, context, channel) whose levels are not near rest, as `predict` states."""
+        """Refuse windows (window, context, channel) whose levels are not near rest; see `model.ForwardModel.predict`."""
         largest = self.largest_level
         if largest is None:
             warnings.warn(
                 "This model was trained before levels were kept, so it is not checked that windows hold counts above rest.",
-                stacklevel=3,
+                stacklevel=4,
             )
             return
         found = np.median(np.abs(touch), axis=(1, 2))  # (window,)
@@ -266,7 +219,7 @@ class Forecaster:
             )
 
     @torch.no_grad()
-    def told(self, windows: Windows) -> Floats:
+    def features(self, windows: Windows) -> Floats:
         """Return the features to come (window, horizon, feature), in the codec's unit."""
         predicted: Tensor = self.model(acted(windows, self.actions))
         features: Floats = predicted.transpose(0, 1).numpy()
@@ -276,10 +229,10 @@ class Forecaster:
         """Return counts above rest (window, horizon, channel) of predicted features (window, horizon, feature).
 
         ``last`` (window, channel) and ``last_feature`` (window, feature) are those of the last row read. A model that
-        states change adds the decoded change to the last row, so that it does not pay for what the codec lost of it.
+        predicts change adds the decoded change to the last row, so that it has no error from what the codec lost of it.
         """
         levels = codecs.decode_ahead(self.codec, features, last)
-        if self.tells_change and self.lossy:
+        if self.predicts_change and self.lossy:
             return self.anchored(levels, last, last_feature)
         return levels.astype(np.float64, copy=False)
 
@@ -304,7 +257,7 @@ class Forecaster:
                 at = np.argwhere(~np.isfinite(given))[0]
                 raise TacpipeError(
                     f"The {name} holds {given[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
-                    "all values must be finite. Leave the window out, or fix the recording."
+                    "all values must be finite. Leave the window out, or repair the recording."
                 )
             if not given[..., before + 3 : before + POSE].any(axis=-1).all():
                 raise TacpipeError(f"The {name} holds a quaternion of length 0, which is not an orientation.")
@@ -330,9 +283,21 @@ class Forecaster:
         return tracks.aligned(rows, self.orientation)
 
 
-def network(params: Mapping[str, Any], codec: codecs.Codec) -> nn.Module:
+def network(params: Params, codec: codecs.Codec) -> nn.Module:
     """Return the network that ``params`` ask for, of random weights, for the codec's features."""
-    return forecasts.build(params, len(codec.latents), layout(codec), changes=codec.of == INCREMENTS)
+    if not isinstance(params, Change):
+        return forecasts.RecurrentForecast(len(codec.latents), params.hidden)
+    return forecasts.build(
+        params.architecture,
+        len(codec.latents),
+        layout(codec),
+        hidden=params.hidden,
+        context=params.context,
+        horizon=params.horizon,
+        dropout=params.dropout,
+        loss=params.loss,
+        changes=codec.representation == INCREMENTS,
+    )
 
 
 def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:

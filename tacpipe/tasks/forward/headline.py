@@ -54,8 +54,8 @@ def headline(
     runs: int = 1,
 ) -> Headline | None:
     """Return how a method compares with its baselines on known objects, unseen ones or all; `sums` by seed and recording."""
-    told = {name: one for name, one in baselines.items() if legitimate(name)}
-    return pairing.headline(TASK, method, _measure(steps), model, told, part=PARTS[part], runs=runs)
+    compared = {name: one for name, one in baselines.items() if legitimate(name)}
+    return pairing.headline(TASK, method, _measure(steps), model, compared, part=PARTS[part], runs=runs)
 
 
 def _measure(steps: Sequence[int]) -> Measure:
@@ -74,7 +74,7 @@ def _measure(steps: Sequence[int]) -> Measure:
         mae = found[2 * count : 3 * count] / found[-1] if found[-1] else np.full(count, np.nan)
         return (*map(float, mae), 1 - float(error(found[None])[0]))
 
-    # a column of its own for what ranks: errors by step alone do not say which predictor is best
+    # a column of its own for what ranks: errors by step alone do not rank predictors
     over = " and ".join(filter(None, (", ".join(ahead[:-1]), ahead[-1])))
     return Measure(
         (*(f"MAE {step}" for step in ahead), "vs persistence"),

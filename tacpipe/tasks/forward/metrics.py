@@ -80,7 +80,7 @@ class Trial:
     name: str
     seen: bool  # in training or validation of the model
     object: str | None = None
-    known: bool = True  # whether the model was trained on recordings of the same object, or nobody stated what is held
+    known: bool = True  # whether the model was trained on recordings of the same object, or no label names the object
     windows: int = 0
     errors: dict[str, Errors] = field(default_factory=dict)
 
@@ -177,8 +177,8 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: Floats
         for predictor, errors in one.errors.items():
             for group, squared, absolute, channels in _pooled(errors, groups, channel_scale):
                 steps = len(squared)
-                told = (one.name, one.object, one.known, one.seen, predictor, group)
-                for name, value in zip(columns, told, strict=False):
+                row = (one.name, one.object, one.known, one.seen, predictor, group)
+                for name, value in zip(columns, row, strict=False):
                     columns[name] += [value] * steps
                 columns["step"] += range(1, steps + 1)
                 columns["windows"] += [one.windows] * steps
@@ -212,10 +212,10 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
         if one.windows:
             model, baseline = (float(one.errors[name].count_squared.mean()) for name in (MODEL, BASELINE))
             gain = float(forecast.skill(np.array([model]), np.array([baseline]))[0])
-            told = (model / one.windows, baseline / one.windows, gain)
-            errors = [_rounded(value) if math.isfinite(value) else "" for value in told]
+            values = (model / one.windows, baseline / one.windows, gain)
+            errors = [_rounded(value) if math.isfinite(value) else "" for value in values]
         rows.append(
-            (one.name, one.object or "", *(str(told).lower() for told in (one.known, one.seen)), one.windows, *errors)
+            (one.name, one.object or "", *(str(flag).lower() for flag in (one.known, one.seen)), one.windows, *errors)
         )
     return _csv(
         ("recording", "object", "known", "seen", "windows", "mse_counts_model", "mse_counts_persistence", "skill"), rows
@@ -241,14 +241,14 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
             "mae_counts": _grouped(np.stack([one.count_absolute for one in errors]), windows, groups),
             "mse_standard": _steps(squared / channel_scale**2, windows),
         }
-        for told, kept in (("mse_latent", "latent_squared"), ("mse_feature", "feature_squared")):
+        for name_of, kept in (("mse_latent", "latent_squared"), ("mse_feature", "feature_squared")):
             if getattr(errors[0], kept) is not None:
-                tree[name][told] = _steps(np.stack([getattr(one, kept) for one in errors]), windows)
+                tree[name][name_of] = _steps(np.stack([getattr(one, kept) for one in errors]), windows)
     if held:
         kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
         tree["skill"] = {
-            told: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), seed)
-            for told, kept in kinds.items()
+            name_of: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), seed)
+            for name_of, kept in kinds.items()
         }
     return tree
 
@@ -276,8 +276,8 @@ def _intervals(model: Floats, baseline: Floats, seed: int) -> Tree:
     names = [f"t{step}" for step in range(1, model.shape[1] + 1)] + ["mean"]
     tree: Tree = {}
     for index, name in enumerate(names):
-        told = {part: float(getattr(found, part)[index]) for part in ("mean", "low", "high")}
-        tree[name] = {part: _rounded(value) for part, value in told.items() if math.isfinite(value)}
+        ends = {part: float(getattr(found, part)[index]) for part in ("mean", "low", "high")}
+        tree[name] = {part: _rounded(value) for part, value in ends.items() if math.isfinite(value)}
     return {name: one for name, one in tree.items() if one}
 
 

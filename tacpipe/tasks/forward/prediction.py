@@ -1,4 +1,4 @@
-"""What a forecaster says of recordings, without a word on whether it came true."""
+"""Predictions of a forecaster for recordings, without their evaluation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All that say something of the touch to come: the model, and whatever it has to beat or is bounded by."""
+"""All predictors of future tactile signals: the model, its baselines, and the bound that its codec sets."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ CHUNK = 2048  # windows predicted at once
 
 @dataclass(frozen=True)
 class Prediction:
-    """What one predictor says of some windows: features (window, step, feature), counts (window, step, channel).
+    """The predictions of one predictor for some windows: features (window, step, feature), counts (window, step, channel).
 
-    Features are those of the model's codec; None for one that does not speak of them.
+    Features are those of the model's codec; None for a predictor that has none.
     """
 
     latent: Floats | None
@@ -36,8 +36,8 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Told:
-    """Some windows of a recording: what came, and what each predictor said would come."""
+class Predicted:
+    """Some windows of a recording: the measured signals, and the predictions of each predictor."""
 
     now: NDArray[np.int64]  # (window,), the last row that is read
     features: Floats  # (window, step, feature) of the model
@@ -47,11 +47,11 @@ class Told:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Some windows of a recording, and what the model alone says would come."""
+    """Some windows of a recording, and the predictions of the model alone."""
 
     windows: Windows
     past: NDArray[np.int64]  # (window, context), rows that are read
-    future: NDArray[np.int64]  # (window, step), rows that are told
+    future: NDArray[np.int64]  # (window, step), rows that are predicted
     features: Floats  # (window, step, feature)
     count: Floats  # (window, step, channel)
 
@@ -62,7 +62,7 @@ class Forecast:
 
 
 def forecasts(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Forecast]:
-    """Yield what the model says of the windows of ``track`` that begin at ``starts``, some windows at a time."""
+    """Yield the model's predictions for the windows of ``track`` that begin at ``starts``, some windows at a time."""
     context, horizon = forecaster.context, forecaster.horizon
     track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
     found = rows([track], [starts], context, horizon)
@@ -71,14 +71,14 @@ def forecasts(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -
         past, future = (some[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
         windows = found.pick(torch.from_numpy(some))[0]
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # plans are dealt out alike whenever a control is judged
-            features = forecaster.told(windows)
+            torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
+            features = forecaster.features(windows)
         count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
         yield Forecast(windows, past, future, features, count)
 
 
-def told(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Told]:
-    """Yield what all predictors say of the windows of ``track`` that begin at ``starts``, some windows at a time."""
+def predicted(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Predicted]:
+    """Yield what all predictors predict for the windows of ``track`` that begin at ``starts``, some windows at a time."""
     for some in forecasts(forecaster, track, starts):
         last, last_feature = track.tactile[some.now], track.latent[some.now]
         truth = Prediction(track.latent[some.future], track.tactile[some.future])
@@ -90,18 +90,18 @@ def told(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Ite
             moved = motion(some.windows)[0].transpose(0, 1).numpy()
             for name, counts in forecaster.baselines.predict(past.astype(np.float32), moved).items():
                 predictions[name] = Prediction(None, counts)
-        yield Told(some.now, some.features, truth, predictions)
+        yield Predicted(some.now, some.features, truth, predictions)
 
 
 def _of_model(forecaster: Forecaster, some: Forecast, last: Floats, last_feature: Floats) -> dict[str, Prediction]:
-    """Return the model's prediction, and persistence; ``last`` (window, channel) is what is felt now."""
+    """Return the model's prediction, and persistence; ``last`` (window, channel) is the last row that is read."""
     codec, horizon = forecaster.codec, forecaster.horizon
-    still = np.zeros_like(last_feature) if codec.of == INCREMENTS else last_feature
+    still = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
     found = {
         MODEL: Prediction(some.features, some.count),
         BASELINE: Prediction(_held(still, horizon), _held(last, horizon)),
     }
-    if forecaster.lossy and not forecaster.tells_change:
+    if forecaster.lossy and not forecaster.predicts_change:
         found["model_anchored"] = Prediction(None, forecaster.anchored(some.count, last, last_feature))
     return found
 

@@ -89,9 +89,9 @@ def rows(
 
 
 def acted(windows: Windows, actions: str) -> Windows:
-    """Return the windows with the plan that a model trained on ``actions`` is told.
+    """Return the windows with the plan that a model trained on ``actions`` reads.
 
-    ``shuffled`` deals the plans out among the windows by torch's generator: the negative control.
+    ``shuffled`` permutes the plans among the windows by torch's generator: the negative control.
     """
     if actions == "none":
         return windows_of.without_plan(windows)

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from tacpipe.tasks.forward.evaluation import evaluate
-from tacpipe.tasks.forward.forecaster import TASK, Forecaster
+from tacpipe.tasks.forward.forecaster import TASK
+from tacpipe.tasks.forward.model import ForwardModel
 from tacpipe.tasks.forward.prediction import predict
 from tacpipe.tasks.forward.training import train
 from tacpipe.tasks.opened import Chain
 
 
-def load(files: Mapping[str, bytes], chain: Chain | None = None) -> Forecaster:
-    """Return the forecaster among a model's files, trained behind the stages ``chain``: what `tacpipe.load` gives."""
-    return Forecaster.load(files, chain)
+def load(files: Mapping[str, bytes], chain: Chain | None = None) -> ForwardModel:
+    """Return the model among these files, trained behind the stages ``chain``: what `tacpipe.load` returns."""
+    return ForwardModel.load(files, chain)
 
 
-__all__ = ["TASK", "Forecaster", "evaluate", "load", "predict", "train"]
+__all__ = ["TASK", "ForwardModel", "evaluate", "load", "predict", "train"]

@@ -50,7 +50,7 @@ class Track:
     finger: Floats  # (time,), m; 0 where it is not recorded
     tactile: Floats  # (time, channel)
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
-    object: str | None = None  # what is held, where a label states
+    object: str | None = None  # the grasped object, where a label names it
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> NDArray[np.int64]:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
@@ -179,8 +179,8 @@ def rate_hz(tracks: Sequence[Track]) -> float:
     """
     if len({one.timeline for one in tracks}) > 1:
         found = {one.timeline: one.name for one in tracks}
-        told = ", ".join(f"{name} is {timeline}" for timeline, name in sorted(found.items()))
-        raise TacpipeError(f"The recordings are not of one grid: {told}. Synchronize all with one --grid.")
+        grids = ", ".join(f"{name} is {timeline}" for timeline, name in sorted(found.items()))
+        raise TacpipeError(f"The recordings are not of one grid: {grids}. Synchronize all with one --grid.")
     rates = {one.name: 1e9 / float(np.median(np.diff(one.t_ns))) for one in tracks if len(one.t_ns) > 1}
     if not rates:
         return 0.0

@@ -1,4 +1,4 @@
-"""How a forecaster comes about: from recordings and params to the files of a model."""
+"""Train a forecaster: from recordings and params to the files of a model."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
+from tacpipe.plugins import params as params_of
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
@@ -34,7 +35,8 @@ from tacpipe.tasks.forward.forecaster import (
     layout,
     network,
 )
-from tacpipe.tasks.forward.predictors import told
+from tacpipe.tasks.forward.params import Change, Params
+from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.seen import seen
@@ -51,7 +53,7 @@ LINEAR = 20_000  # windows that the linear baselines are fitted on
 
 
 def train(
-    params: Mapping[str, Any],
+    params: Params,
     training: Dataset,
     validation: Dataset,
     workspace: Path,
@@ -59,7 +61,7 @@ def train(
 ) -> dict[str, bytes]:
     """Return the files of a model trained on ``training`` and stopped by its error on ``validation``.
 
-    ``params`` are those of the stage `train.forward`. Scales and baselines are fitted on the training recordings alone,
+    Scales and baselines are fitted on the training recordings alone,
     or scales taken over from the model ``init`` with its weights. The files name what ``auto`` became.
     Raises `TacpipeError` where recordings lack columns or windows or hold what the architecture cannot read, and where
     ``init`` has another shape or codec.
@@ -80,7 +82,7 @@ def train(
     parts = [[dataclasses.replace(one, arm=tracks.aligned(one.arm, reference)) for one in part] for part in parts]
     device = "cuda" if torch.cuda.is_available() else "cpu"
     known, watched = (
-        _windows(part, params, stride, device) for part, stride in zip(parts, (params["stride"], 1), strict=True)
+        _windows(part, params, stride, device) for part, stride in zip(parts, (params.stride, 1), strict=True)
     )
     _check_channels(codec, parts[0])
 
@@ -92,16 +94,24 @@ def train(
             model.calibrate(*known.pick(known.some(CALIBRATED)))  # type: ignore[operator]
         return model
 
-    schedule = loop.Schedule(**{field.name: params[field.name] for field in dataclasses.fields(loop.Schedule)})
+    schedule = loop.Schedule(
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience,
+        gradient_clip=params.gradient_clip,
+        seed=params.seed,
+        cycle=params.cycle,
+    )
     trained = loop.train(build, loop.Windows(known.part, watched.part, schedule.batch), schedule, workspace)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
         "task": TASK,
-        "architecture": params["architecture"],
-        "params": dict(params),
-        "codec": _told(codec),
-        "context": params["context"],
-        "horizon": params["horizon"],
+        "architecture": params.architecture,
+        "params": params_of.to_json(params),
+        "codec": _described(codec),
+        "context": params.context,
+        "horizon": params.horizon,
         "rate_hz": rate_hz,
         "timeline": parts[0][0].timeline,
         "inputs": {
@@ -120,12 +130,12 @@ def train(
         },
     }
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
-    if params["baselines"]:
+    if params.baselines:
         linear = Baselines.fit(_linear(known), _linear(watched))
         config["baselines"] = linear.chosen
         files[BASELINES] = save_arrays({name: np.ascontiguousarray(one) for name, one in linear.to_tensors().items()})
     files |= {WEIGHTS: save_tensors(trained.weights), CONFIG: _json(config)}
-    if params["baselines"]:
+    if params.baselines:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
     return {**files, CONFIG: _json(config), HISTORY: trained.history_lines}
 
@@ -135,7 +145,7 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for track in part:
         loads.begin(track)
-        for some in told(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+        for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add(some)
     return loads.calibrated()
 
@@ -154,11 +164,11 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
         )
 
 
-def _windows(part: Sequence[Track], params: Mapping[str, Any], stride: int, device: str) -> Rows:
+def _windows(part: Sequence[Track], params: Params, stride: int, device: str) -> Rows:
     """Return the rows of a part and its windows, all or those in contact."""
-    context, horizon, where = params["context"], params["horizon"], params["windows"]
-    starts = [getattr(one, "starts" if where == "all" else "contact_starts")(context, horizon, stride) for one in part]
-    return rows(part, starts, context, horizon, actions=params["actions"], device=device)
+    context, horizon = params.context, params.horizon
+    starts = [(one.starts if params.windows == "all" else one.contact_starts)(context, horizon, stride) for one in part]
+    return rows(part, starts, context, horizon, actions=params.actions, device=device)
 
 
 def _linear(part: Rows) -> tuple[Floats, Floats, Floats]:
@@ -190,13 +200,13 @@ def _scaling(part: Sequence[Track]) -> dict[str, list[float]]:
     }
 
 
-def _told(codec: codecs.Codec) -> dict[str, Any]:
-    """Return what a reader wants to know of a codec, and a short name for it."""
+def _described(codec: codecs.Codec) -> dict[str, Any]:
+    """Return what a model's configuration holds of its codec, and a short name for it."""
     frames, latents = int(getattr(codec, "frames", 1)), len(codec.latents)
     name = {"raw": "raw", "pca": f"PCA-{latents}", "autoencoder": f"AE-C{frames}-{latents}"}.get(codec.kind, codec.kind)
-    if codec.of != "levels":
-        name = f"{name} {codec.of}"
-    return {"kind": codec.kind, "of": codec.of, "frames": frames, "latents": latents, "name": name}
+    if codec.representation != "levels":
+        name = f"{name} {codec.representation}"
+    return {"kind": codec.kind, "of": codec.representation, "frames": frames, "latents": latents, "name": name}
 
 
 def _reference(quaternions: Sequence[Floats]) -> Floats:
@@ -210,39 +220,42 @@ def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str,
     return seen(digests, start.config["trained_on"] if start else {})
 
 
-def _resolved(params: Mapping[str, Any], codec: codecs.Codec, start: Forecaster | None) -> dict[str, Any]:
-    """Return the params with what ``auto`` is for the representation of ``codec``."""
-    found = {**params, "architecture": forecasts.resolved(_asked(params, start), layout(codec))}
-    if "loss" in found:
-        found["loss"] = forecasts.resolved_loss(found["loss"], changes=codec.of == INCREMENTS)
-    return found
+def _resolved(params: Params, codec: codecs.Codec, start: Forecaster | None) -> Params:
+    """Return the params with what ``auto`` is for the representation of ``codec``.
 
-
-def _asked(params: Mapping[str, Any], start: Forecaster | None) -> str:
-    """Return the architecture that is asked for; ``auto`` is that of the model to begin with, if it is one of change."""
-    asked = str(params["architecture"])
-    return str(start.config["architecture"]) if start and start.tells_change and asked == forecasts.AUTO else asked
+    An architecture ``auto`` is that of the model to begin with, if that one predicts change.
+    """
+    if not isinstance(params, Change):
+        return params
+    asked = params.architecture
+    if asked == forecasts.AUTO and start and isinstance(start.params, Change):
+        asked = start.params.architecture
+    return dataclasses.replace(
+        params,
+        architecture=cast("Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolved(asked, layout(codec))),
+        loss=forecasts.resolved_loss(params.loss, changes=codec.representation == INCREMENTS),
+    )
 
 
 def _check_start(
     start: Forecaster,
     init: Mapping[str, bytes],
-    params: Mapping[str, Any],
+    params: Params,
     codec: codecs.Codec,
     recordings: Mapping[str, bytes],
 ) -> None:
     """Raise `TacpipeError` where the model to begin with does not fit what is to be trained."""
     for name in ("architecture", "hidden", "context", "horizon"):
-        found = start.config["params"][name]
-        if found != params[name]:
+        found, wanted = getattr(start.params, name), getattr(params, name)
+        if found != wanted:
             raise TacpipeError(
-                f"The model of --init has {name} {found} and the one to train {params[name]}; they must be equal. "
+                f"The model of --init has {name} {found} and the one to train {wanted}; they must be equal. "
                 f"Give --{name} {found}, or begin without --init."
             )
-    told, wanted = start.config["codec"]["name"], _told(codec)["name"]
-    if told != wanted:
+    read, held = start.config["codec"]["name"], _described(codec)["name"]
+    if read != held:
         raise TacpipeError(
-            f"The model of --init reads {told} and the recordings hold {wanted}, so its weights mean something else. "
+            f"The model of --init reads {read} and the recordings hold {held}, so its weights mean something else. "
             "Give recordings of the same representation, or begin without --init."
         )
     check_codec(init, recordings)

@@ -5,31 +5,30 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import Any, Self, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from tacpipe.datasets import model_files
-from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.level import Level
+from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.models.spatial_spectrum import Bands
-from tacpipe.models.strong import Strong
 from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
+from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.learning import JUDGED, Network
+from tacpipe.tasks.material.losses import CHUNK, Network
+from tacpipe.tasks.material.params import Params
 from tacpipe.tasks.material.slides import Layout, Slides, difference
-from tacpipe.tasks.opened import Chain, opened
+from tacpipe.tasks.opened import Chain
 from tacpipe.training.scaling import Affine
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 TASK = "material"
 CHOSEN = ".chosen"  # ends the name of what a readout was chosen by, which may be NaN
@@ -49,8 +48,8 @@ Materials = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a reader says of slides."""
+class ReaderOutput:
+    """Predictions of a reader for slides."""
 
     scores: Floats  # (slide, class), in the order of the model's classes
     latents: Floats | None  # (slide, latent)
@@ -63,18 +62,18 @@ class NetworkReader:
     network: Network
     scaling: Affine
 
-    def tell(self, frames: Floats) -> Told:
-        """Return what the network says of slides (slide, time, channel) in device counts."""
+    def read(self, frames: Floats) -> ReaderOutput:
+        """Return scores and latents of slides (slide, time, channel) in device counts."""
         scores, latents = [], []
         device = next(self.network.parameters()).device
         self.network.eval()
         with torch.no_grad():
-            for first in range(0, len(frames), JUDGED):
-                scaled = torch.from_numpy(self.scaling.apply(frames[first : first + JUDGED])).to(device)
-                told = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
-                scores.append(told.scores.cpu().numpy())
-                latents.append(told.latents.cpu().numpy())
-        return Told(np.concatenate(scores), np.concatenate(latents))
+            for first in range(0, len(frames), CHUNK):
+                scaled = torch.from_numpy(self.scaling.apply(frames[first : first + CHUNK])).to(device)
+                found = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
+                scores.append(found.scores.cpu().numpy())
+                latents.append(found.latents.cpu().numpy())
+        return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
 
     def scores_of(self, latents: Floats) -> Floats:
         """Return the scores (slide, class) that this sensor's classifier gives to latents, of another sensor maybe."""
@@ -89,17 +88,17 @@ class NetworkReader:
 class RocketReader:
     """Convolutional features and a linear readout of one sensor."""
 
-    strong: Strong
+    strong: MinirocketClassifier
     classes: tuple[int, ...]
 
-    def tell(self, frames: Floats) -> Told:
+    def read(self, frames: Floats) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
-        return Told(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
+        return ReaderOutput(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
 
 
 @dataclass(frozen=True)
 class SpectraReader:
-    """Spectra over spatial frequency of one sensor, and what it and other sensors were told of them."""
+    """Spectra over spatial frequency of one sensor, and the classes that it and other sensors learned."""
 
     bands: Bands
     rate_hz: float
@@ -107,13 +106,13 @@ class SpectraReader:
     transfer: Transfer
     classes: tuple[int, ...]
 
-    def tell(self, frames: Floats) -> Told:
+    def read(self, frames: Floats) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
         found = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
-        return Told(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
+        return ReaderOutput(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
 
     def expected(self, latents: Floats) -> Floats:
-        """Return the scores (slide, class) of spectra by what other sensors alone were told of the classes."""
+        """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
@@ -121,22 +120,23 @@ Reader = NetworkReader | RocketReader | SpectraReader
 
 
 class Classifier:
-    """Readers of one or more sensors that name the material of a slide."""
+    """Readers of one or more sensors that predict the material of a slide; `model` adds what reads recordings."""
 
     def __init__(self, files: Mapping[str, bytes], chain: Chain | None = None) -> None:
         self.chain = chain  # the stages that it was trained behind; None: unknown
         config = model_files.tree(files, CONFIG, NEEDED)
-        self.config: Config = config
+        self.config: Config = config  # as it is stored
+        self.params: Params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         self.architecture: str = config["architecture"]
         self.classes: tuple[int, ...] = tuple(config["classes"])
         self.quantities = tuple(config["quantities"])
-        self.layouts = {name: Layout.from_told(name, told) for name, told in config["sensors"].items()}
+        self.layouts = {name: Layout.from_json(name, layout) for name, layout in config["sensors"].items()}
         self.readers: dict[str, Reader] = self._readers(files[WEIGHTS], WEIGHTS)
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files[BASELINES]) if BASELINES in files else {}
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Classifier:
+    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
         """Return the classifier of a model's files. Raises `TacpipeError` where they are of another task.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
@@ -148,8 +148,8 @@ class Classifier:
             )
         task = model_files.tree(files, CONFIG).get("task")
         if task != TASK:
-            told = plain(str(task))
-            raise TacpipeError(f"This model is of the task {told}, not {TASK}. Give one of `tacpipe train material`.")
+            found = plain(str(task))
+            raise TacpipeError(f"This model is of the task {found}, not {TASK}. Give one of `tacpipe train material`.")
         with model_files.validated("the model"):
             made = cls(files, chain)
             made._try()
@@ -165,45 +165,10 @@ class Classifier:
             noise = np.random.default_rng(0).normal(size=(2, layout.frames, len(layout.channels))).astype(np.float32)
             if self.baselines:
                 self.baselines[MEAN_LEVEL][name].scores(noise)
-            found = [reader[name].tell(noise).scores for reader in (self.readers, self.last) if reader]
-            told = [scores.shape for scores in found if not np.isnan(scores).any()] or [(0, 0)]
-            if any(shape != (len(noise), len(self.classes)) for shape in told):
-                raise ValueError(f"slides of {name} get scores of {told}, not of {len(self.classes)} classes")
-
-    @overload
-    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
-
-    @overload
-    def predict(self, slides: Floats | NDArray[np.float64], /, sensor: str = "") -> Materials: ...
-
-    def predict(
-        self, given: Dataset | Recording | Floats | NDArray[np.float64], /, sensor: str = ""
-    ) -> pa.Table | Materials:
-        """Return the material of slides: of a dataset or one of its ``shards`` as a table, of arrays as an array.
-
-        **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
-        a row a slide with ``recording``, ``sensor``, ``material`` (int32), a ``score_…`` of each class and, of networks, the
-        latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of a dataset are those of the command to the last bit;
-        those of one recording alone may differ in the last digits of a float32, because slides are computed together.
-        Raises `UsageError` where the recordings did not go through the stages that the model was trained behind.
-
-        **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them of a
-        recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64. Raises
-        `TacpipeError` for another shape than the model was trained on, and for values that are not finite.
-        """
-        if isinstance(given, Dataset | Recording):
-            from tacpipe.tasks.material import prediction  # which reads this module
-
-            return prediction.predictions(self, opened(given, self.chain))
-        return self.named(self.scores(given, sensor))
-
-    def frames(self, recording: Recording) -> tuple[Floats, str]:
-        """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.
-
-        The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.
-        """
-        ((sensor, slides),) = self.read(opened(recording, self.chain)).items()
-        return slides.frames[0], sensor
+            found = [reader[name].read(noise).scores for reader in (self.readers, self.last) if reader]
+            shapes = [scores.shape for scores in found if not np.isnan(scores).any()] or [(0, 0)]
+            if any(shape != (len(noise), len(self.classes)) for shape in shapes):
+                raise ValueError(f"slides of {name} get scores of {shapes}, not of {len(self.classes)} classes")
 
     def probabilities(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
@@ -231,7 +196,7 @@ class Classifier:
             raise TacpipeError(f"Slides of {layout.sensor} are (slide, {wanted[0]}, {wanted[1]}), not {frames.shape}.")
         if not np.isfinite(frames).all():
             raise TacpipeError("A slide holds a value that is not finite; it must have a number in every frame.")
-        return self.readers[layout.sensor].tell(frames).scores
+        return self.readers[layout.sensor].read(frames).scores
 
     def layout(self, sensor: str) -> Layout:
         """Return the layout of a sensor's slides. Raises `TacpipeError` where the model does not know the sensor."""
@@ -248,7 +213,7 @@ class Classifier:
         Those of other sensors are left out where the model was trained for named ones, and refused where it was trained
         for all that there were. Raises `TacpipeError` for what `tacpipe.tasks.material.slides.read` refuses.
         """
-        only = tuple(self.layouts) if self.config["params"]["sensors"] else ()
+        only = tuple(self.layouts) if self.params.sensors else ()
         there = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
         only = tuple(name for name in only if name in there) or only
         found = slides_of.read(recordings, only=only, quantities=self.quantities, labelled=labelled)
@@ -280,17 +245,17 @@ class Classifier:
         if self.architecture == ROCKET:
             arrays = model_files.arrays(content, file, but=CHOSEN)
             return {
-                name: RocketReader(Strong.from_tensors(under(f"{name}.", arrays)), self.classes)
+                name: RocketReader(MinirocketClassifier.from_tensors(under(f"{name}.", arrays)), self.classes)
                 for name in self.layouts
             }
         if self.architecture == SPECTRA:
-            arrays, told = model_files.arrays(content, file), self.config["spectra"]
-            bands = Bands(told["way_m"], np.array(told["edges_per_m"]))
+            arrays, stored = model_files.arrays(content, file), self.config["spectra"]
+            bands = Bands(stored["way_m"], np.array(stored["edges_per_m"]))
             return {
                 name: SpectraReader(
                     bands,
                     layout.rate_hz,
-                    told["speed_m_s"][name],
+                    stored["speed_m_s"][name],
                     Transfer.from_tensors(under(f"{name}.", arrays)),
                     self.classes,
                 )
@@ -308,11 +273,11 @@ class Classifier:
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
 
-    def _baselines(self, content: bytes) -> dict[str, dict[str, Level | Strong]]:
+    def _baselines(self, content: bytes) -> dict[str, dict[str, Level | MinirocketClassifier]]:
         """Return the baselines by name and sensor."""
         arrays = model_files.arrays(content, BASELINES, but=CHOSEN)
-        permuted = Strong if self.architecture == ROCKET else Level
-        kinds: dict[str, type[Level] | type[Strong]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: permuted}
+        permuted = MinirocketClassifier if self.architecture == ROCKET else Level
+        kinds: dict[str, type[Level] | type[MinirocketClassifier]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: permuted}
         return {
             kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
             for kind, cls in kinds.items()

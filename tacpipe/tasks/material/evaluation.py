@@ -1,4 +1,4 @@
-"""How a classifier of materials is judged: on every slide, beside all that it has to beat."""
+"""Evaluation of a classifier of materials: on every slide, next to its baselines."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ from tacpipe.tasks.material.classifier import (
     Floats,
     Materials,
     NetworkReader,
+    ReaderOutput,
     SpectraReader,
-    Told,
 )
 from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
+from tacpipe.tasks.material.params import XLSTM, Raec
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.material.training import HISTORY
 
@@ -39,14 +40,14 @@ PREDICTIONS = "predictions"
 
 
 @dataclass
-class Judged:
-    """What was stated of the slides of one sensor."""
+class Evaluated:
+    """The slides of one sensor and the predictions for them."""
 
     slides: Slides
     seen: NDArray[np.bool_]  # (slide,): the model was trained on it
-    told: Told
+    output: ReaderOutput
     predicted: dict[str, Materials]  # predictor -> the material it names (slide,)
-    held: NDArray[np.bool_]  # (slide,): of a material whose label the sensor was not stated
+    held: NDArray[np.bool_]  # (slide,): of a material whose label the sensor did not learn
     zero_shot: tuple[Materials, Materials] | None = None  # another sensor's names: of all materials, of held-out ones
     counted: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
 
@@ -57,31 +58,33 @@ class Judged:
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
-    """Return metrics, confusions and predictions of a model, its files given, on slides, beside its baselines.
+    """Return metrics, confusions and predictions of a model, its files given, on slides, next to its baselines.
 
-    Every slide counts. Slides that the model was trained or chosen on are told by their digests and reported apart, under
-    ``seen``. Raises `TacpipeError` where slides have no label or are not what the model reads.
+    Every slide counts. Slides that the model was trained or chosen on are recognised by their digests and reported
+    apart, under ``seen``. Raises `TacpipeError` where slides have no label or are not what the model reads.
     """
     classifier = Classifier.load(model)
     known = set(classifier.config["trained_on"].values())
-    judged = {
-        sensor: _judged(classifier, slides, known)
+    evaluated = {
+        sensor: _evaluated(classifier, slides, known)
         for sensor, slides in classifier.read(recordings, labelled=True).items()
     }
-    if not judged:
+    if not evaluated:
         raise TacpipeError(
             "There is no slide to evaluate the model on. Give a dataset that `tacpipe segment slides` made."
         )
-    tree = _summary(judged, classifier, seen=False)
-    seen = _summary(judged, classifier, seen=True)
+    tree = _summary(evaluated, classifier, seen=False)
+    seen = _summary(evaluated, classifier, seen=True)
     if any(seen["counts"]["slides"].values()):
         tree["seen"] = seen
-    zero = _zero_shot(judged, classifier)
+    zero = _zero_shot(evaluated, classifier)
     if zero:
         tree["zero_shot"] = zero
-    rows = [(sensor, one, int(at)) for sensor, one in judged.items() for at in np.flatnonzero(one.counted & ~one.seen)]
+    rows = [
+        (sensor, one, int(at)) for sensor, one in evaluated.items() for at in np.flatnonzero(one.counted & ~one.seen)
+    ]
     files = {
-        headline.FILE: headline.write(_headlines(judged, classifier)),
+        headline.FILE: headline.write(_headlines(evaluated, classifier)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
         "confusion.csv": metrics.confusion_csv(
             [sensor for sensor, _, _ in rows],
@@ -91,54 +94,54 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     attributes = {name: shard.attributes for name, shard in recordings.recordings.items()}
-    table = predictions_table(judged, classifier, {name: one.get("session") for name, one in attributes.items()})
+    table = predictions_table(evaluated, classifier, {name: one.get("session") for name, one in attributes.items()})
     return Result({PREDICTIONS: RecordingOutput(table, origin.together(attributes.values()))}, files)
 
 
-def _judged(classifier: Classifier, slides: Slides, known: set[str]) -> Judged:
-    """Return what all predictors say of the slides of one sensor."""
+def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evaluated:
+    """Return the predictions of all predictors for the slides of one sensor."""
     sensor = slides.layout.sensor
     foreign = [index for index, one in enumerate(slides.materials) if int(one) not in classifier.classes]
     if foreign:
         raise TacpipeError(
-            f"{slides.names[foreign[0]]} is of material {slides.materials[foreign[0]]}, which the model was never taught; "
+            f"{slides.names[foreign[0]]} is of material {slides.materials[foreign[0]]}, not one of those the model names; "
             f"it names {len(classifier.classes)} from {classifier.classes[0]} to {classifier.classes[-1]}. Leave it out."
         )
-    told = classifier.readers[sensor].tell(slides.frames)
-    predicted = {MODEL: classifier.named(told.scores)}
+    output = classifier.readers[sensor].read(slides.frames)
+    predicted = {MODEL: classifier.named(output.scores)}
     if sensor in classifier.last:
-        predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].tell(slides.frames).scores)
-    mapped = bool(classifier.config["params"].get("known"))  # all have the known sensor's classifier already
-    if classifier.config.get("joint") and told.latents is not None and not mapped:
-        predicted[SWAPPED] = _exchanged(classifier, sensor, told.latents)
+        predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].read(slides.frames).scores)
+    params = classifier.params
+    mapped = isinstance(params, Raec) and bool(params.frozen_sensor)  # all have the frozen sensor's classifier already
+    if classifier.config.get("joint") and output.latents is not None and not mapped:
+        predicted[SWAPPED] = _exchanged(classifier, sensor, output.latents)
     for name, by_sensor in classifier.baselines.items():
         frames = slides.frames
-        if name != MEAN_LEVEL and told.latents is not None:
-            frames = told.latents[:, None]
+        if name != MEAN_LEVEL and output.latents is not None:
+            frames = output.latents[:, None]
         fitted = by_sensor[sensor]
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
     counted = np.ones(len(slides), bool)
-    if classifier.config["params"].get("drop_last"):
-        batch = classifier.config["params"]["batch"]
-        counted[len(slides) // batch * batch or len(slides) :] = False  # fewer than one batch count all
-    found = Judged(
+    if isinstance(params, Raec | XLSTM) and params.drop_last:
+        counted[len(slides) // params.batch * params.batch or len(slides) :] = False  # fewer than one batch count all
+    found = Evaluated(
         slides,
         np.array([digest in known for digest in slides.digests], bool),
-        told,
+        output,
         predicted,
         np.isin(slides.materials, held_out),
         counted=counted,
     )
-    if held_out and told.latents is not None:
-        found.zero_shot = _by_another(classifier, sensor, told.latents, held_out)
+    if held_out and output.latents is not None:
+        found.zero_shot = _by_another(classifier, sensor, output.latents, held_out)
     return found
 
 
 def _exchanged(classifier: Classifier, sensor: str, latents: Floats) -> Materials:
-    """Return what the classifier of another sensor says of latents, in this sensor's names of materials.
+    """Return the materials that the classifier of another sensor gives latents, in this sensor's names of materials.
 
-    Sensors that were aligned by permuted classes share a space in which one's material stands where another's does; the
+    Sensors that were aligned by permuted classes share a space in which one's material lies where another's does; the
     name is then taken back through that permutation.
     """
     scores = _partner_scores(classifier, sensor, latents)
@@ -162,44 +165,45 @@ def _partner_scores(classifier: Classifier, sensor: str, latents: Floats) -> Flo
 def _by_another(
     classifier: Classifier, sensor: str, latents: Floats, held_out: list[int]
 ) -> tuple[Materials, Materials]:
-    """Return the names by what other sensors were told alone: of all materials, and of those held out alone."""
+    """Return the materials by the classes that other sensors learned: of all materials, and of those held out alone."""
     scores = _partner_scores(classifier, sensor, latents)
     among = np.isin(classifier.classes, held_out)
     return classifier.named(scores), classifier.named(np.where(among, scores, -np.inf))
 
 
-def _summary(judged: Mapping[str, Judged], classifier: Classifier, *, seen: bool) -> Tree:
+def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> Tree:
     """Return the metrics on the slides that the model has seen, or on those it has not."""
-    chosen = {sensor: (one.seen == seen) & one.counted & ~one.held for sensor, one in judged.items()}
-    predictors = sorted({name for one in judged.values() for name in one.predicted})
+    chosen = {sensor: (one.seen == seen) & one.counted & ~one.held for sensor, one in evaluated.items()}
+    predictors = sorted({name for one in evaluated.values() for name in one.predicted})
     right = {
-        name: {sensor: one.right(name, chosen[sensor]) for sensor, one in judged.items() if name in one.predicted}
+        name: {sensor: one.right(name, chosen[sensor]) for sensor, one in evaluated.items() if name in one.predicted}
         for name in predictors
     }
     return metrics.summary(right, len(classifier.classes))
 
 
-def _headlines(judged: Mapping[str, Judged], classifier: Classifier) -> list[headline.Headline]:
+def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> list[headline.Headline]:
     """Return how the model compares with its baselines on the slides of each sensor that it has not seen."""
     found = []
-    for sensor, one in judged.items():
+    for sensor, one in evaluated.items():
         chosen = ~one.seen & one.counted & ~one.held
         names = np.array(one.slides.names)[chosen]
         right = {
             predictor: {
-                (0, str(name)): (int(told), 1) for name, told in zip(names, one.right(predictor, chosen), strict=True)
+                (0, str(name)): (int(correct), 1)
+                for name, correct in zip(names, one.right(predictor, chosen), strict=True)
             }
             for predictor in one.predicted
         }
-        told = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
-        found += [told] if told else []
+        made = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
+        found += [made] if made else []
     return found
 
 
-def _zero_shot(judged: Mapping[str, Judged], classifier: Classifier) -> Tree:
-    """Return how well another sensor's classifier names materials whose labels a sensor was never told."""
+def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Tree:
+    """Return how well another sensor's classifier names materials whose labels a sensor did not learn."""
     every, among, chances = {}, {}, {}
-    for sensor, one in judged.items():
+    for sensor, one in evaluated.items():
         if one.zero_shot is None:
             continue
         chosen = one.held & ~one.seen
@@ -215,26 +219,26 @@ def _zero_shot(judged: Mapping[str, Judged], classifier: Classifier) -> Tree:
 
 
 def predictions_table(
-    judged: Mapping[str, Judged], classifier: Classifier, sessions: Mapping[str, Any] | None = None
+    evaluated: Mapping[str, Evaluated], classifier: Classifier, sessions: Mapping[str, Any] | None = None
 ) -> pa.Table:
     """Return one row a slide: what it is, what each predictor named, and the model's scores and latents.
 
     ``sessions`` maps a slide to its session, where one is recorded.
     """
-    label, count = {"quantity": "label"}, {sensor: len(one.slides) for sensor, one in judged.items()}
+    label, count = {"quantity": "label"}, {sensor: len(one.slides) for sensor, one in evaluated.items()}
     columns: list[tuple[pa.Field, Any]] = [
-        (pa.field("recording", pa.string()), [name for one in judged.values() for name in one.slides.names]),
+        (pa.field("recording", pa.string()), [name for one in evaluated.values() for name in one.slides.names]),
         (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
-        (pa.field("material", pa.int32(), metadata=label), _joined(one.slides.materials for one in judged.values())),
-        (pa.field("seen", pa.bool_()), _joined(one.seen for one in judged.values())),
+        (pa.field("material", pa.int32(), metadata=label), _joined(one.slides.materials for one in evaluated.values())),
+        (pa.field("seen", pa.bool_()), _joined(one.seen for one in evaluated.values())),
     ]
-    told = [(sessions or {}).get(name) for one in judged.values() for name in one.slides.names]
-    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in told]))
-    for name in sorted({name for one in judged.values() for name in one.predicted}):
-        values = [one.predicted.get(name, np.full(len(one.slides), slides_of.UNKNOWN)) for one in judged.values()]
+    named = [(sessions or {}).get(name) for one in evaluated.values() for name in one.slides.names]
+    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in named]))
+    for name in sorted({name for one in evaluated.values() for name in one.predicted}):
+        values = [one.predicted.get(name, np.full(len(one.slides), slides_of.UNKNOWN)) for one in evaluated.values()]
         columns.append((pa.field(name, pa.int32(), metadata={"quantity": "prediction"}), _joined(values)))
-    columns += score_columns(classifier, _joined(one.told.scores for one in judged.values()))
-    latents = [one.told.latents for one in judged.values() if one.told.latents is not None]
+    columns += score_columns(classifier, _joined(one.output.scores for one in evaluated.values()))
+    latents = [one.output.latents for one in evaluated.values() if one.output.latents is not None]
     if latents:
         columns += latent_columns(_joined(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]

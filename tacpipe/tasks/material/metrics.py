@@ -1,4 +1,4 @@
-"""Counts of right names, with intervals: the numbers that a result is told in."""
+"""Counts of right names, with intervals: the numbers of a result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Tree = dict[str, Any]
 def accuracy(correct: Mapping[str, NDArray[np.bool_]]) -> Tree:
     """Return accuracy, right ones, number and 95 % Wilson interval by sensor; a sensor without slides is left out.
 
-    Accuracy is the share of right names: equation (4) of the paper, taken literally, would be a mean squared difference
+    Accuracy is the ratio of right names: equation (4) of the paper, taken literally, would be a mean squared difference
     of labels.
 
     >>> accuracy({"biotac": np.array([True, False])})["accuracy"]
@@ -45,9 +45,9 @@ def chance(counts: Mapping[str, int], classes: int) -> Tree:
 
 
 def summary(right: Mapping[str, Mapping[str, NDArray[np.bool_]]], classes: int) -> Tree:
-    """Return the metrics of predictors: ``right`` tells by predictor and sensor which slides were named rightly (slide,).
+    """Return the metrics of predictors: ``right`` holds by predictor and sensor which slides were named rightly (slide,).
 
-    ``skill`` is the share of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability
+    ``skill`` is the fraction of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability
     of so unequal disagreements if both were as good.
     """
     found: Tree = {name: accuracy(by_sensor) for name, by_sensor in right.items()}

@@ -17,35 +17,39 @@ from tacpipe.errors import TacpipeError
 
 NONE = -1  # stands where a sensor has no slide in a row of a batch, and for the class of a slide without label
 PAIRINGS = ("random", "fixed", "permuted")
-EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # a reduced sensor learns from each so-many-th batch: share in percent to that
+EVERY = {50: 2, 25: 4, 17: 6, 11: 9}  # percentage of the batches for a subsampled sensor: 1 of how many that is
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """How the slides of all sensors are dealt into the batches of each epoch."""
+    """How the slides of all sensors are distributed over the batches of each epoch."""
 
     classes: Mapping[str, Tensor]  # sensor -> class of each slide, from 0; NONE for slides without label
     batch: int
     pairing: str = "random"  # random: other pairs every epoch; fixed: drawn once; permuted: random, of other classes
     shuffle: bool = True  # other batches every epoch; without, pairs are fixed as well
     drop_last: bool = False  # leave out the batch that is not full
-    reduced: str = ""  # sensor that learns from a fraction of the batches alone
-    ratio: int = 100  # that share, in percent
+    subsample_sensor: str = ""  # sensor that learns from a part of the batches alone
+    subsample_percent: int = 100  # of the batches
     partners: Mapping[int, int] | None = None  # class of the first sensor -> class of the others, of permuted pairs
     seed: int = 0  # of what is drawn once
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be dealt."""
+        """Refuse options that do not fit."""
         if self.pairing not in PAIRINGS:
             raise TacpipeError(f"pairing is {self.pairing!r}; it must be {', '.join(PAIRINGS)}.")
-        if self.ratio not in (100, 90, *EVERY):
-            raise TacpipeError(f"ratio is {self.ratio} %; it must be 100, 90, {', '.join(map(str, EVERY))}.")
-        if self.reduced and self.reduced not in self.classes:
-            raise TacpipeError(f"reduce names the sensor {self.reduced}; there are {', '.join(self.classes)}.")
-        if self.reduced and self.shuffle:
+        if self.subsample_percent not in (100, 90, *EVERY):
             raise TacpipeError(
-                "A reduced sensor must see the same slides in every epoch, or it would see all in the end: "
-                "give --no-shuffle next to --reduce."
+                f"subsample_percent is {self.subsample_percent}; it must be 100, 90, {', '.join(map(str, EVERY))}."
+            )
+        if self.subsample_sensor and self.subsample_sensor not in self.classes:
+            raise TacpipeError(
+                f"subsample_sensor is {self.subsample_sensor}; it must be one of {', '.join(self.classes)}."
+            )
+        if self.subsample_sensor and self.shuffle:
+            raise TacpipeError(
+                "A subsampled sensor must see the same slides in every epoch, or it would see all of them over the epochs: "
+                "give --no-shuffle with --subsample-sensor."
             )
 
     def epoch(self) -> list[dict[str, Tensor]]:
@@ -57,16 +61,16 @@ class Pairs:
         rows = self._rows()  # (sensor, row)
         size = self.batch
         batches = [rows[:, first : first + size] for first in range(0, rows.shape[1], size)]
-        if (self.drop_last or self.reduced) and batches and batches[-1].shape[1] < size:
+        if (self.drop_last or self.subsample_sensor) and batches and batches[-1].shape[1] < size:
             batches.pop()
-        dealt = []
+        found = []
         for number, batch in enumerate(batches):
             of = dict(zip(self.classes, batch.clone(), strict=True))
-            if self.reduced and not visited(number, self.ratio):
-                of[self.reduced][:] = NONE
+            if self.subsample_sensor and not visited(number, self.subsample_percent):
+                of[self.subsample_sensor][:] = NONE
             if any((one != NONE).any() for one in of.values()):
-                dealt.append(of)
-        return dealt
+                found.append(of)
+        return found
 
     def _rows(self) -> Tensor:
         """Return the slide of each sensor in every row (sensor, row), in the order of the epoch."""
@@ -96,18 +100,18 @@ class Pairs:
         return torch.cat(blocks, dim=1)
 
 
-def visited(number: int, ratio: int) -> bool:
-    """Return whether a reduced sensor learns from the batch of this number, from 0.
+def visited(number: int, percent: int) -> bool:
+    """Return whether a subsampled sensor learns from the batch of this number, from 0.
 
     The published code takes batches whose number is a multiple of 2, 4, 6 or 9 for 50, 25, 17 and 11 %, and so 288, 160,
     96 and 64 of 576 slides. No such number gives 90 %; here each tenth batch is left out, which gives 512.
 
-    >>> [32 * sum(visited(i, ratio) for i in range(18)) for ratio in (100, 90, 50, 25, 17, 11)]
+    >>> [32 * sum(visited(i, percent) for i in range(18)) for percent in (100, 90, 50, 25, 17, 11)]
     [576, 512, 288, 160, 96, 64]
     """
-    if ratio == 90:
+    if percent == 90:
         return number % 10 != 0
-    return ratio == 100 or number % EVERY[ratio] == 0
+    return percent == 100 or number % EVERY[percent] == 0
 
 
 def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:

@@ -1,4 +1,4 @@
-"""What a classifier says of slides, without a word on whether it is right."""
+"""Predictions of a classifier for slides, without their evaluation."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
     """Return one table, ``predictions``: a row a slide with the material named, all scores, and latents where there are.
 
-    Slides need no label; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where the
-    recordings are not what the model reads.
+    Slides need no label; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError`
+    where the recordings are not what the model reads.
     """
     return Result({PREDICTIONS: RecordingOutput(predictions(Classifier.load(model), recordings))})
 
@@ -29,19 +29,19 @@ def predictions(classifier: Classifier, recordings: Dataset) -> pa.Table:
     """Return the table of `predict`, which raises the same errors."""
     names: list[str] = []
     sensors: list[str] = []
-    told = []
+    outputs = []
     for sensor, slides in classifier.read(recordings).items():
         names += slides.names
         sensors += [sensor] * len(slides)
-        told.append(classifier.readers[sensor].tell(slides.frames))
-    scores = np.concatenate([one.scores for one in told])
+        outputs.append(classifier.readers[sensor].read(slides.frames))
+    scores = np.concatenate([one.scores for one in outputs])
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), names),
         (pa.field("sensor", pa.string()), sensors),
         (pa.field("material", pa.int32(), metadata={"quantity": "prediction"}), classifier.named(scores)),
         *score_columns(classifier, scores),
     ]
-    latents = [one.latents for one in told if one.latents is not None]
+    latents = [one.latents for one in outputs if one.latents is not None]
     if latents:
         columns += latent_columns(np.concatenate(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
@@ -12,117 +11,122 @@ from safetensors.numpy import save
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
 from tacpipe.models.level import Level
-from tacpipe.models.spatial_spectrum import Bands, Felt
-from tacpipe.models.strong import Strong
+from tacpipe.models.minirocket_classifier import MinirocketClassifier
+from tacpipe.models.spatial_spectrum import Bands, Sampling
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins.constraints import Assignments
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, MEAN_LEVEL, PERMUTED_LABELS, WEIGHTS, Config
+from tacpipe.tasks.material.params import Minirocket, Params, Spectra
 from tacpipe.tasks.material.slides import Slides
 
-Params = Mapping[str, Any]
 BySensor = Mapping[str, Slides]
 Arrays = dict[str, np.ndarray]
 
 
-def rockets(config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+def rockets(params: Minirocket, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
     """Return the files of a model of patterns and a readout, of each sensor alone."""
-    params = config["params"]
     tensors: Arrays = {}
     baselines: Arrays = {}
     for place, (name, some) in enumerate(known.items()):
         frames, materials = _labelled(params, some, watched.get(name), place)
-        settings = {"seed": params["seed"], "features": params["features"]}
-        strong = Strong.fit(frames, materials, **settings)
+        strong = MinirocketClassifier.fit(frames, materials, seed=params.seed, features=params.features)
         tensors |= {f"{name}.{key}": value for key, value in strong.to_tensors().items()}
-        if params["baselines"]:
-            shuffled = np.random.default_rng([params["seed"], 3, place]).permutation(materials)
+        if params.baselines:
+            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= stored(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
     return _files(config, tensors, baselines)
 
 
-def spectra(config: Config, known: BySensor, watched: BySensor, held: Mapping[str, Iterable[int]]) -> dict[str, bytes]:
-    """Return the files of a model of spectra over spatial frequency, by which sensors tell one another of materials.
+def spectra(
+    params: Spectra, config: Config, known: BySensor, watched: BySensor, held: Mapping[str, Iterable[int]]
+) -> dict[str, bytes]:
+    """Return the files of a model of spectra over spatial frequency, by which sensors learn materials from one another.
 
-    ``held`` are the materials whose labels a sensor is not told; nothing that is fitted for it sees their slides. Raises
+    ``held`` are the materials whose labels a sensor does not learn; nothing that is fitted for it sees their slides. Raises
     `TacpipeError` where a sensor's speed or rate is not known, where sensors share too few materials, and where no
-    sensor is told of a material.
+    sensor learns a material.
     """
-    params = config["params"]
-    felt = _felt(params["speeds"], known)
-    bands = Bands.common(list(felt.values()))
-    told: dict[str, transfer.Told] = {}
+    sampled = _samplings(params.speeds, known)
+    bands = Bands.common(list(sampled.values()))
+    labelled: dict[str, transfer.Labelled] = {}
     baselines: Arrays = {}
     for place, (name, some) in enumerate(known.items()):
         frames, materials = _labelled(params, some, watched.get(name), place)
         free = ~np.isin(materials, list(held[name]))
         frames, materials = frames[free], materials[free]
-        told[name] = transfer.Told(bands.log_power(frames, felt[name].rate_hz, felt[name].speed_m_s), materials)
-        if params["baselines"]:
-            shuffled = np.random.default_rng([params["seed"], 3, place]).permutation(materials)
+        labelled[name] = transfer.Labelled(
+            bands.log_power(frames, sampled[name].rate_hz, sampled[name].speed_m_s), materials
+        )
+        if params.baselines:
+            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= stored(PERMUTED_LABELS, name, Level.fit(told[name].features[:, None], shuffled))
-    named = {name: {int(one) for one in some.labels} for name, some in told.items()}
+            baselines |= stored(PERMUTED_LABELS, name, Level.fit(labelled[name].features[:, None], shuffled))
+    named = {name: {int(one) for one in some.labels} for name, some in labelled.items()}
     missing = sorted(set(config["classes"]) - set().union(*named.values()))
     if missing:
-        raise UsageError(f"hold_out leaves no sensor with labels of material {missing[0]}; leave one at least.")
+        raise UsageError(f"hold_out leaves no sensor that learns material {missing[0]}; leave at least one.")
     config = config | {
         "spectra": {
             "way_m": bands.way_m,
             "edges_per_m": bands.edges_per_m.tolist(),
-            "speed_m_s": {name: one.speed_m_s for name, one in felt.items()},
+            "speed_m_s": {name: one.speed_m_s for name, one in sampled.items()},
         },
         "held_out": {name: sorted(set(config["classes"]) - own) for name, own in named.items()},
     }
     tensors = {
         f"{name}.{key}": value
-        for name, own in told.items()
-        for key, value in Transfer.fit(own, [told[other] for other in told if other != name]).to_tensors().items()
+        for name, own in labelled.items()
+        for key, value in Transfer.fit(own, [labelled[other] for other in labelled if other != name])
+        .to_tensors()
+        .items()
     }
     return _files(config, tensors, baselines)
 
 
-def _felt(speeds: str, known: BySensor) -> dict[str, Felt]:
-    """Return how each sensor's slides come about, at the median speed of those whose speed is told.
+def _samplings(speeds: str, known: BySensor) -> dict[str, Sampling]:
+    """Return the sampling of each sensor's slides, at the median of the speeds that are recorded.
 
-    ``speeds``, like ``biotac=0.025,roboskin=0.05``, is of sensors none of whose slides tells it.
+    ``speeds``, like ``biotac=0.025,roboskin=0.05``, is of sensors whose slides have none.
     """
     given = Assignments(float).items(speeds)
     found = {}
     for name, some in known.items():
-        told = some.speeds_m_s[some.speeds_m_s > 0]
-        if not len(told) and name not in given:
+        recorded = some.speeds_m_s[some.speeds_m_s > 0]
+        if not len(recorded) and name not in given:
             raise UsageError(
-                f"It is not known how fast {name} slides, and speeds is {speeds!r}; add {name}=0.05, or what it is."
+                f"The slides of {name} have no speed, and speeds is {speeds!r}; add {name}=0.05, or what it is."
             )
         if some.layout.rate_hz <= 0:
             raise TacpipeError(
-                f"{some.names[0]} has no rate, and without one nobody knows how long a wave is; set it with "
+                f"{some.names[0]} has no rate, and the length of a wave needs one; set it with "
                 f"`tacpipe label RECORDINGS {some.names[0]} --set rate_hz=100`, or what it is."
             )
-        speed_m_s = float(np.median(told)) if len(told) else given[name]
-        found[name] = Felt(some.layout.frames, some.layout.rate_hz, speed_m_s)
+        speed_m_s = float(np.median(recorded)) if len(recorded) else given[name]
+        found[name] = Sampling(some.layout.frames, some.layout.rate_hz, speed_m_s)
     return found
 
 
-def _labelled(params: Params, some: Slides, watched: Slides | None, place: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames and materials to learn from: those of validation too, where params say so."""
+def _labelled(
+    params: Minirocket | Spectra, some: Slides, watched: Slides | None, place: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames and materials to learn from: those of validation too, where params ask for it."""
     frames, materials = some.frames, permuted(params, some.materials, place)
-    if params["use_validation"] and watched is not None and params["labels"] == "true":
+    if params.use_validation and watched is not None and params.labels == "true":
         frames = np.concatenate([frames, watched.frames])
         materials = np.concatenate([materials, watched.materials])
     return frames, materials
 
 
 def permuted(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
-    """Return labels dealt out anew among the slides, where params ask for it: then there is nothing to learn."""
-    if params["labels"] == "true":
+    """Return labels permuted among the slides, where params ask for it: then there is nothing to learn."""
+    if params.labels == "true":
         return materials
-    return np.random.default_rng([params["seed"], 2, place]).permutation(materials)
+    return np.random.default_rng([params.seed, 2, place]).permutation(materials)
 
 
-def stored(kind: str, sensor: str, fitted: Level | Strong) -> Arrays:
-    """Return what a baseline is told by, under names that no other has."""
+def stored(kind: str, sensor: str, fitted: Level | MinirocketClassifier) -> Arrays:
+    """Return the tensors of a baseline, under names that no other has."""
     return {f"{kind}.{sensor}.{key}": value for key, value in fitted.to_tensors().items()}
 
 

@@ -31,15 +31,15 @@ class Layout:
     rate_hz: float
     layout: str = "time"  # frames in the order of time; authors: as published, in another one
 
-    def told(self) -> dict[str, Any]:
-        """Return what `from_told` reads, as JSON holds it."""
+    def to_json(self) -> dict[str, Any]:
+        """Return what `from_json` reads."""
         named = {"frames": self.frames, "rate_hz": self.rate_hz, "layout": self.layout}
         return {"channels": list(self.channels), **named}
 
     @classmethod
-    def from_told(cls, sensor: str, told: dict[str, Any]) -> Layout:
-        """Return the layout that `told` wrote."""
-        return cls(sensor, tuple(told["channels"]), int(told["frames"]), float(told["rate_hz"]), told["layout"])
+    def from_json(cls, sensor: str, stored: dict[str, Any]) -> Layout:
+        """Return the layout that `to_json` wrote."""
+        return cls(sensor, tuple(stored["channels"]), int(stored["frames"]), float(stored["rate_hz"]), stored["layout"])
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class Slides:
     layout: Layout
     names: tuple[str, ...]
     frames: NDArray[np.float32]  # (slide, time, channel), device counts
-    materials: NDArray[np.int64]  # (slide,); UNKNOWN where none is told
+    materials: NDArray[np.int64]  # (slide,); UNKNOWN where none is labelled
     digests: tuple[str, ...]
-    speeds_m_s: NDArray[np.float64]  # (slide,); NaN where none is told
+    speeds_m_s: NDArray[np.float64]  # (slide,); NaN where none is recorded
 
     def __len__(self) -> int:
         """Return how many slides there are."""
@@ -89,7 +89,7 @@ def read(
         sensor = shard.attributes.get("sensor")
         if not isinstance(sensor, str):
             raise TacpipeError(
-                f"Recording {name} has no attribute with its sensor; set it with `tacpipe label RECORDINGS {name} "
+                f"Recording {name} has no label sensor; set it with `tacpipe label RECORDINGS {name} "
                 f"--set sensor=biotac`, or what it is."
             )
         there.add(sensor)
@@ -98,8 +98,8 @@ def read(
         found.setdefault(sensor, []).append((shard, *_frames(shard, sensor, quantities)))
     missing = sorted(set(only) - set(found))
     if missing:
-        told = ", ".join(sorted(there)) or "none"
-        raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {told}. Give others.")
+        known = ", ".join(sorted(there)) or "none"
+        raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {known}. Give others.")
     return {sensor: _bundle(several, labelled) for sensor, several in sorted(found.items())}
 
 
@@ -114,8 +114,10 @@ def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[L
     wanted = {quantity.encode() for quantity in quantities}
     channels = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") in wanted]
     if not channels:
-        told = " or ".join(quantities)
-        raise TacpipeError(f"Recording {shard.name} has no {told} channel: no column's quantity is {told}.")
+        wanted_quantity = " or ".join(quantities)
+        raise TacpipeError(
+            f"Recording {shard.name} has no {wanted_quantity} channel: no column's quantity is {wanted_quantity}."
+        )
     values = _columns(table, channels)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]

@@ -1,4 +1,4 @@
-"""How a classifier of materials comes about: from slides and params to the files of a model."""
+"""Train a classifier of materials: from slides and params to the files of a model."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import headers, recurrent_autoencoder
 from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.tasks.material import readouts
 from tacpipe.tasks.material import slides as slides_of
@@ -27,15 +28,15 @@ from tacpipe.tasks.material.classifier import (
     MEAN_LEVEL,
     PERMUTED_LABELS,
     ROCKET,
-    SPECTRA,
     TASK,
     WEIGHTS,
     Classifier,
     Config,
     NetworkReader,
 )
-from tacpipe.tasks.material.learning import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
+from tacpipe.tasks.material.params import XLSTM, Minirocket, Params, Raec, Spectra
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.seen import seen
 from tacpipe.training import loop
@@ -46,11 +47,10 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 RAEC = "raec"
-QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params do not say
-WEIGHTED = ("reconstruction", "classification", "alignment")  # losses of raec
-MAPPED_RECONSTRUCTION = 0.05  # of a network that learns to meet known latents: that of the published script
+QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params name none
+MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen one: that of the published script
 
-Params = Mapping[str, Any]
+NetworkParams = Raec | XLSTM
 BySensor = Mapping[str, Slides]
 
 
@@ -63,13 +63,13 @@ def train(
 ) -> dict[str, bytes]:
     """Return the files of a model trained on the slides of ``training`` and, for networks, chosen on ``validation``.
 
-    ``params`` are those of the stage `train.material`. Whatever is fitted is fitted on training slides alone; a readout
-    in closed form needs none to choose by, and learns from validation slides too where ``use_validation`` says so.
+    Whatever is fitted is fitted on training slides alone; a readout
+    in closed form needs none to choose by, and learns from validation slides too where ``use_validation`` is set.
     Raises `TacpipeError` where slides lack labels, differ in layout or, learned jointly, in materials.
     """
     _check(params, init)
-    only = [name.strip() for name in params["sensors"].split(",") if name.strip()]
-    kinds = slides_of.quantities(params["quantities"]) or QUANTITIES.get(params["architecture"], (slides_of.TACTILE,))
+    only = CommaList().items(params.sensors)
+    kinds = slides_of.quantities(params.quantities) or QUANTITIES.get(params.architecture, (slides_of.TACTILE,))
     known = slides_of.read(training, only=only, quantities=kinds, labelled=True)
     watched: dict[str, Slides] = {}
     if validation is not None and validation.recordings:
@@ -81,11 +81,11 @@ def train(
         raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to classify.")
     config: Config = {
         "task": TASK,
-        "architecture": params["architecture"],
-        "params": dict(params),
-        "split": params["setting"],
+        "architecture": params.architecture,
+        "params": params_of.to_json(params),
+        "split": params.run_label,
         "quantities": kinds,
-        "sensors": {name: some.layout.told() for name, some in known.items()},
+        "sensors": {name: some.layout.to_json() for name, some in known.items()},
         "classes": classes,
         "counts": {
             role: {name: len(some) for name, some in part.items()}
@@ -98,34 +98,43 @@ def train(
             for name, digest in zip(some.names, some.digests, strict=True)
         },
     }
-    if params["architecture"] == ROCKET:
-        return readouts.rockets(config, known, watched)
-    if params["architecture"] == SPECTRA:
-        return readouts.spectra(config, known, watched, held_out(params["hold_out"], classes, known))
-    return _networks(config, known, watched, workspace, init)
+    if isinstance(params, Minirocket):
+        return readouts.rockets(params, config, known, watched)
+    if isinstance(params, Spectra):
+        return readouts.spectra(params, config, known, watched, held_out(params.hold_out, classes, known))
+    return _networks(params, config, known, watched, workspace, init)
 
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
-    """Refuse a model to begin with where nothing is learned from it, and a known sensor without one."""
-    if init is not None and params["architecture"] != RAEC:
+    """Refuse a model to begin with where nothing is learned from it, and a frozen sensor without one."""
+    if init is not None and not isinstance(params, Raec):
         raise UsageError(
-            f"--init goes with the architecture {RAEC} alone, whose networks learn to meet the latents of a known "
-            f"sensor, not with {params['architecture']}. Leave it out, or choose --architecture {RAEC}."
+            f"--init goes with the architecture {RAEC} alone, whose networks can be aligned to that of a frozen sensor, "
+            f"not with {params.architecture}. Leave it out, or choose --architecture {RAEC}."
         )
-    if bool(params.get("known")) != (init is not None):
+    if bool(_frozen(params)) != (init is not None):
         raise UsageError(
-            "Mapping to a known space needs both --known, the sensor whose latents are known, and --init, the model that "
-            "knows them."
+            "Alignment to a trained network needs both --frozen-sensor, the sensor that it is of, and --init, the model "
+            "that holds it."
         )
+
+
+def _frozen(params: Params) -> str:
+    """Return the sensor whose network is frozen; the empty text where none is."""
+    return params.frozen_sensor if isinstance(params, Raec) else ""
 
 
 # ---- networks
 
 
 def _networks(
-    config: Config, known: BySensor, watched: BySensor, workspace: Path, init: Mapping[str, bytes] | None
+    params: NetworkParams,
+    config: Config,
+    known: BySensor,
+    watched: BySensor,
+    workspace: Path,
+    init: Mapping[str, bytes] | None,
 ) -> dict[str, bytes]:
-    params = config["params"]
     missing = sorted(set(known) - set(watched))
     if missing:
         raise TacpipeError(
@@ -134,22 +143,22 @@ def _networks(
         )
     device = "cuda" if torch.cuda.is_available() else "cpu"
     start = Classifier.load(init) if init else None
-    joint = bool(params.get("joint")) and len(known) > 1
-    mapped_to = str(params.get("known", ""))
+    joint = isinstance(params, Raec) and params.joint and len(known) > 1
+    mapped_to = _frozen(params)
     if joint:
         _same_materials(known)
-    kinds = headers.chosen(params["headers"], {name: len(some.layout.channels) for name, some in known.items()})
+    kinds = headers.chosen(params.headers, {name: len(some.layout.channels) for name, some in known.items()})
     shapes = {name: _shape(params, some, kinds[name], len(config["classes"])) for name, some in known.items()}
-    scalings = {name: Affine.fit(some.frames, params["scaling"]) for name, some in known.items()}
-    held = held_out(params["hold_out"], config["classes"], known)
+    scalings = {name: Affine.fit(some.frames, params.scaling) for name, some in known.items()}
+    held = held_out(params.hold_out, config["classes"], known)
     if start:
         _same_space(start, mapped_to, config, known)
         shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
         scalings[mapped_to] = _reader(start, mapped_to).scaling
         config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
-    felt = [
+    scaled_slides = [
         {
-            name: _felt(config, some, scalings[name], held, device, place)
+            name: _scaled(params, config, some, scalings[name], held, device, place)
             for place, (name, some) in enumerate(part.items())
         }
         for part in (known, watched)
@@ -163,76 +172,88 @@ def _networks(
         "held_out": {name: sorted(materials) for name, materials in held.items()},
     }
     partners = None
-    if params.get("pairing") == "permuted":
-        partners = permuted_classes(range(len(config["classes"])), params["seed"])
+    if isinstance(params, Raec) and params.pairing == "permuted":
+        partners = permuted_classes(range(len(config["classes"])), params.seed)
         config["partners"] = {
             str(config["classes"][one]): config["classes"][other] for one, other in sorted(partners.items())
         }
-    pairs = _pairs(params, felt[0], partners)
-    work = JointWork(felt[0], felt[1], pairs, _weights(params, joint), mapped_to, params["drop_last"])
-    trained = loop.train(lambda: _built(params, shapes, start).to(device), work, _schedule(params), workspace)
-    best, last = (trained.weights, trained.last) if params["select"] == "best" else (trained.last, trained.weights)
+    pairs = _pairs(params, scaled_slides[0], partners)
+    work = JointWork(scaled_slides[0], scaled_slides[1], pairs, _weights(params, joint), mapped_to, params.drop_last)
+
+    def build() -> nn.Module:
+        return _built(params.architecture, shapes, start, mapped_to).to(device)
+
+    trained = loop.train(build, work, _schedule(params), workspace)
+    best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
     config["validation"] = _validation(trained.history, work.joint)
     files = {
         CONFIG: readouts.config_file(config),
         WEIGHTS: save_tensors(best),
         HISTORY: trained.history_lines,
     }
-    if params["select"] == "best":
+    if params.select == "best":
         files[LAST] = save_tensors(last)
-    if params["baselines"]:
+    if params.baselines:
         files[BASELINES] = _network_baselines(Classifier.load(files), known, params)
     return files
 
 
-def _pairs(params: Params, felt: Mapping[str, Felt], partners: Mapping[int, int] | None) -> Pairs:
+def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> Pairs:
     return Pairs(
-        {name: some.classes.cpu() for name, some in felt.items()},
-        reduced=params["reduce"],
+        {name: some.classes.cpu() for name, some in slides.items()},
+        params.batch,
+        pairing=params.pairing if isinstance(params, Raec) else Pairs.pairing,
+        shuffle=params.shuffle,
+        drop_last=params.drop_last,
+        subsample_sensor=params.subsample_sensor,
+        subsample_percent=params.subsample_percent,
         partners=partners,
-        **_of(Pairs, params),
+        seed=params.seed,
     )
 
 
-def _schedule(params: Params) -> loop.Schedule:
+def _schedule(params: NetworkParams) -> loop.Schedule:
     return loop.Schedule(
-        epochs=params["epochs"],
-        batch=params["batch"],
-        learning_rate=params["learning_rate"],
-        patience=params["patience"] or params["epochs"],
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience or params.epochs,
         gradient_clip=math.inf,
-        seed=params["seed"],
-        cycle=params["cycle"],
+        seed=params.seed,
+        cycle=params.cycle,
     )
 
 
-def _shape(params: Params, some: Slides, header: str, classes: int) -> Shape:
-    return Shape(
-        channels=len(some.layout.channels),
-        classes=classes,
-        header=header,
-        **_of(Shape, params),
+def _shape(params: NetworkParams, some: Slides, header: str, classes: int) -> Shape:
+    shape = Shape(channels=len(some.layout.channels), classes=classes, header=header, hidden=params.hidden)
+    if not isinstance(params, Raec):
+        return shape
+    return dataclasses.replace(
+        shape, decoder=params.decoder, latents=params.latents, unpool=params.unpool, dropout=params.dropout
     )
 
 
-def _of(kind: type[Any], params: Params) -> dict[str, Any]:
-    """Return the params that fields of a dataclass are named like; an architecture has some of them, or all."""
-    return {field.name: params[field.name] for field in dataclasses.fields(kind) if field.name in params}
-
-
-def _felt(config: Config, some: Slides, scaled: Affine, held: Mapping[str, set[int]], device: str, place: int) -> Felt:
+def _scaled(
+    params: NetworkParams,
+    config: Config,
+    some: Slides,
+    scaled: Affine,
+    held: Mapping[str, set[int]],
+    device: str,
+    place: int,
+) -> ScaledSlides:
     """Return slides as networks read them; what is held out or not among the training slides' classes has no label."""
-    params, name = config["params"], some.layout.sensor
+    name = some.layout.sensor
     numbers = {material: number for number, material in enumerate(config["classes"]) if material not in held[name]}
     materials = readouts.permuted(params, some.materials, place)
     classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
     if not (classes != NONE).any():
         raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
-    return Felt(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
+    return ScaledSlides(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
 
 
 def held_out(given: str, classes: Sequence[int], sensors: Sequence[str] | BySensor) -> dict[str, set[int]]:
-    """Return the materials whose labels each sensor is not told; ``given`` is like ``roboskin=17,18,19,20``.
+    """Return the materials whose labels each sensor does not learn; ``given`` is like ``roboskin=17,18,19,20``.
 
     >>> held_out("b=3,4", [1, 2, 3, 4], ["a", "b"])
     {'a': set(), 'b': {3, 4}}
@@ -265,7 +286,7 @@ def _same_materials(known: BySensor) -> None:
 def _same_space(start: Classifier, known: str, config: Config, slides: BySensor) -> None:
     """Refuse a model of --init that does not know the sensor or the same materials."""
     if known not in slides:
-        raise UsageError(f"known names the sensor {known}; the recordings are of {', '.join(slides)}.")
+        raise UsageError(f"frozen_sensor is {known}; the recordings are of {', '.join(slides)}.")
     if start.architecture != RAEC:
         raise TacpipeError(
             f"The model of --init is of the architecture {start.architecture}; its space must be of {RAEC}."
@@ -284,24 +305,25 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
     return reader
 
 
-def _weights(params: Params, joint: bool) -> Weights:
-    found = {name: params[f"{name}_weight"] for name in WEIGHTED if f"{name}_weight" in params}
-    if params.get("known"):
-        found["reconstruction"] = MAPPED_RECONSTRUCTION
-    if not joint:
-        found["alignment"] = 0.0
-    return Weights(**found, **_of(Weights, params))
-
-
-def _built(params: Params, shapes: Mapping[str, Shape], start: Classifier | None) -> nn.ModuleDict:
-    """Return the networks by sensor; a known one is taken over and frozen, with its classifier in all others."""
-    built = nn.ModuleDict(
-        {name: recurrent_autoencoder.build(params["architecture"], one) for name, one in shapes.items()}
+def _weights(params: NetworkParams, joint: bool) -> Weights:
+    if not isinstance(params, Raec):
+        return Weights(alignment=0.0)
+    return Weights(
+        reconstruction=MAPPED_RECONSTRUCTION if params.frozen_sensor else params.reconstruction_weight,
+        classification=params.classification_weight,
+        alignment=params.alignment_weight if joint else 0.0,
+        align_from=params.align_from,
+        alignment_loss=params.alignment_loss,
     )
+
+
+def _built(architecture: str, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:
+    """Return the networks by sensor; that of ``frozen`` is taken over and frozen, with its classifier in all others."""
+    built = nn.ModuleDict({name: recurrent_autoencoder.build(architecture, one) for name, one in shapes.items()})
     if start:
-        known = _reader(start, params["known"]).network
+        known = _reader(start, frozen).network
         for name, network in built.items():
-            if name == params["known"]:
+            if name == frozen:
                 network.load_state_dict(known.state_dict())
                 network.requires_grad_(False)
             else:
@@ -328,9 +350,9 @@ def _network_baselines(trained: Classifier, known: BySensor, params: Params) -> 
     """Return the mean-level baseline, and a readout of the networks' own latents fitted to shuffled labels."""
     found: dict[str, np.ndarray] = {}
     for place, (name, some) in enumerate(known.items()):
-        latents = trained.readers[name].tell(some.frames).latents
+        latents = trained.readers[name].read(some.frames).latents
         assert latents is not None
-        shuffled = np.random.default_rng([params["seed"], 3, place]).permutation(some.materials)
+        shuffled = np.random.default_rng([params.seed, 3, place]).permutation(some.materials)
         found |= readouts.stored(MEAN_LEVEL, name, Level.fit(some.frames, some.materials))
         found |= readouts.stored(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
     return readouts.packed(found)

@@ -1,4 +1,4 @@
-"""How near a model of touch comes on grasps it has not seen, beside what can be said without looking."""
+"""Evaluation of a model of touch on grasps it has not seen, next to its baselines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import metrics
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.metrics import Told, Tree
+from tacpipe.tasks.touch.metrics import Readings, Tree
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
 from tacpipe.tasks.touch.result_names import CONSTANT, GRASPS, MODEL, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS, TRUE
 
@@ -32,10 +32,10 @@ Mask = NDArray[np.bool_]
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
-    """Return ``metrics.json``, ``by_object.csv`` and what each predictor told of each grasp.
+    """Return ``metrics.json``, ``by_object.csv`` and the predictions of each predictor for each grasp.
 
     The measures are of grasps that the model was not trained on, and again of those among them whose object it knows
-    (``known``) and does not (``novel``); grasps it has seen, and those with the very reading of one of these, are told
+    (``known``) and does not (``novel``); grasps it has seen, and those with the very reading of one of these, are reported
     apart, under ``seen``. Raises `TacpipeError` where grasps have no reading, or are not what the model reads.
     """
     predictor = Predictor.load(model)
@@ -48,19 +48,19 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         raise TacpipeError(
             "The model was trained without baselines, and cannot be evaluated. Train it with --baselines."
         )
-    told = {TRUE: grasps.felt, MODEL: predictor.foretell(grasps), **predictor.baselines.foretell(grasps)}
-    told = {name: {target: one[target] for target in predictor.targets} for name, one in told.items()}
-    streams = {name: told_table(one) for name, one in told.items()}
-    del told[TRUE]
+    predicted = {TRUE: grasps.readings, MODEL: predictor.predict_grasps(grasps), **predictor.baselines.predict(grasps)}
+    predicted = {name: {target: one[target] for target in predictor.targets} for name, one in predicted.items()}
+    streams = {name: readings_table(one) for name, one in predicted.items()}
+    del predicted[TRUE]
     trained = set(predictor.config["trained_on"].values())
-    seen = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.felt_before(grasps)
+    seen = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.same_reading(grasps)
     known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
-    tree = _measures(grasps, told, ~seen, known)
+    tree = _measures(grasps, predicted, ~seen, known)
     for name, mask in (("known", known & ~seen), ("novel", ~known & ~seen), ("seen", seen)):
         if mask.any():
-            tree[name] = _measures(grasps, told, mask, known)
+            tree[name] = _measures(grasps, predicted, mask, known)
     files = {
-        headline.FILE: headline.write(_headlines(predictor, grasps, told, seen, known)),
+        headline.FILE: headline.write(_headlines(predictor, grasps, predicted, seen, known)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "by_object.csv": _by_object_csv(tree),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
@@ -71,7 +71,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
 
 def _headlines(
-    predictor: Predictor, grasps: Grasps, told: Mapping[str, Told], seen: Mask, known: Mask
+    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Mask, known: Mask
 ) -> list[headline.Headline]:
     """Return how the model compares with its baselines on each target, on known objects and on novel ones."""
     objects = {name: of or "unnamed" for name, of in zip(grasps.names, grasps.objects, strict=True)}
@@ -79,9 +79,9 @@ def _headlines(
     for part in (True, False):
         rows = np.flatnonzero((known == part) & ~seen)
         for target in predictor.targets:
-            true = biotac_sp.normalised(target, grasps.felt[target])
+            true = biotac_sp.normalised(target, grasps.readings[target])
             errors = {}
-            for name, one in told.items():
+            for name, one in predicted.items():
                 squared = regression.squared_sums(true, biotac_sp.normalised(target, one[target]))
                 errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
             model = errors.pop(MODEL)
@@ -93,7 +93,7 @@ def _headlines(
     return found
 
 
-def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, known: Mask) -> Tree:
+def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Mask, known: Mask) -> Tree:
     """Return the measures of every predictor on some grasps, over all of them and by object.
 
     Where an object among them is not ``known``, intervals are over objects: what the next one will be like is the question.
@@ -103,20 +103,20 @@ def _measures(grasps: Grasps, told: Mapping[str, Told], mask: Mask, known: Mask)
     names, objects = np.array(grasps.names), np.array(grasps.objects)
     clusters = objects if (mask & ~known).any() else names
     tree: Tree = {"counts": {"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}}
-    for name, one in told.items():
-        tree[name] = _tree(grasps, one, told[CONSTANT], mask, clusters)
+    for name, one in predicted.items():
+        tree[name] = _tree(grasps, one, predicted[CONSTANT], mask, clusters)
         tree[name]["by_object"] = {
-            other or "unnamed": _tree(grasps, one, told[CONSTANT], mask & (objects == other), names)
+            other or "unnamed": _tree(grasps, one, predicted[CONSTANT], mask & (objects == other), names)
             for other in sorted(set(objects[mask]))
         }
-    felt, model = (metrics.chosen(one, mask) for one in (grasps.felt, told[MODEL]))
-    tree[MODEL]["by_electrode"] = metrics.by_electrode(felt, model)
+    readings, model = (metrics.chosen(one, mask) for one in (grasps.readings, predicted[MODEL]))
+    tree[MODEL]["by_electrode"] = metrics.by_electrode(readings, model)
     return tree
 
 
-def _tree(grasps: Grasps, told: Told, constant: Told, mask: Mask, clusters: NDArray[Any]) -> Tree:
-    felt, one, mean = (metrics.chosen(values, mask) for values in (grasps.felt, told, constant))
-    return metrics.tree(felt, one, mean, clusters[mask].tolist())
+def _tree(grasps: Grasps, predicted: Readings, constant: Readings, mask: Mask, clusters: NDArray[Any]) -> Tree:
+    readings, one, mean = (metrics.chosen(values, mask) for values in (grasps.readings, predicted, constant))
+    return metrics.tree(readings, one, mean, clusters[mask].tolist())
 
 
 def _by_object_csv(tree: Tree) -> bytes:
@@ -153,10 +153,10 @@ def simulated(recordings: Dataset) -> dict[str, bool]:
     return {"simulated": True} if found else {}
 
 
-def told_table(told: Told) -> pa.Table:
-    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, as far as told."""
+def readings_table(predicted: Readings) -> pa.Table:
+    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, where predicted."""
     fields, arrays = [], []
-    for target, values in told.items():
+    for target, values in predicted.items():
         for name, column in zip(biotac_sp.value_columns(target), values.T, strict=True):
             fields.append(pa.field(name, pa.float32(), metadata={"unit": "count", "quantity": "prediction"}))
             arrays.append(pa.array(column.astype(np.float32)))

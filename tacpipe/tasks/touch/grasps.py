@@ -1,4 +1,4 @@
-"""Grasps of a dataset as arrays: clouds, grasps and what was felt."""
+"""Grasps of a dataset as arrays: clouds, grasps and readings."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ FARTHEST_M = 0.1  # of a grasp point, maybe on a hidden side, from its cloud: be
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps side by side, each with its cloud and, where it is known, what both fingers felt."""
+    """Grasps side by side, each with its cloud and, where it is known, the reading of both fingers."""
 
     names: tuple[str, ...]
-    objects: tuple[str, ...]  # empty where none is told
+    objects: tuple[str, ...]  # empty where none is labelled
     sessions: tuple[str, ...]
     t_ns: NDArray[np.int64]  # (grasp,)
     clouds: tuple[Cloud, ...]
     grasps: tuple[Grasp, ...]
-    felt: Mapping[str, Floats]  # by target (grasp, value), device counts; empty where nothing was felt
+    readings: Mapping[str, Floats]  # by target (grasp, value), device counts; empty without readings
     digests: tuple[str, ...]  # of the recordings
 
     def __len__(self) -> int:
@@ -51,13 +51,13 @@ class Grasps:
             np.concatenate([self.t_ns, others.t_ns]),
             self.clouds + others.clouds,
             self.grasps + others.grasps,
-            {target: np.concatenate([felt, others.felt[target]]) for target, felt in self.felt.items()},
+            {target: np.concatenate([values, others.readings[target]]) for target, values in self.readings.items()},
             self.digests + others.digests,
         )
 
 
-def read(recordings: Dataset, *, felt: bool = True) -> Grasps:
-    """Return the grasps of a dataset in the order of names; with ``felt`` each must have a reading.
+def read(recordings: Dataset, *, with_readings: bool = True) -> Grasps:
+    """Return the grasps of a dataset in the order of names; with ``with_readings`` each must have a reading.
 
     Raises `TacpipeError` where a recording lacks a stream or a column, where a value is not finite, where a cloud has
     next to no points, and where a grasp lies far from it.
@@ -71,8 +71,8 @@ def read(recordings: Dataset, *, felt: bool = True) -> Grasps:
         clouds.append(cloud)
         grasps.append(grasp)
         t_ns.append(stamp)
-        if felt:
-            for target, values in _felt(shard).items():
+        if with_readings:
+            for target, values in _reading(shard).items():
                 readings[target].append(values)
     return Grasps(
         tuple(names),
@@ -81,7 +81,7 @@ def read(recordings: Dataset, *, felt: bool = True) -> Grasps:
         np.array(t_ns, np.int64),
         tuple(clouds),
         tuple(grasps),
-        {target: np.array(values, np.float64) for target, values in readings.items()} if felt else {},
+        {target: np.array(values, np.float64) for target, values in readings.items()} if with_readings else {},
         tuple(shard.digest for shard in shards),
     )
 
@@ -118,10 +118,10 @@ def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
     return cloud, grasp, int(table.column("t_ns")[0].as_py())
 
 
-def _felt(shard: Recording) -> dict[str, Floats]:
+def _reading(shard: Recording) -> dict[str, Floats]:
     if READING not in shard.streams:
         raise TacpipeError(
-            f"Recording {shard.name} has no reading of touch to learn from or to evaluate by. `tacpipe predict` needs none."
+            f"Recording {shard.name} has no tactile reading to learn from or to evaluate with. `tacpipe predict` needs none."
         )
     table = shard.table(READING)
     if table.num_rows != 1:

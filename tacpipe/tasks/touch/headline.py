@@ -45,10 +45,18 @@ def headline(
     the number of values that were summed. Grasps are drawn anew where objects are known, else ``objects`` (by grasp).
     """
     drawn = None if known else objects
-    told = {BASELINES.get(name, name.replace("_", " ")): _sums(one) for name, one in baselines.items() if one}
+    compared = {BASELINES.get(name, name.replace("_", " ")): _sums(one) for name, one in baselines.items() if one}
     measure = _measure(range_counts, "grasps" if known else "objects")
     return pairing.headline(
-        TASK, method, measure, _sums(model), told, part=PARTS[known], target=TARGETS[target], clusters=drawn, runs=runs
+        TASK,
+        method,
+        measure,
+        _sums(model),
+        compared,
+        part=PARTS[known],
+        target=TARGETS[target],
+        clusters=drawn,
+        runs=runs,
     )
 
 

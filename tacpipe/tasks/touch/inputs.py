@@ -86,7 +86,7 @@ class Sources:
 
     @cached_property
     def wrists(self) -> list[NDArray[np.float64] | None]:
-        """Each wrist's rotation, or what stands for it."""
+        """Each wrist's rotation, or its estimate."""
         if self.inputs.wrist == "estimated":
             return [frame.estimated_wrist(grasp) for grasp in self.grasps]
         return [grasp.wrist for grasp in self.grasps]
@@ -136,7 +136,7 @@ def _check(inputs: Inputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
         )
     if (inputs.posed or inputs.normalisation == "wrist") and inputs.wrist == "given" and grasp.wrist is None:
         raise TacpipeError(
-            f"{name} does not state how the wrist is turned, which inputs {inputs.mode} with normalisation "
+            f"{name} has no rotation of the wrist, which inputs {inputs.mode} with normalisation "
             f"{inputs.normalisation} need. Choose others, or --wrist estimated, which makes it of the closing axis and the "
             f"camera's line of sight."
         )

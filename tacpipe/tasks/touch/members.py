@@ -1,10 +1,10 @@
-"""What a model of touch consists of: members that each foretell some targets, and whose mean is the model's word."""
+"""The members of a model of touch, each of which predicts some targets; their mean is the model's prediction."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,61 +16,62 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.models.patches import PatchNetwork
 from tacpipe.models.pointnet import HEADS, PointNet
+from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Inputs, Sources
-from tacpipe.tasks.touch.learning import Drawn, foretold
+from tacpipe.tasks.touch.losses import Drawn, predictions
 from tacpipe.tasks.touch.patches import Patches, PatchSources, require_colours
 from tacpipe.training.scaling import Affine
 
 Floats = NDArray[np.float64]
-Params = Mapping[str, Any]
+NetworkParams = params_of.Patches | params_of.Pointnet
 LARGEST = 100_000  # points of a cloud, and times that they are drawn
 
 
 class Member(Protocol):
-    """A part of a model that foretells targets of its own."""
+    """A part of a model that predicts targets of its own."""
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What it foretells."""
+        """What it predicts."""
 
-    def foretell(self, grasps: Grasps) -> Floats:
+    def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets side by side (grasp, value), device counts."""
 
 
 @dataclass(frozen=True)
 class ForestMember:
-    """Forests that read the grasp's geometry; where several tell a target their mean counts."""
+    """Forests that read the grasp's geometry; where several predict a target their mean counts."""
 
     targets: tuple[str, ...]
-    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # each with the targets that it tells, side by side
+    forests: tuple[tuple[tuple[str, ...], Forest], ...]  # each with the targets that it predicts, side by side
     coloured: bool
     placed: bool
     features: tuple[str, ...]
 
-    def foretell(self, grasps: Grasps) -> Floats:
+    def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts."""
         if self.coloured:
             require_colours(grasps.names, grasps.clouds)
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
             raise TacpipeError("The model was trained on other features than this version computes. Train it again.")
-        told = averaged((group, forest.predict(rows)) for group, forest in self.forests)
-        return np.concatenate([told[target] for target in self.targets], axis=1)
+        found = averaged((group, forest.predict(rows)) for group, forest in self.forests)
+        return np.concatenate([found[target] for target in self.targets], axis=1)
 
 
 @dataclass(frozen=True)
 class NetworkMember:
-    """A network that reads points, and the scale of what it tells."""
+    """A network that reads points, and the scale of its output."""
 
     targets: tuple[str, ...]
     network: nn.Module
     scale: Affine
-    params: Params
+    params: NetworkParams
 
-    def foretell(self, grasps: Grasps) -> Floats:
+    def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
-        found = foretold(self.network, sources(self.params, grasps), len(grasps), self.params["draws"])
+        found = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
         return np.asarray(self.scale.restore(found), np.float64)
 
 
@@ -81,12 +82,12 @@ def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
 
 
 def averaged(several: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
-    """Return by target (grasp, value) the mean of what several tell, each its targets' values side by side."""
-    told: dict[str, list[Floats]] = {}
+    """Return by target (grasp, value) the mean of several predictions, each its targets' values side by side."""
+    found: dict[str, list[Floats]] = {}
     for targets, values in several:
         for target, own in parted(values, targets).items():
-            told.setdefault(target, []).append(own)
-    return {target: np.mean(values, axis=0) for target, values in told.items()}
+            found.setdefault(target, []).append(own)
+    return {target: np.mean(values, axis=0) for target, values in found.items()}
 
 
 def units(values: Floats, targets: Sequence[str]) -> Floats:
@@ -97,45 +98,47 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
     return unit
 
 
-def network(params: Params, targets: Sequence[str]) -> nn.Module:
+def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
     """Return an untrained network for params and targets."""
     outputs = sum(biotac_sp.width(target) for target in targets)
-    if params["architecture"] == "pointnet":
+    if isinstance(params, params_of.Pointnet):
         read = inputs(params)
-        return PointNet(
-            read.channels, read.grasp_numbers, outputs, head=HEADS[params["head"]], transform=params["transform"]
-        )
-    sizes = {"backbone": params["backbone"], "hidden": params["hidden"], "dropout": params["dropout"]}
+        return PointNet(read.channels, read.grasp_numbers, outputs, head=HEADS[params.head], transform=params.transform)
     near = patches(params)
-    return PatchNetwork(near.channels, near.grasp_numbers, outputs, **sizes)
-
-
-def checked(params: Params) -> None:
-    """Raise `ValueError` for sizes that no params of `tacpipe train touch` come near."""
-    for name in ("draws", "points"):
-        if not 0 < int(params[name]) <= LARGEST:
-            raise ValueError(f"{name} is {params[name]}")
-
-
-def inputs(params: Params) -> Inputs:
-    """Return what a PointNet reads."""
-    return Inputs(
-        params["inputs"], params["points"], params["normalisation"], float(params["rotation_deg"]), params["wrist"]
+    return PatchNetwork(
+        near.channels,
+        near.grasp_numbers,
+        outputs,
+        backbone=params.backbone,
+        hidden=params.hidden,
+        dropout=params.dropout,
     )
 
 
-def patches(params: Params) -> Patches:
+def checked(params: NetworkParams) -> None:
+    """Raise `ValueError` for sizes that no params of `tacpipe train touch` come near."""
+    for name, value in (("draws", params.draws), ("points", params.points)):
+        if not 0 < value <= LARGEST:
+            raise ValueError(f"{name} is {value}")
+
+
+def inputs(params: params_of.Pointnet) -> Inputs:
+    """Return what a PointNet reads."""
+    return Inputs(params.inputs, params.points, params.normalisation, params.rotation_deg, params.wrist)
+
+
+def patches(params: params_of.Patches) -> Patches:
     """Return what a patch network reads."""
-    return Patches(params["points"], params["radius_mm"] / 1000, coloured(params), params["place"])
+    return Patches(params.points, params.radius_mm / 1000, coloured(params), params.place)
 
 
-def coloured(params: Params) -> bool:
+def coloured(params: params_of.Params) -> bool:
     """Return whether colours are read."""
-    return str(params["inputs"]).startswith("rgb")
+    return params.inputs.startswith("rgb")
 
 
-def sources(params: Params, grasps: Grasps) -> Drawn:
+def sources(params: NetworkParams, grasps: Grasps) -> Drawn:
     """Return where a network's points are drawn from. Raises `TacpipeError` where a grasp lacks what it reads."""
-    if params["architecture"] == "pointnet":
+    if isinstance(params, params_of.Pointnet):
         return Sources(inputs(params), grasps.names, grasps.clouds, grasps.grasps)
     return PatchSources(patches(params), grasps.names, grasps.clouds, grasps.grasps)

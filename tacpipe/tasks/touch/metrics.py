@@ -1,4 +1,4 @@
-"""How near foretold touch comes to what was felt: the tree of measures of one set of grasps."""
+"""The measures of predicted readings of one set of grasps, as a tree."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tacpipe.channels import biotac_sp
 from tacpipe.metrics import regression
 
 Floats = NDArray[np.float64]
-Told = Mapping[str, Floats]  # by target (grasp, value), device counts
+Readings = Mapping[str, Floats]  # by target (grasp, value), device counts
 Tree = dict[str, Any]
 
 
-def tree(felt: Told, told: Told, constant: Told, clusters: Sequence[str]) -> Tree:
-    """Return the measures of what one predictor told, by measure and target.
+def tree(readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]) -> Tree:
+    """Return the measures of one predictor's readings, by measure and target.
 
     ``rmse`` and ``mae`` are in shares of each target's range (`biotac_sp.RANGES`), over all grasps and electrodes at once;
     ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
@@ -25,10 +25,10 @@ def tree(felt: Told, told: Told, constant: Told, clusters: Sequence[str]) -> Tre
     """
     names = ("rmse", "rmse_counts", "rmse_batch_mean", "mae", "r2", "skill", "skill_low", "skill_high")
     found: Tree = {name: {} for name in names}
-    for target, values in told.items():
-        true, share, mean = (biotac_sp.normalised(target, one[target]) for one in (felt, told, constant))
+    for target, values in predicted.items():
+        true, share, mean = (biotac_sp.normalised(target, one[target]) for one in (readings, predicted, constant))
         found["rmse"][target] = regression.rmse(true, share)
-        found["rmse_counts"][target] = regression.rmse(felt[target], values)
+        found["rmse_counts"][target] = regression.rmse(readings[target], values)
         found["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, share)
         found["mae"][target] = regression.mae(true, share)
         found["r2"][target] = _known(regression.r2(true, share))
@@ -40,12 +40,12 @@ def tree(felt: Told, told: Told, constant: Told, clusters: Sequence[str]) -> Tre
     return found
 
 
-def by_electrode(felt: Told, told: Told) -> Tree:
-    """Return RMSE (share of the range) and R2 of each electrode, by target."""
+def by_electrode(readings: Readings, predicted: Readings) -> Tree:
+    """Return RMSE (fraction of the range) and R2 of each electrode, by target."""
     found: Tree = {}
-    for target, values in told.items():
+    for target, values in predicted.items():
         if biotac_sp.width(target) > 1:
-            true, share = (biotac_sp.normalised(target, one) for one in (felt[target], values))
+            true, share = (biotac_sp.normalised(target, one) for one in (readings[target], values))
             pairs = zip(regression.rmse_by_value(true, share), regression.r2_by_value(true, share), strict=True)
             found[target] = {
                 f"{number:02d}": {"rmse": float(rmse), "r2": _known(float(r2))}
@@ -54,11 +54,11 @@ def by_electrode(felt: Told, told: Told) -> Tree:
     return found
 
 
-def chosen(told: Told, mask: NDArray[np.bool_]) -> dict[str, Floats]:
+def chosen(predicted: Readings, mask: NDArray[np.bool_]) -> dict[str, Floats]:
     """Return the values of the grasps that a mask (grasp,) chooses."""
-    return {target: values[mask] for target, values in told.items()}
+    return {target: values[mask] for target, values in predicted.items()}
 
 
 def _known(value: float) -> float | None:
-    """Return a measure, or None where it is not defined, as JSON tells it."""
+    """Return a measure, or None where it is not defined, for JSON."""
     return value if np.isfinite(value) else None

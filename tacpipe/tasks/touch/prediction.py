@@ -1,4 +1,4 @@
-"""What a model says that grasps would feel like, without a word on whether it is right."""
+"""Predictions of a model for grasps, without their evaluation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pyarrow as pa
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch.evaluation import simulated, told_table
+from tacpipe.tasks.touch.evaluation import readings_table, simulated
 from tacpipe.tasks.touch.predictor import Predictor
 from tacpipe.tasks.touch.result_names import PREDICTIONS
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
-    """Return one table, ``predictions``: a row a grasp with the recording's name and all values foretold, device counts.
+    """Return one table, ``predictions``: a row a grasp with the recording's name and all predicted values, device counts.
 
-    Grasps need no reading; ``steps`` is for tasks that foresee and does nothing here. Raises `TacpipeError` where
+    Grasps need no reading; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError` where
     there are no recordings or they are not what the model reads.
     """
     return Result({PREDICTIONS: RecordingOutput(predictions(Predictor.load(model), recordings), simulated(recordings))})
@@ -29,8 +29,8 @@ def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int
 
 def predictions(predictor: Predictor, recordings: Dataset) -> pa.Table:
     """Return the table of `predict`, which raises the same errors."""
-    grasps = grasps_of.read(recordings, felt=False)
+    grasps = grasps_of.read(recordings, with_readings=False)
     if not len(grasps):
         raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the role asked for.")
-    table = told_table(predictor.foretell(grasps))
+    table = readings_table(predictor.predict_grasps(grasps))
     return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))

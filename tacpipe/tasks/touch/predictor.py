@@ -1,11 +1,11 @@
-"""A trained model of touch: from a cloud and a grasp to what both fingers would feel."""
+"""A trained model of touch: from a cloud and a grasp to the tactile reading of both fingers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -15,20 +15,16 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
-from tacpipe.errors import UsageError
 from tacpipe.models.forest import Forest
 from tacpipe.models.tensors import under
+from tacpipe.plugins import params as params_of
 from tacpipe.printable import excerpt
-from tacpipe.tasks.opened import Chain, opened
+from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
+from tacpipe.tasks.touch.params import Params, Trees
 from tacpipe.training.scaling import Affine
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
 
 Floats = NDArray[np.float64]
 Config = dict[str, Any]
@@ -45,7 +41,7 @@ NEEDED = {
 
 @dataclass(frozen=True)
 class Touch:
-    """What both fingers would feel, device counts; NaN for what the model does not foretell.
+    """The reading of both fingers, device counts; NaN for what the model does not predict.
 
     ``th`` is the thumb, ``mf`` the middle finger. A reading at rest is about 2,779 and 1,676 counts of ``pdc``, and 2,400
     to 3,480 of each electrode; contact raises ``pdc`` and lowers the electrodes under it.
@@ -59,77 +55,54 @@ class Touch:
 
 @dataclass(frozen=True)
 class Predictor:
-    """A model of touch, loaded."""
+    """A loaded model of touch; `model` adds what reads recordings."""
 
-    config: Config
+    params: Params
+    config: Config  # as it is stored
     members: Sequence[members.Member]
     baselines: Baselines | None
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
 
     @classmethod
-    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Predictor:
+    def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
         """Return the model among these files, as `tacpipe train touch` wrote them.
 
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
         that recordings went through the same.
         """
         config = model_files.tree(files, CONFIG, NEEDED)
+        params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         device = "cuda" if torch.cuda.is_available() else "cpu"
         with model_files.validated("the model"):
             found = [
-                _member(config, about, under(f"{number}.", tensors), device)
+                _member(params, about, under(f"{number}.", tensors), device)
                 for number, about in enumerate(config["members"])
             ]
             baselines = None
             if BASELINES in files:
-                told = model_files.arrays(files[BASELINES], BASELINES, but="")
-                baselines = Baselines.from_tensors(told, tuple(config["learned_objects"]))
+                stored = model_files.arrays(files[BASELINES], BASELINES, but="")
+                baselines = Baselines.from_tensors(stored, tuple(config["learned_objects"]))
                 baselines.check()
             if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
-        return cls(config, found, baselines, chain)
+        return cls(params, config, found, baselines, chain)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
         """What the model predicts."""
         return tuple(self.config["targets"])
 
-    def foretell(self, grasps: Grasps) -> dict[str, Floats]:
-        """Return what would be measured by target (grasp, value), device counts: the mean of the members.
+    def predict_grasps(self, grasps: Grasps) -> dict[str, Floats]:
+        """Return the predicted reading by target (grasp, value), device counts: the mean of the members.
 
         Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
         """
-        told = members.averaged((member.targets, member.foretell(grasps)) for member in self.members)
-        return {target: told[target] for target in self.targets}
-
-    @overload
-    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
-
-    @overload
-    def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
-
-    def predict(self, given: Dataset | Recording | Cloud, grasp: Grasp | None = None, /) -> pa.Table | Touch:
-        """Return what grasps would measure like: of a dataset or one of its ``shards`` as a table, of one cloud as `Touch`.
-
-        **Recordings** (``tacpipe.open(PATH)``, or one of its ``shards``) give the arrow table that `tacpipe predict` writes:
-        a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.
-        ``.to_pandas()`` makes a frame of it. Raises `UsageError` where the recordings did not go through the stages that
-        the model was trained behind.
-
-        **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` where the grasp
-        lies far from the cloud, and where either lacks what the model reads.
-        """
-        if isinstance(given, Cloud):
-            if grasp is None:
-                raise UsageError("A cloud alone does not state where the fingers close. Give predict(cloud, grasp).")
-            return self.predict_all(given, [grasp])[0]
-        from tacpipe.tasks.touch import prediction  # which reads this module
-
-        return prediction.predictions(self, opened(given, self.chain))
+        found = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
+        return {target: found[target] for target in self.targets}
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
-        """Return the touch of several grasps on one cloud; as `predict`, in one pass."""
+        """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""
         for number, grasp in enumerate(grasps):
             check(f"Grasp {number}" if len(grasps) > 1 else "The grasp", cloud, grasp)
         count = len(grasps)
@@ -140,16 +113,16 @@ class Predictor:
         bundle = Grasps(
             names, nothing, nothing, np.zeros(count, np.int64), (cloud,) * count, tuple(grasps), {}, nothing
         )
-        told = self.foretell(bundle)
-        for target in set(biotac_sp.TARGETS) - set(told):
-            told[target] = np.full((count, biotac_sp.width(target)), np.nan)
+        found = self.predict_grasps(bundle)
+        for target in set(biotac_sp.TARGETS) - set(found):
+            found[target] = np.full((count, biotac_sp.width(target)), np.nan)
         return [
-            Touch(float(told["pdc_th"][at, 0]), float(told["pdc_mf"][at, 0]), told["e_th"][at], told["e_mf"][at])
+            Touch(float(found["pdc_th"][at, 0]), float(found["pdc_mf"][at, 0]), found["e_th"][at], found["e_mf"][at])
             for at in range(count)
         ]
 
 
-def _member(config: Config, about: Mapping[str, Any], tensors: dict[str, Any], device: str) -> members.Member:
+def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], device: str) -> members.Member:
     targets = tuple(about["targets"])
     width = sum(biotac_sp.width(target) for target in targets)
     if about["kind"] == FOREST:
@@ -164,6 +137,8 @@ def _member(config: Config, about: Mapping[str, Any], tensors: dict[str, Any], d
     scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):
         raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
-    network = model_files.filled(lambda: members.network(config["params"], targets), under("network.", tensors))
-    members.checked(config["params"])
-    return members.NetworkMember(targets, network.to(device).eval(), scale, config["params"])
+    if isinstance(params, Trees):
+        raise ValueError(f"the architecture {params.architecture} has a network")
+    network = model_files.filled(lambda: members.network(params, targets), under("network.", tensors))
+    members.checked(params)
+    return members.NetworkMember(targets, network.to(device).eval(), scale, params)

@@ -1,4 +1,4 @@
-"""What a result of the task ``touch`` calls its parts: who judges writes them, and a report reads them without torch."""
+"""Names of the parts of a result of the task ``touch``: written by its evaluation, read by a report without torch."""
 
 from __future__ import annotations
 

@@ -6,14 +6,15 @@ from collections.abc import Mapping
 
 from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch.evaluation import evaluate
+from tacpipe.tasks.touch.model import TouchModel
 from tacpipe.tasks.touch.prediction import predict
-from tacpipe.tasks.touch.predictor import TASK, Predictor, Touch
+from tacpipe.tasks.touch.predictor import TASK, Touch
 from tacpipe.tasks.touch.training import train
 
 
-def load(files: Mapping[str, bytes], chain: Chain | None = None) -> Predictor:
-    """Return the predictor among a model's files, trained behind the stages ``chain``: what `tacpipe.load` gives."""
-    return Predictor.load(files, chain)
+def load(files: Mapping[str, bytes], chain: Chain | None = None) -> TouchModel:
+    """Return the model among these files, trained behind the stages ``chain``: what `tacpipe.load` returns."""
+    return TouchModel.load(files, chain)
 
 
-__all__ = ["TASK", "Predictor", "Touch", "evaluate", "load", "predict", "train"]
+__all__ = ["TASK", "Touch", "TouchModel", "evaluate", "load", "predict", "train"]

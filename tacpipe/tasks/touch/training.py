@@ -1,4 +1,4 @@
-"""How a model of touch comes about: from grasps and params to its files."""
+"""Train a model of touch: from grasps and params to its files."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
+from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.learning import Drawn, Felt, TouchWork
+from tacpipe.tasks.touch.losses import Drawn, ScaledGrasps, TouchWork
+from tacpipe.tasks.touch.members import NetworkParams
+from tacpipe.tasks.touch.params import Params, Trees
 from tacpipe.tasks.touch.patches import require_colours
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
 from tacpipe.training import loop
@@ -35,7 +38,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 Floats = NDArray[np.float64]
-Params = Mapping[str, Any]
 Config = dict[str, Any]
 
 LEAVES = (2, 4, 8)  # rows of a leaf that are tried
@@ -49,41 +51,41 @@ def train(
 ) -> dict[str, bytes]:
     """Return the files of a model trained on the grasps of ``training``.
 
-    ``params`` are those of the stage `train.touch`. Whatever is fitted is fitted on training grasps alone, and on those of
-    ``validation`` too where ``use_validation`` says so and nothing is chosen by them. Raises `TacpipeError` where
-    grasps lack what is to be read or told.
+    Whatever is fitted is fitted on training grasps alone, and on those of ``validation`` too where ``use_validation`` is
+    set and nothing is chosen by them. Raises `TacpipeError` where grasps lack what is to be read or predicted.
     """
-    asked = CommaList().items(params["targets"])
+    asked = CommaList().items(params.targets)
     targets = tuple(target for target in biotac_sp.TARGETS if target in asked)  # in one order whatever was asked for
     known = grasps_of.read(training)
     if not len(known):
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     watched = grasps_of.read(validation) if validation is not None and validation.recordings else None
-    if watched is not None and params["use_validation"] and not _chooses(params):
+    if watched is not None and params.use_validation and not _chooses(params):
         known, watched = known.joined(watched), None
     config = _config(params, targets, known, watched)
     tensors: dict[str, Tensor] = {}
     history: list[loop.Line] = []
-    if params["architecture"] in ("strong", "trees"):
-        _grow(config, tensors, known, targets)
+    if isinstance(params, Trees):
+        _grow(params, config, tensors, known, targets)
     else:
-        _learn(config, tensors, history, (known, watched), targets, workspace)
+        _learn(params, config, tensors, history, (known, watched), targets, workspace)
     files = {WEIGHTS: save_tensors(tensors)}
     if history:
         files[HISTORY] = "".join(json.dumps(line) + "\n" for line in history).encode()
-    if params["baselines"]:
+    if params.baselines:
         config["learned_objects"] = list(known.objects)
         files[BASELINES] = save_arrays(Baselines.of(known).tensors())
     return {CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), **files}
 
 
 def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Grasps | None) -> Config:
-    """Return what the model's file says of it before anything is learned."""
+    """Return the model's configuration before anything is learned."""
+    stored = params_of.to_json(params)
     return {
         "task": TASK,
-        "architecture": params["architecture"],
-        "params": dict(params),
-        "split": params["setting"],
+        "architecture": stored["architecture"],
+        "params": stored,
+        "split": params.run_label,
         "targets": list(targets),
         "objects": sorted(set(known.objects) - {""}),
         "counts": {"train": len(known), "val": len(watched) if watched else 0},
@@ -96,45 +98,45 @@ def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Gras
 
 def _chooses(params: Params) -> bool:
     """Return whether something is chosen by validation grasps: a network's epoch, or when its training ends."""
-    return params["architecture"] not in ("strong", "trees") and bool(params["select"] == "best" or params["patience"])
+    return not isinstance(params, Trees) and bool(params.select == "best" or params.patience)
 
 
-def _grow(config: Config, tensors: dict[str, Tensor], known: Grasps, targets: Sequence[str]) -> None:
-    """Add a forest a target and, where the model is to be strong, one that tells all targets by the same cuts.
+def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Grasps, targets: Sequence[str]) -> None:
+    """Add a forest a target and, in a tree-ensemble, one that predicts all targets by the same cuts.
 
-    Each has the leaves that foretell best what its trees were not shown.
+    Each has the leaves of the least out-of-bag error.
     """
-    params = config["params"]
     coloured = members.coloured(params)
     if coloured:
         require_colours(known.names, known.clouds)
-    rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params["place"])
+    rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params.place)
     groups = [[target] for target in targets]
-    if params["architecture"] == "strong" and len(targets) > 1:
+    if params.architecture == "tree-ensemble" and len(targets) > 1:
         groups.append(list(targets))
     about: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": groups, "features": list(names)}
-    about |= {"coloured": coloured, "placed": params["place"], "leaves": []}
+    about |= {"coloured": coloured, "placed": params.place, "leaves": []}
     kept: dict[str, Tensor] = {}
     for number, group in enumerate(groups):
         values = _side_by_side(known, group)
         unit = members.units(values, group)
-        leaf = params["leaf"] or _leaf(rows, values / unit, params)
-        forest = Forest.fitted(rows, values / unit, trees=params["trees"], leaf=leaf, seed=params["seed"])
+        leaf = params.leaf or _leaf(rows, values / unit, params)
+        forest = Forest.fitted(rows, values / unit, trees=params.trees, leaf=leaf, seed=params.seed)
         about["leaves"].append(leaf)
         kept |= {f"{number}.{name}": tensor for name, tensor in forest.times(unit).tensors().items()}
     _add(config, tensors, about, kept)
 
 
-def _leaf(rows: Floats, values: Floats, params: Params) -> int:
+def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
     """Return the size of leaves whose trees err least on rows outside of the sample that each was grown on."""
     fitting = [leaf for leaf in LEAVES if 2 * leaf <= len(rows)] or LEAVES[:1]
     if len(fitting) == 1:
         return fitting[0]
-    errors = [Forest.out_of_bag_error(rows, values, leaf=leaf, seed=params["seed"]) for leaf in fitting]
+    errors = [Forest.out_of_bag_error(rows, values, leaf=leaf, seed=params.seed) for leaf in fitting]
     return fitting[int(np.argmin(errors))]
 
 
 def _learn(
+    params: NetworkParams,
     config: Config,
     tensors: dict[str, Tensor],
     history: list[loop.Line],
@@ -142,8 +144,7 @@ def _learn(
     targets: Sequence[str],
     workspace: Path,
 ) -> None:
-    """Add the networks: one for all targets or one for each, and as many of each as ``networks`` says."""
-    params = config["params"]
+    """Add the networks: one for all targets or one for each, and as many of each as ``networks`` is."""
     known, watched = parts
     if watched is None and _chooses(params):
         raise TacpipeError(
@@ -154,15 +155,15 @@ def _learn(
     learned = (members.sources(params, known), known)
     followed = (members.sources(params, watched), watched) if watched else learned  # without any, what was learned
     parameters = 0
-    for group in [tuple(targets)] if params["together"] else [(target,) for target in targets]:
-        scale = _scale(known, group, params["loss"])
+    for group in [tuple(targets)] if params.multi_target else [(target,) for target in targets]:
+        scale = _scale(known, group, params.loss)
         work = _work(params, scale, (learned, followed), group, device)
-        for number in range(params["networks"]):
+        for number in range(params.networks):
             place = workspace / f"{'-'.join(group)}-{number}"
-            schedule = _schedule(params, params["seed"] + 1000 * number)
+            schedule = _schedule(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
-            trained = loop.train(build, work, schedule, place, weight_decay=params["weight_decay"])
-            kept = trained.weights if params["select"] == "best" else trained.last
+            trained = loop.train(build, work, schedule, place, weight_decay=params.weight_decay)
+            kept = trained.weights if params.select == "best" else trained.last
             parameters += _weights_learned(params, group)
             about = {"kind": NETWORK, "targets": list(group)}
             named = {f"network.{name}": value for name, value in kept.items()}
@@ -170,26 +171,27 @@ def _learn(
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
             }
             _add(config, tensors, about, named)
-            whose = {"target": "all" if params["together"] else group[0], "network": number}
+            whose = {"target": "all" if params.multi_target else group[0], "network": number}
             history += [{**line, **whose} for line in trained.history]
     config["parameters"] = parameters
 
 
 def _work(
-    params: Params, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
+    params: NetworkParams, scale: Affine, parts: Sequence[tuple[Drawn, Grasps]], group: Sequence[str], device: str
 ) -> TouchWork:
     """Return what a network of some targets learns; of ``parts`` the first is learned from and the second watched."""
     training, watched = (
-        Felt(drawn, torch.from_numpy(scale.apply(_side_by_side(some, group))).to(device)) for drawn, some in parts
+        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_side_by_side(some, group))).to(device))
+        for drawn, some in parts
     )
-    return TouchWork(training, watched, params["batch"], params["loss"], _weights(group).to(device))
+    return TouchWork(training, watched, params.batch, params.loss, _weights(group).to(device))
 
 
-def _built(params: Params, targets: Sequence[str], device: str) -> nn.Module:
+def _built(params: NetworkParams, targets: Sequence[str], device: str) -> nn.Module:
     return members.network(params, targets).to(device)
 
 
-def _weights_learned(params: Params, targets: Sequence[str]) -> int:
+def _weights_learned(params: NetworkParams, targets: Sequence[str]) -> int:
     """Return how many numbers a network learns; the running means of batches are none of them."""
     with torch.device("meta"):  # shapes alone
         return sum(weight.numel() for weight in members.network(params, targets).parameters())
@@ -202,11 +204,11 @@ def _add(config: Config, tensors: dict[str, Tensor], about: dict[str, Any], name
 
 
 def _side_by_side(some: Grasps, group: Sequence[str]) -> Floats:
-    return np.concatenate([some.felt[target] for target in group], axis=1)
+    return np.concatenate([some.readings[target] for target in group], axis=1)
 
 
 def _scale(known: Grasps, group: Sequence[str], loss: str) -> Affine:
-    """Return the scale of what a network tells: the letter's ranges for its loss, else mean and spread of each value."""
+    """Return the scale of a network's output: the letter's ranges for its loss, else mean and spread of each value."""
     if loss != "rmse":
         return Affine.fit(_side_by_side(known, group), "standard")
     ranges = np.concatenate([[biotac_sp.RANGES[target]] * biotac_sp.width(target) for target in group])
@@ -220,13 +222,13 @@ def _weights(group: Sequence[str]) -> Tensor:
     return weights / weights.mean()
 
 
-def _schedule(params: Params, seed: int) -> loop.Schedule:
+def _schedule(params: NetworkParams, seed: int) -> loop.Schedule:
     return loop.Schedule(
-        epochs=params["epochs"],
-        batch=params["batch"],
-        learning_rate=params["learning_rate"],
-        patience=params["patience"] or params["epochs"],
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience or params.epochs,
         gradient_clip=math.inf,
         seed=seed,
-        cycle=params["cycle"],
+        cycle=params.cycle,
     )

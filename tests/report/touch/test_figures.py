@@ -80,7 +80,7 @@ def test_pressures_are_drawn_for_the_fingers_that_are_foretold() -> None:
     (method,) = methods(result(novel=NOVEL, targets=("pdc_mf", "e_mf")))
     html = pressure.section(method)
     assert html.count("<svg") == 1
-    assert "PDC middle finger, strong: 40 unseen grasps" in html
+    assert "PDC middle finger, tree-ensemble: 40 unseen grasps" in html
     assert "drill (novel)" in html
 
 

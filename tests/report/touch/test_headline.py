@@ -23,7 +23,9 @@ def told(*results: Any) -> list[str]:
 
 def test_gain_over_the_best_baseline_is_told_for_each_target_with_what_it_rests_on() -> None:
     ((known, verdict),) = said(result(baselines={"object_mean": 0.2}))
-    assert known.startswith("Known objects: strong is better than the best baseline on PDC thumb (skill +0.500, ")
+    assert known.startswith(
+        "Known objects: tree-ensemble is better than the best baseline on PDC thumb (skill +0.500, "
+    )
     assert "over constant" in known and "electrodes middle finger (skill" in known
     assert known.endswith("; 24 grasps of 3 objects in 1 run (95 % intervals over grasps).")
     assert verdict == "better"
@@ -31,7 +33,7 @@ def test_gain_over_the_best_baseline_is_told_for_each_target_with_what_it_rests_
 
 def test_a_baseline_that_is_better_takes_the_green_and_is_named() -> None:
     ((known, verdict),) = said(result(baselines={"object_mean": 0.04}))
-    assert known.startswith("Known objects: strong is worse than the best baseline on PDC thumb (skill −0.250, ")
+    assert known.startswith("Known objects: tree-ensemble is worse than the best baseline on PDC thumb (skill −0.250, ")
     assert "over mean of the object" in known
     assert verdict == "worse"
 
@@ -55,14 +57,16 @@ def test_where_nothing_is_better_than_the_constant_on_novel_objects_it_says_so()
     assert found[1][0].endswith(f"{none}no evidence of generalisation.")
     assert found[1][1] != "better"
     alone = told(result(off=worse, novel=NOVEL))[1]
-    assert "strong is not better than the best baseline" in alone and alone.endswith("no evidence of generalisation.")
+    assert "tree-ensemble is not better than the best baseline" in alone and alone.endswith(
+        "no evidence of generalisation."
+    )
 
 
 def test_methods_that_were_not_evaluated_on_novel_objects_are_not_counted() -> None:
     off = {**APART, "drill": 0.12, "shoe": 0.12}
     given = [result(off=off, novel=NOVEL), result("trees", off=0.11, novel=NOVEL), result("pointnet")]
     assert "None of the 2 methods is" in told(*given)[1]
-    assert "strong is not better" in told(given[0], given[2])[1]
+    assert "tree-ensemble is not better" in told(given[0], given[2])[1]
     assert told(result(), given[1])[1].startswith("Novel objects: trees on geometry and colour is not better than")
 
 

@@ -24,12 +24,12 @@ def test_runs_that_differ_in_seed_words_or_other_networks_targets_are_one_method
 
 def test_options_that_another_architecture_has_set_no_method_apart() -> None:
     found = methods(result(trees=300), result(trees=300, points=64, head="fc1"), result(trees=300, wrist="estimated"))
-    assert [(one.name, len(one.runs)) for one in found] == [("strong", 3)]
+    assert [(one.name, len(one.runs)) for one in found] == [("tree-ensemble", 3)]
 
 
 def test_one_network_for_other_targets_is_another_method() -> None:
     found = methods(result(together=True), result(together=True), result(together=True, targets=("pdc_th",)))
-    assert [one.name for one in found] == ["strong", "strong · targets pdc_th"]
+    assert [one.name for one in found] == ["tree-ensemble", "tree-ensemble · targets pdc_th"]
 
 
 def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -> None:
@@ -49,17 +49,17 @@ def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -
 
 
 def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_do_not() -> None:
-    kinds = ("strong", "trees", "patches")
+    kinds = ("strong", "trees", "patches")  # as they are stored
     found = methods(*(result(kind, inputs=inputs) for kind in kinds for inputs in ("rgbcont", "xyzcont", "xyz")))
     assert [(one.name, len(one.runs)) for one in found] == [
         ("patches", 1),
         ("patches · without colour", 2),  # contacts are read whatever the inputs
-        ("strong", 1),
-        ("strong · without colour", 2),
+        ("tree-ensemble", 1),
+        ("tree-ensemble · without colour", 2),
         ("trees on geometry", 2),
         ("trees on geometry and colour", 1),
     ]
-    assert [one.name for one in methods(result(inputs="xyz"))] == ["strong · without colour"]  # alone, too
+    assert [one.name for one in methods(result(inputs="xyz"))] == ["tree-ensemble · without colour"]  # alone, too
     assert [one.name for one in methods(result("pointnet", inputs="xyz"), result("pointnet"), result("pointnet"))] == [
         "PointNet",
         "PointNet · inputs xyz",
@@ -68,7 +68,11 @@ def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_
 
 def test_marks_of_other_settings_come_behind_the_colour() -> None:
     found = methods(result(leaf=0), *(result(inputs="xyz", leaf=leaf) for leaf in (0, 4)))
-    assert [one.name for one in found] == ["strong", "strong · without colour", "strong · without colour · leaf 4"]
+    assert [one.name for one in found] == [
+        "tree-ensemble",
+        "tree-ensemble · without colour",
+        "tree-ensemble · without colour · leaf 4",
+    ]
 
 
 def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
@@ -87,9 +91,9 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
         )
     )
     assert [(one.split, one.simulated) for one in found] == [("random", False), ("folds", False), ("random", True)]
-    assert [one.name for one in found[0].methods] == ["strong", "trees on geometry and colour"]
+    assert [one.name for one in found[0].methods] == ["tree-ensemble", "trees on geometry and colour"]
     assert {one.name for group in found for one in group.methods} == {
-        "strong",
+        "tree-ensemble",
         "PointNet",
         "trees on geometry and colour",
     }
@@ -97,13 +101,13 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
 
 def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
     (both,) = groups(methods(result(), result("trees", seed=0), result("trees", seed=1)))
-    assert both.default.name == "strong"
+    assert both.default.name == "tree-ensemble"
     (others,) = groups(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
     assert others.default.name == "trees on geometry and colour"
 
 
 def test_one_method_an_architecture_is_told_in_detail() -> None:
     (group,) = groups(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
-    assert [one.name for one in group.main] == ["PointNet", "strong"]
+    assert [one.name for one in group.main] == ["PointNet", "tree-ensemble"]
     (both,) = groups(methods(result("trees", inputs="xyzcont"), result("trees")))
     assert [one.name for one in both.main] == ["trees on geometry and colour"]

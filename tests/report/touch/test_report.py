@@ -39,7 +39,7 @@ def test_all_parts_are_told_on_one_page_that_is_the_same_each_time() -> None:
         "Novel objects:",
         "PDC thumb, known objects",
         "electrodes middle finger, novel objects",
-        "By object, strong",
+        "By object, tree-ensemble",
         "R² of each electrode on novel objects",
         "Worst decile by error",
         "Clouds and their grasps",

@@ -22,7 +22,7 @@ def test_errors_stand_in_shares_and_counts_with_skill_r2_and_what_they_rest_on()
     given = [result(off=off, seed=seed, **PDC) for seed, off in enumerate((0.04, 0.06))]
     (group,) = groups(methods(*given, result("trees", off=0.07, **PDC)))
     html = tables.errors(group, True)
-    row = cells(html, "strong")
+    row = cells(html, "tree-ensemble")
     assert row[:3] == ["0.0510", "46", "0.74"]  # √((0.04² + 0.06²)/2) of 900 counts, 1 - 0.0026/0.01
     assert row[3].startswith("+0.490")
     assert [one.replace("\N{NO-BREAK SPACE}", " ") for one in row[4:]] == [
@@ -32,7 +32,7 @@ def test_errors_stand_in_shares_and_counts_with_skill_r2_and_what_they_rest_on()
         "24",
         "2",
     ]
-    assert '<tr class="best"><td>strong' in html
+    assert '<tr class="best"><td>tree-ensemble' in html
     assert tables.errors(group, False) == ""
 
 
@@ -63,7 +63,7 @@ def test_each_object_is_told_beside_its_mean_and_novel_ones_have_none() -> None:
 def test_every_run_is_listed_on_known_and_on_novel_objects() -> None:
     html = tables.every_run(methods(result(novel=NOVEL, targets=("pdc_th",), seed=3, train=412)))
     assert "The run" in html
-    assert cells(html, "strong")[:7] == ["random", "3", "412", "known objects", "24", "0.0500", "0.75"]
+    assert cells(html, "tree-ensemble")[:7] == ["random", "3", "412", "known objects", "24", "0.0500", "0.75"]
 
 
 def test_table_1_holds_heads_beside_the_papers_and_baselines() -> None:

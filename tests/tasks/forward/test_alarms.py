@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tacpipe.tasks.forward.alarms import Loads
-from tacpipe.tasks.forward.predictors import Prediction, Told
+from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 from tests.models.window_fakes import LAYOUT
 from tests.stages.learning_fakes import CHANNELS, table
@@ -31,14 +31,14 @@ def stepped(seed: int = 0) -> Floats:
     return load
 
 
-def said(one: Track, ahead: dict[str, Floats]) -> Told:
+def said(one: Track, ahead: dict[str, Floats]) -> Predicted:
     """What predictors say of each row (time,) but the first: the load of the last step of the horizon."""
     now = np.arange(1, len(one.t_ns) - HORIZON)
     predictions = {
         name: Prediction(None, np.tile(values[now, None, None], (1, HORIZON, len(CHANNELS))))
         for name, values in ahead.items()
     }
-    return Told(now, np.zeros(0), Prediction(None, np.zeros(0)), predictions)
+    return Predicted(now, np.zeros(0), Prediction(None, np.zeros(0)), predictions)
 
 
 def loads(*parts: tuple[Track, dict[str, Floats]]) -> Loads:

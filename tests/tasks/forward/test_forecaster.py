@@ -15,7 +15,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load as load_stage
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.task import Forecaster, load
+from tacpipe.tasks.forward.task import ForwardModel, load
 from tests.conftest import sample_data
 from tests.report.stream_shard import StreamShard
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
@@ -39,7 +39,7 @@ TEST = motion(20)
 @pytest.fixture(scope="module")
 def latents() -> Mapping[str, Any]:
     """Training recordings by what their latents stand for."""
-    return {of: compressed(*(motion(seed) for seed in range(3)), of=of) for of in ("levels", "increments")}
+    return {of: compressed(*(motion(seed) for seed in range(3)), representation=of) for of in ("levels", "increments")}
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +49,14 @@ def models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory)
     for name in ("gru raw", "taxelwise raw", "recurrent raw", "gru levels", "recurrent levels", "gru increments"):
         architecture, of = name.split()
         training = latents.get(of)
-        watched = None if training is None else compressed(motion(10), files=training.files, of=of)
+        watched = None if training is None else compressed(motion(10), files=training.files, representation=of)
         folder, fast = tmp_path_factory.mktemp("model"), {"learning_rate": 0.02, "epochs": 3}
         found[name] = trained(folder, training, watched, architecture=architecture, **fast)
     return found
 
 
 @pytest.fixture(scope="module")
-def forecaster(models: Mapping[str, Mapping[str, bytes]]) -> Forecaster:
+def forecaster(models: Mapping[str, Mapping[str, bytes]]) -> ForwardModel:
     return load(models["gru raw"])
 
 
@@ -90,7 +90,7 @@ def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_wi
     models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
     made = load(models["gru increments"])
-    shard = compressed(TEST, files=latents["increments"].files, of="increments").recordings[TEST.name]
+    shard = compressed(TEST, files=latents["increments"].files, representation="increments").recordings[TEST.name]
     found, starts, some = foretold(made, shard)
     predicted, wanted = made.predict(*asked(found, starts)), some.predictions["model"].count
     # the first window begins where the recording does, so that nothing is lost
@@ -98,14 +98,14 @@ def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_wi
     assert np.abs(predicted - wanted).mean() < 0.2 * np.abs(predicted - found.tactile[some.now][:, None]).mean()
 
 
-def test_one_window_needs_no_axis(forecaster: Forecaster) -> None:
+def test_one_window_needs_no_axis(forecaster: ForwardModel) -> None:
     window, plan = windows()
     together = forecaster.predict(window, plan)
     assert forecaster.predict(window[1], plan[1]).shape == (HORIZON, len(CHANNELS))
     assert np.allclose(forecaster.predict(window[1], plan[1]), together[1], atol=1e-3)
 
 
-def test_velocities_that_are_left_out_are_differences_of_poses(forecaster: Forecaster) -> None:
+def test_velocities_that_are_left_out_are_differences_of_poses(forecaster: ForwardModel) -> None:
     window, plan = windows()
     arm = np.concatenate([window[..., len(CHANNELS) :], plan], axis=1)
     t_ns = np.arange(LENGTH) * 20_000_000
@@ -116,7 +116,7 @@ def test_velocities_that_are_left_out_are_differences_of_poses(forecaster: Forec
     assert np.allclose(forecaster.predict(window, plan), told, atol=1e-3)
 
 
-def test_the_columns_that_it_names_are_those_that_it_reads(forecaster: Forecaster) -> None:
+def test_the_columns_that_it_names_are_those_that_it_reads(forecaster: ForwardModel) -> None:
     assert forecaster.window_columns == (*CHANNELS, *tracks.POSE)
     assert forecaster.plan_columns == tracks.POSE
     assert set(forecaster.window_columns) < set(TEST.content.column_names)  # a dataset has each
@@ -189,7 +189,7 @@ def spoiled(at: tuple[int, ...], value: float, of_plan: bool = False) -> tuple[F
         ((windows()[0], np.zeros((3, HORIZON, 7))), "The plan holds a quaternion of length 0"),
     ],
 )
-def test_what_cannot_be_read_is_one_sentence(given: tuple[Floats, Floats], said: str, forecaster: Forecaster) -> None:
+def test_what_cannot_be_read_is_one_sentence(given: tuple[Floats, Floats], said: str, forecaster: ForwardModel) -> None:
     with pytest.raises(TacpipeError, match=said):
         forecaster.predict(*given)
 
@@ -205,7 +205,7 @@ def test_raw_counts_are_refused_and_counts_above_rest_are_not(
         made.predict(window, plan)
 
 
-def test_hard_contact_that_training_had_not_is_no_raw_counts(forecaster: Forecaster) -> None:
+def test_hard_contact_that_training_had_not_is_no_raw_counts(forecaster: ForwardModel) -> None:
     window, plan = windows()
     assert forecaster.largest_level is not None
     window[..., :3] = 40 * forecaster.largest_level  # a quarter of all channels
@@ -217,7 +217,7 @@ def test_hard_contact_that_training_had_not_is_no_raw_counts(forecaster: Forecas
 def test_a_model_that_keeps_no_level_predicts_with_a_warning(models: Mapping[str, Mapping[str, bytes]]) -> None:
     config = json.loads(models["gru raw"]["config.json"])
     del config["largest_level"]
-    older = Forecaster.load({**models["gru raw"], "config.json": json.dumps(config).encode()})
+    older = ForwardModel.load({**models["gru raw"], "config.json": json.dumps(config).encode()})
     with pytest.warns(UserWarning, match="trained before levels were kept"):
         found = older.predict(*windows())
     assert np.array_equal(found, load(models["gru raw"]).predict(*windows()))
@@ -262,7 +262,7 @@ def test_a_model_of_another_task_is_refused(models: Mapping[str, Mapping[str, by
     files = models["gru raw"]
     config = {**json.loads(files["config.json"]), "task": "material"}
     with pytest.raises(TacpipeError, match="trained for material"):
-        Forecaster.load({**files, "config.json": json.dumps(config).encode()})
+        ForwardModel.load({**files, "config.json": json.dumps(config).encode()})
 
 
 def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from safetensors.numpy import load
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forecasts import ARCHITECTURES
+from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import task as forward
 from tacpipe.training import checkpoint
 from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
@@ -73,7 +74,7 @@ def test_the_config_tells_what_was_trained_on_what(tmp_path: Path) -> None:
         "train": {"recordings": 3, "windows": 3 * 36},
         "val": {"recordings": 2, "windows": 2 * 72},  # validation and test have every window, whatever the stride
     }
-    assert found["params"] == params(stride=2) | {"loss": "absolute"}
+    assert found["params"] == to_json(params(stride=2, loss="absolute"))
     assert set(found["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
     assert set(found["anticipation"]) == {"sd", "theta"}
 
@@ -233,7 +234,7 @@ def test_a_model_of_another_representation_is_nothing_to_begin_with(tmp_path: Pa
 
 @pytest.mark.parametrize(("of", "name"), [("levels", "PCA-3"), ("increments", "PCA-3 increments")])
 def test_a_model_of_latents_holds_its_codec(of: str, name: str, tmp_path: Path) -> None:
-    training = compressed(*TRAIN, of=of)
+    training = compressed(*TRAIN, representation=of)
     files = trained(tmp_path, training, compressed(*VAL, files=training.files))
     assert set(files) == FILES | {"codec.json", "codec.safetensors"}
     assert files["codec.safetensors"] == training.files["codec.safetensors"]

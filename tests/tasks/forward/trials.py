@@ -20,7 +20,7 @@ from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.predictors import Told, told
+from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
 
@@ -30,7 +30,7 @@ LENGTH = CONTEXT + HORIZON
 SMALL = {"architecture": "gru", "hidden": 16, "epochs": 2, "batch": 64, "context": CONTEXT, "horizon": HORIZON}
 
 
-def params(**changed: Any) -> dict[str, Any]:
+def params(**changed: Any) -> Any:
     """The params of the training stage, small."""
     return fitting("train.forward", SMALL, **changed)
 
@@ -41,11 +41,11 @@ def trained(folder: Path, training: Any = None, validation: Any = None, **change
     return forward.train(params(**changed), training, validation or dataset(motion(10)), folder)
 
 
-def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, of: str = "levels") -> Any:
+def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, representation: str = "levels") -> Any:
     """The recordings with three principal components, and the codec's files."""
     stage = registry.load("compress.pca")
     assert stage.fit is not None
-    asked = stage.params(components=3, of=of)
+    asked = stage.params(components=3, representation=representation)
     files = dict(files or stage.fit(asked, dataset(*shards)).files)
     latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
     return dataset(*latent, files=files)
@@ -63,11 +63,11 @@ def judged(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, b
     return json.loads(result.files["metrics.json"]), result
 
 
-def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[np.int64], Told]:
+def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[np.int64], Predicted]:
     """What a model says of all windows of a recording, with the windows' first rows."""
     found = tracks.track(shard, forecaster.codec)
     starts = found.starts(forecaster.context, forecaster.horizon)
-    (some,) = told(forecaster, found, starts)
+    (some,) = predicted(forecaster, found, starts)
     return found, starts, some
 
 

@@ -21,12 +21,12 @@ def visited(pairs: Pairs, sensor: str) -> list[int]:
     return [int(one) for batch in pairs.epoch() for one in batch[sensor] if one != NONE]
 
 
-@pytest.mark.parametrize("ratio, count", [(100, 576), (90, 512), (50, 288), (25, 160), (17, 96), (11, 64)])
-def test_a_reduced_sensor_learns_from_the_same_few_slides_in_every_epoch(ratio: int, count: int) -> None:
+@pytest.mark.parametrize("percent, count", [(100, 576), (90, 512), (50, 288), (25, 160), (17, 96), (11, 64)])
+def test_a_reduced_sensor_learns_from_the_same_few_slides_in_every_epoch(percent: int, count: int) -> None:
     whole = two(pairing="fixed", shuffle=False, drop_last=True)
-    reduced = two(pairing="fixed", shuffle=False, reduced="b", ratio=ratio)
+    reduced = two(pairing="fixed", shuffle=False, subsample_sensor="b", subsample_percent=percent)
     order = visited(whole, "b")
-    every = {100: 1, 50: 2, 25: 4, 17: 6, 11: 9}.get(ratio)
+    every = {100: 1, 50: 2, 25: 4, 17: 6, 11: 9}.get(percent)
     kept = [n for n in range(18) if (n % every == 0 if every else n % 10)]
     assert visited(reduced, "b") == [one for n in kept for one in order[32 * n : 32 * n + 32]]
     assert len(visited(reduced, "b")) == count
@@ -102,9 +102,9 @@ def test_three_sensors_are_dealt_side_by_side() -> None:
     "changed, sentence",
     [
         ({"pairing": "none"}, "pairing is 'none'"),
-        ({"ratio": 30, "reduced": "a", "shuffle": False}, "ratio is 30 %"),
-        ({"reduced": "c", "shuffle": False}, "the sensor c; there are a, b"),
-        ({"reduced": "a", "ratio": 50}, "give --no-shuffle"),
+        ({"subsample_percent": 30, "subsample_sensor": "a", "shuffle": False}, "subsample_percent is 30"),
+        ({"subsample_sensor": "c", "shuffle": False}, "subsample_sensor is c"),
+        ({"subsample_sensor": "a", "subsample_percent": 50}, "give --no-shuffle"),
     ],
 )
 def test_what_cannot_be_dealt_is_refused(changed: dict[str, object], sentence: str) -> None:

@@ -146,10 +146,10 @@ def test_labels_dealt_out_anew_leave_nothing_to_learn(tmp_path: Path) -> None:
     [
         ({"speeds": "biotac"}, "speeds is 'biotac'; it must be a comma-separated list of NAME=VALUE"),
         ({"speeds": "biotac=-1"}, "each value a number above 0"),
-        ({"speeds": "biotac=0.02"}, "Nothing tells how fast roboskin slides"),
-        ({"hold_out": "roboskin=3;biotac=3"}, "no sensor that is told of material 3"),
-        ({"hold_out": "roboskin=3", "sensors": "roboskin"}, "no sensor that is told of material 3"),
-        ({"hold_out": "roboskin=1,2,3,4,5,6"}, "told 2 classes in common"),
+        ({"speeds": "biotac=0.02"}, "roboskin .*biotac=0.02"),
+        ({"hold_out": "roboskin=3;biotac=3"}, "hold_out .*material 3"),
+        ({"hold_out": "roboskin=3", "sensors": "roboskin"}, "hold_out .*material 3"),
+        ({"hold_out": "roboskin=1,2,3,4,5,6"}, " 2 classes"),
         ({"hold_out": "roboskin=9"}, "hold_out names roboskin=9"),
     ],
 )

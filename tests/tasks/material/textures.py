@@ -65,7 +65,7 @@ def slides(first: int, count: int, sensors: tuple[str, ...] = ("biotac", "robosk
     )
 
 
-def params(**changed: Any) -> dict[str, Any]:
+def params(**changed: Any) -> Any:
     return fitting("train.material", SMALL, **changed)
 
 

@@ -95,7 +95,7 @@ def grasps(first: int = 0, count: int = 6, **given: Any) -> Grasps:
     return grasps_of.read(recordings(first, count, **given))
 
 
-def params(**changed: Any) -> dict[str, Any]:
+def params(**changed: Any) -> Any:
     return fitting("train.touch", SMALL, **changed)
 
 

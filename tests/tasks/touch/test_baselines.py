@@ -24,25 +24,25 @@ def asked(objects: tuple[str, ...], t_ns: tuple[int, ...]) -> Grasps:
 
 
 def test_the_constant_is_the_mean_of_all_training_grasps() -> None:
-    told = baselines().foretell(asked(("ball", "drill"), (0, 5)))["constant"]
+    told = baselines().predict(asked(("ball", "drill"), (0, 5)))["constant"]
     assert told["pdc_th"].tolist() == [[40.0], [40.0]]
     assert told["e_th"].tolist() == [list(np.arange(24) + 36.0)] * 2
 
 
 def test_the_object_mean_is_that_of_the_same_object_and_the_constant_for_others() -> None:
-    told = baselines().foretell(asked(("egg", "ball", "drill", ""), (0, 0, 0, 0)))["object_mean"]
+    told = baselines().predict(asked(("egg", "ball", "drill", ""), (0, 0, 0, 0)))["object_mean"]
     assert told["pdc_th"].tolist() == [[40.0], [15.0], [40.0], [40.0]]
     assert told["e_th"][1].tolist() == list(np.arange(24) + 12.0)
 
 
 def test_the_nearest_in_time_are_three_whatever_their_object() -> None:
-    told = baselines().foretell(asked(("drill",) * 3, (90, 1000, 10**18)))["nearest_in_time"]
+    told = baselines().predict(asked(("drill",) * 3, (90, 1000, 10**18)))["nearest_in_time"]
     assert told["pdc_th"].tolist() == [[(10 + 20 + 40) / 3], [(20 + 40 + 90) / 3], [(20 + 40 + 90) / 3]]
 
 
 def test_of_fewer_than_three_training_grasps_all_are_nearest() -> None:
     two = Baselines({"pdc_th": FELT["pdc_th"][:2]}, ("a", "b"), np.array([0, 1], np.int64))
-    assert two.foretell(asked(("a",), (7,)))["nearest_in_time"]["pdc_th"].tolist() == [[15.0]]
+    assert two.predict(asked(("a",), (7,)))["nearest_in_time"]["pdc_th"].tolist() == [[15.0]]
 
 
 def test_tensors_and_their_bytes_give_back_the_baselines() -> None:
@@ -50,7 +50,7 @@ def test_tensors_and_their_bytes_give_back_the_baselines() -> None:
     again = Baselines.from_tensors(load(save(one.tensors())), one.objects)
     assert again.objects == one.objects
     assert again.t_ns.tolist() == one.t_ns.tolist()
-    assert {name: felt.tolist() for name, felt in again.felt.items()} == {n: f.tolist() for n, f in FELT.items()}
+    assert {name: felt.tolist() for name, felt in again.readings.items()} == {n: f.tolist() for n, f in FELT.items()}
 
 
 def test_times_of_nanoseconds_since_1970_keep_their_last_digit() -> None:

@@ -37,22 +37,22 @@ def test_grasps_come_in_the_order_of_their_names_with_all_that_was_felt() -> Non
     assert found.sessions == ("ball-s01", "melon-s01")
     assert found.t_ns.tolist() == [180_000_000_000, 420_000_000_000]
     assert found.digests == (other.digest, one.digest)
-    assert {target: felt.shape for target, felt in found.felt.items()} == {
+    assert {target: felt.shape for target, felt in found.readings.items()} == {
         "pdc_th": (2, 1),
         "pdc_mf": (2, 1),
         "e_th": (2, 24),
         "e_mf": (2, 24),
     }
     row = one.tables["reading"].to_pylist()[0]
-    assert found.felt["pdc_mf"][1].tolist() == [row["mf_pdc"]]
-    assert found.felt["e_th"][1].tolist() == [row[f"th_electrode{n:02d}"] for n in range(1, 25)]
+    assert found.readings["pdc_mf"][1].tolist() == [row["mf_pdc"]]
+    assert found.readings["e_th"][1].tolist() == [row[f"th_electrode{n:02d}"] for n in range(1, 25)]
     np.testing.assert_array_equal(found.clouds[0].points_m, cloud(3).points_m)
 
 
 def test_grasps_need_no_reading_where_none_is_asked_for() -> None:
-    found = grasps_of.read(recordings(felt=False), felt=False)
+    found = grasps_of.read(recordings(felt=False), with_readings=False)
     assert len(found) == 12
-    assert found.felt == {}
+    assert found.readings == {}
 
 
 def test_objects_and_sessions_that_are_not_told_are_empty() -> None:
@@ -67,7 +67,9 @@ def test_joined_grasps_stand_one_after_the_other() -> None:
     assert len(both.clouds) == len(both.grasps) == len(both.digests) == len(both) == 6
     np.testing.assert_array_equal(both.t_ns[-2:], other.t_ns)
     for target in biotac_sp.TARGETS:
-        np.testing.assert_array_equal(both.felt[target], np.concatenate([one.felt[target], other.felt[target]]))
+        np.testing.assert_array_equal(
+            both.readings[target], np.concatenate([one.readings[target], other.readings[target]])
+        )
 
 
 FAR = Grasp(np.array([0.02, -0.1, 0.8]), np.array([0.02, -0.1, 1.2]))
@@ -79,7 +81,7 @@ NAN = pa.table({name: np.array([0.0, np.nan, 1.0, 2.0], np.float32) for name in 
     [
         (without(recording(0), "cloud"), "ball-000 has the streams grasp, reading and no cloud.*segment grasps"),
         (without(recording(0), "grasp"), "ball-000 has the streams cloud, reading and no grasp"),
-        (without(recording(0), "reading"), "ball-000 has no reading of touch.*tacpipe predict"),
+        (without(recording(0), "reading"), "ball-000 has no tactile reading.*tacpipe predict"),
         (without(recording(0), "cloud", "y_m"), "ball-000: The column y_m is missing"),
         (without(recording(0), "grasp", "g2_z_m"), "ball-000: The column g2_z_m is missing"),
         (without(recording(0), "reading", "th_pdc"), "ball-000: The column th_pdc is missing"),

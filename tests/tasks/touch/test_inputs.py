@@ -144,8 +144,8 @@ def test_an_estimated_wrist_stands_for_the_one_that_is_told() -> None:
             grasp(0),
             "ball-7 has a cloud without colours.*inputs rgb",
         ),
-        (Inputs("xyzpose", 5, "none"), cloud(0), grasp(0, wrist=False), "ball-7 does not tell how the wrist is turned"),
-        (Inputs("xyz", 5, "wrist"), cloud(0), grasp(0, wrist=False), "ball-7 does not tell how.*--wrist estimated"),
+        (Inputs("xyzpose", 5, "none"), cloud(0), grasp(0, wrist=False), "ball-7 .*wrist"),
+        (Inputs("xyz", 5, "wrist"), cloud(0), grasp(0, wrist=False), "ball-7 .*--wrist estimated"),
     ],
 )
 def test_a_grasp_that_lacks_what_is_read_is_refused_by_name(

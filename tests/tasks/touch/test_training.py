@@ -12,6 +12,7 @@ from safetensors.torch import load
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models.forest import Forest
+from tacpipe.plugins.params import to_json
 from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch import training
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, HISTORY, WEIGHTS
@@ -36,14 +37,14 @@ TREES = {"architecture": "trees"}
 
 
 def test_a_model_holds_what_it_was_trained_on_and_how(tmp_path: Path) -> None:
-    files = trained(tmp_path, setting="blocked")
+    files = trained(tmp_path, run_label="blocked")
     assert set(files) == {CONFIG, WEIGHTS, BASELINES}
     assert set(trained(tmp_path, **PATCHES)) == {CONFIG, WEIGHTS, BASELINES, HISTORY}
     told = config(files)
     assert told["task"] == "touch"
     assert told["architecture"] == "strong"
     assert told["split"] == "blocked"
-    assert told["params"] == params(setting="blocked")
+    assert told["params"] == to_json(params(run_label="blocked"))
     assert told["targets"] == ["pdc_th", "pdc_mf", "e_th", "e_mf"]
     assert told["objects"] == ["ball", "melon"]
     assert told["counts"] == {"train": 12, "val": 0}
@@ -52,7 +53,7 @@ def test_a_model_holds_what_it_was_trained_on_and_how(tmp_path: Path) -> None:
 
 
 def test_strong_trees_are_a_forest_a_target_and_one_of_all(tmp_path: Path) -> None:
-    strong, trees = (config(trained(tmp_path, architecture=one))["members"][0] for one in ("strong", "trees"))
+    strong, trees = (config(trained(tmp_path, architecture=one))["members"][0] for one in ("tree-ensemble", "trees"))
     alone = [["pdc_th"], ["pdc_mf"], ["e_th"], ["e_mf"]]
     assert trees["groups"] == alone
     assert strong["groups"] == [*alone, ["pdc_th", "pdc_mf", "e_th", "e_mf"]]
@@ -71,7 +72,7 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(changed: 
 @pytest.mark.long
 @pytest.mark.parametrize(
     "changed",
-    [{**PATCHES, "networks": 2}, {**POINTNET, "together": False, "targets": "pdc_th,e_th", "rotation_deg": 45.0}],
+    [{**PATCHES, "networks": 2}, {**POINTNET, "multi_target": False, "targets": "pdc_th,e_th", "rotation_deg": 45.0}],
 )
 @pytest.mark.parametrize("epochs", [1, 2])
 def test_an_interrupted_training_goes_on_where_it_was(
@@ -155,7 +156,7 @@ def test_patience_ends_a_training_whose_validation_loss_no_longer_falls(tmp_path
 
 
 def test_one_network_a_target_makes_four_members_each_with_its_history(tmp_path: Path) -> None:
-    files = trained(tmp_path, **{**POINTNET, "targets": "e_mf, pdc_th,e_th,pdc_mf", "together": False})
+    files = trained(tmp_path, **{**POINTNET, "targets": "e_mf, pdc_th,e_th,pdc_mf", "multi_target": False})
     told = config(files)
     assert [one["targets"] for one in told["members"]] == [["pdc_th"], ["pdc_mf"], ["e_th"], ["e_mf"]]
     assert [(line["target"], line["network"], line["epoch"]) for line in history(files)] == [
@@ -175,11 +176,11 @@ def test_several_networks_have_other_first_weights(tmp_path: Path) -> None:
     assert not (weights["0.network.head.0.weight"] == weights["1.network.head.0.weight"]).all()
 
 
-@pytest.mark.parametrize("changed", [{}, TREES, PATCHES, {**POINTNET, "together": True}])
+@pytest.mark.parametrize("changed", [{}, TREES, PATCHES, {**POINTNET, "multi_target": True}])
 def test_some_targets_alone_are_told_where_only_they_are_asked_for(changed: dict[str, Any], tmp_path: Path) -> None:
     files = trained(tmp_path, **{**changed, "targets": "e_th,pdc_mf"})
     assert config(files)["targets"] == ["pdc_mf", "e_th"]
-    told = touch.load(files).foretell(grasps(6, 1))
+    told = touch.load(files).predict_grasps(grasps(6, 1))
     assert {target: values.shape for target, values in told.items()} == {"pdc_mf": (2, 1), "e_th": (2, 24)}
     metrics, result = judged(files, recordings(6, 2))
     assert list(metrics["model"]["rmse"]) == ["e_th", "pdc_mf"]
@@ -244,7 +245,7 @@ def test_the_papers_networks_learn_shares_of_its_ranges_and_the_balanced_loss_st
     assert paper["0.scale.offset"].tolist() == [2500]
     assert paper["0.scale.scale"].tolist() == [900]
     other = load(trained(tmp_path / "b", **PATCHES, targets="pdc_th")[WEIGHTS])
-    felt = grasps().felt["pdc_th"]
+    felt = grasps().readings["pdc_th"]
     assert other["0.scale.offset"].tolist() == pytest.approx([felt.mean()])
     assert other["0.scale.scale"].tolist() == pytest.approx([felt.std()])
 
@@ -263,12 +264,12 @@ def test_networks_learn_what_they_are_shown_given_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"architecture": "forest"}, "architecture is 'forest'; it must be one of strong, trees"),
+        ({"architecture": "forest"}, "architecture is 'forest'; it must be one of tree-ensemble, trees"),
         ({**PATCHES, "select": "first"}, "select is 'first'; it must be one of last, best"),
         ({"targets": "pdc_th,thumb"}, "targets is 'pdc_th,thumb'; .* each item one of pdc_th, pdc_mf"),
         ({"targets": " , "}, "targets is ' , '; it must be a comma-separated list"),
         ({"inputs": "grey"}, "inputs is 'grey'; it must be one of rgb, xyz"),
-        ({"inputs": "rgbpose"}, "inputs is 'rgbpose'; with architecture strong it must be one of rgb, xyz"),
+        ({"inputs": "rgbpose"}, "inputs is 'rgbpose'; with architecture tree-ensemble it must be one of rgb, xyz"),
         ({**PATCHES, "networks": 0}, "networks is 0; it must be a whole number of 1 or more"),
         ({**PATCHES, "draws": 0}, "draws is 0; it must be a whole number from 1 to 100000"),
         ({"trees": -1}, "trees is -1; it must be a whole number of 1 or more"),

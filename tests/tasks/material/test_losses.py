@@ -10,16 +10,16 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.recurrent_autoencoder import Shape, build
-from tacpipe.tasks.material.learning import Felt, JointWork, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import NONE, Pairs
 
 CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
 SHAPES = {"a": Shape(4, 3, hidden=6, latents=5), "b": Shape(7, 3, hidden=6, latents=5)}
 
 
-def felt(sensor: str, classes: Tensor = CLASSES) -> Felt:
+def felt(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
     generator = torch.Generator().manual_seed(len(sensor) + SHAPES[sensor].channels)
-    return Felt(torch.randn(len(classes), 9, SHAPES[sensor].channels, generator=generator), classes)
+    return ScaledSlides(torch.randn(len(classes), 9, SHAPES[sensor].channels, generator=generator), classes)
 
 
 def networks(architecture: str = "raec") -> nn.ModuleDict:
@@ -27,10 +27,10 @@ def networks(architecture: str = "raec") -> nn.ModuleDict:
     return nn.ModuleDict({name: build(architecture, shape) for name, shape in SHAPES.items()})
 
 
-def work(weights: Weights, known: str = "", **classes: Tensor) -> JointWork:
+def work(weights: Weights, frozen: str = "", **classes: Tensor) -> JointWork:
     given = {name: felt(name, classes.get(name, CLASSES)) for name in SHAPES}
     pairs = Pairs({name: one.classes for name, one in given.items()}, 16)
-    return JointWork(given, given, pairs, weights, known)
+    return JointWork(given, given, pairs, weights, frozen)
 
 
 def batch(job: JointWork) -> dict[str, Tensor]:
@@ -78,7 +78,7 @@ def test_before_its_epoch_the_alignment_moves_no_weight() -> None:
 
 
 def test_a_known_sensor_gets_no_gradient_and_the_others_learn_no_class() -> None:
-    job, model = work(Weights(0.05, 1.0, 1.0, 0), known="a"), networks()
+    job, model = work(Weights(0.05, 1.0, 1.0, 0), frozen="a"), networks()
     model["a"].requires_grad_(False)
     rows = batch(job)
     loss, _ = job.loss(model, rows, 0)
@@ -152,6 +152,6 @@ def test_contrast_is_the_supervised_contrastive_loss_between_sensors() -> None:
     assert float(job.loss(model, rows, 0)[0].detach()) == pytest.approx(np.mean(terms), rel=1e-4)
 
 
-def test_an_agreement_that_there_is_none_of_is_refused() -> None:
-    with pytest.raises(TacpipeError, match="agreement is 'love'"):
-        Weights(agreement="love")
+def test_an_unknown_alignment_loss_is_refused() -> None:
+    with pytest.raises(TacpipeError, match="alignment_loss is 'love'"):
+        Weights(alignment_loss="love")

@@ -31,8 +31,8 @@ class Drawn(Protocol):
 
 
 @dataclass(frozen=True)
-class Felt:
-    """Grasps to learn from or to watch, and what was felt, scaled."""
+class ScaledGrasps:
+    """Grasps to learn from or to watch, and their scaled readings."""
 
     sources: Drawn
     values: Tensor  # (grasp, value)
@@ -44,10 +44,10 @@ class Felt:
 
 @dataclass(frozen=True)
 class TouchWork:
-    """The work of a network of touch; ``weights`` (value,) tell how much each value counts in the loss ``balanced``."""
+    """The work of a network of touch; ``weights`` (value,) are those of each value in the loss ``balanced``."""
 
-    training: Felt
-    watched: Felt
+    training: ScaledGrasps
+    watched: ScaledGrasps
     batch: int
     loss_name: str
     weights: Tensor
@@ -78,11 +78,11 @@ class TouchWork:
         """Return the loss of the grasps with these indices, whose points are drawn now, and their number."""
         rng = np.random.default_rng(int(torch.randint(SEEDS, (1,))))
         arrays = self.training.sources.draw(batch.tolist(), rng)
-        return self._loss(told(model, arrays), self.training.values[batch]), len(batch)
+        return self._loss(output(model, arrays), self.training.values[batch]), len(batch)
 
     def watch(self, model: nn.Module) -> dict[str, Any]:
         """Return the loss over all watched grasps, always with the same points."""
-        found = foretold(model, self.watched.sources, len(self.watched), draws=1)
+        found = predictions(model, self.watched.sources, len(self.watched), draws=1)
         values = self.watched.values
         return {"val_loss": float(self._loss(torch.from_numpy(found).to(values), values))}
 
@@ -97,19 +97,19 @@ class TouchWork:
         return (squared * self.weights).mean()
 
 
-def told(model: nn.Module, arrays: Arrays) -> Tensor:
+def output(model: nn.Module, arrays: Arrays) -> Tensor:
     """Return what a network makes of points and numbers (grasp, value), on the device of its weights."""
     device = next(model.parameters()).device
     found: Tensor = model(*(torch.from_numpy(array).to(device) for array in arrays))
     return found
 
 
-def foretold(model: nn.Module, sources: Drawn, count: int, draws: int) -> NDArray[np.float32]:
+def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> NDArray[np.float32]:
     """Return the mean over ``draws`` of what a network makes of the first ``count`` grasps, (grasp, value), scaled."""
     rows = []
     with torch.no_grad():
         for first in range(0, count, WATCHED):
             indices = range(first, min(first + WATCHED, count))
-            visits = torch.stack([told(model, sources.fixed(indices, visit)) for visit in range(draws)])
+            visits = torch.stack([output(model, sources.fixed(indices, visit)) for visit in range(draws)])
             rows.append(visits.mean(dim=0))
     return torch.cat(rows).cpu().numpy()

@@ -57,5 +57,5 @@ def test_no_rows_give_no_inputs_of_the_right_width() -> None:
 
 
 def test_another_kind_of_value_is_refused() -> None:
-    with pytest.raises(TacpipeError, match="of is 'speed'; a codec is fitted on levels or increments"):
+    with pytest.raises(TacpipeError, match="representation is 'speed'"):
         frame_stacking.inputs(np.zeros((2, 1)), None, "speed", 1)

@@ -8,7 +8,7 @@ from safetensors.numpy import load, save
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.level import Level
-from tacpipe.models.strong import Strong
+from tacpipe.models.minirocket_classifier import MinirocketClassifier
 
 PATTERNS = 84 * 6
 
@@ -37,7 +37,7 @@ def pressed(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def test_textures_are_told_apart_where_levels_say_nothing() -> None:
     x, labels = textured(60)
     new, truth = textured(90, seed=1)
-    fitted = Strong.fit(x, labels, features=PATTERNS)
+    fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
     assert fitted.classes.tolist() == [3, 4, 20]
     assert fitted.scores(new).shape == (90, 3)
     assert np.mean(fitted.predict(new) == truth) > 0.9
@@ -47,7 +47,7 @@ def test_textures_are_told_apart_where_levels_say_nothing() -> None:
 def test_strength_counts_where_it_tells_the_class() -> None:
     x, labels = pressed(80)
     new, truth = pressed(200, seed=1)
-    fitted = Strong.fit(x, labels, features=PATTERNS)
+    fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
     assert fitted.share == 1
     assert np.mean(fitted.predict(new) == truth) > 0.8
 
@@ -56,26 +56,26 @@ def test_shuffled_labels_are_learned_from_the_same_patterns_and_tell_nothing() -
     x, labels = textured(60)
     new, truth = textured(300, seed=1)
     shuffled = np.random.default_rng(0).permutation(labels)
-    fitted = Strong.fit(x, labels, features=PATTERNS)
+    fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
     other = fitted.relabelled(x, shuffled)
     assert np.mean(other.predict(new) == truth) < 0.6
-    again = Strong.fit(x, shuffled, features=PATTERNS)
+    again = MinirocketClassifier.fit(x, shuffled, features=PATTERNS)
     assert np.array_equal(other.scores(new), again.scores(new))
 
 
 def test_the_seed_decides_and_tensors_hold_everything() -> None:
     x, labels = textured(30)
-    one, same, other = (Strong.fit(x, labels, features=PATTERNS, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (MinirocketClassifier.fit(x, labels, features=PATTERNS, seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(one.scores(x), same.scores(x))
     assert not np.array_equal(one.scores(x), other.scores(x))
-    again = Strong.from_tensors(load(save(one.to_tensors())))
+    again = MinirocketClassifier.from_tensors(load(save(one.to_tensors())))
     assert np.array_equal(again.scores(x), one.scores(x))
     assert again.share == one.share
 
 
 def test_readings_below_zero_and_other_slides_are_handled() -> None:
     x, labels = textured(30)
-    fitted = Strong.fit(x - 60, labels, features=PATTERNS)
+    fitted = MinirocketClassifier.fit(x - 60, labels, features=PATTERNS)
     assert np.isfinite(fitted.scores(x - 60)).all()
     with pytest.raises(TacpipeError, match="do not fit the transform"):
         fitted.scores(x[:, :50])

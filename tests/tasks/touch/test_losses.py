@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch import training
 from tacpipe.tasks.touch.inputs import Arrays
-from tacpipe.tasks.touch.learning import Felt, TouchWork, foretold
+from tacpipe.tasks.touch.losses import ScaledGrasps, TouchWork, predictions
 
 
 class Numbers:
@@ -41,7 +41,7 @@ class Sum(nn.Module):
 
 
 def work(count: int = 7, batch: int = 3, loss: str = "rmse", weights: tuple[float, float] = (1.0, 1.0)) -> TouchWork:
-    felt = Felt(Numbers(), torch.zeros(count, 2))
+    felt = ScaledGrasps(Numbers(), torch.zeros(count, 2))
     return TouchWork(felt, felt, batch, loss, torch.tensor(weights))
 
 
@@ -78,7 +78,7 @@ def test_the_balanced_loss_counts_every_target_alike() -> None:
     assert weights.shape == (25,)
     assert weights.mean().item() == pytest.approx(1)
     assert weights[0].item() == pytest.approx(weights[1:].sum().item())
-    felt = Felt(Numbers(), torch.zeros(4, 25))
+    felt = ScaledGrasps(Numbers(), torch.zeros(4, 25))
     one = TouchWork(felt, felt, 2, "balanced", weights)
     off = [torch.zeros(3, 25), torch.zeros(3, 25)]
     off[0][:, 0] = 0.5  # all of the pressure
@@ -109,7 +109,7 @@ def test_the_same_generator_draws_the_same_points() -> None:
 
 @pytest.mark.parametrize("count", [3, 64, 130])
 def test_what_is_foretold_is_the_mean_over_visits_of_every_grasp(count: int) -> None:
-    found = foretold(Sum(), Numbers(), count, draws=3)
+    found = predictions(Sum(), Numbers(), count, draws=3)
     np.testing.assert_allclose(found, np.repeat(np.arange(count)[:, None] + 10.0, 2, axis=1))
 
 

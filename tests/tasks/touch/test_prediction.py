@@ -24,7 +24,7 @@ def test_grasps_without_reading_are_told_what_evaluate_tells(tmp_path: Path) -> 
 
 def test_what_is_not_what_the_model_reads_is_refused(tmp_path: Path) -> None:
     files = trained(tmp_path, **FAST)
-    with pytest.raises(TacpipeError, match="There is no grasp to foretell"):
+    with pytest.raises(TacpipeError, match="no grasp to predict"):
         touch.predict(files, dataset())
     with pytest.raises(TacpipeError, match="melon-003 has a cloud without colours"):
         touch.predict(files, dataset(recording(3, "melon", cloud=cloud(3, 0.05, coloured=False))))

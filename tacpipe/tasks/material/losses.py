@@ -1,4 +1,4 @@
-"""What networks learn of slides: to make them again, to name their material, and to agree with other sensors."""
+"""The losses of networks on slides: reconstruction, classification, and alignment with other sensors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, RecurrentClassifier, Told
+from tacpipe.models.recurrent_autoencoder import NetworkOutput, RecurrentAutoencoder, RecurrentClassifier
 from tacpipe.tasks.material.pairs import NONE, Pairs
 from tacpipe.training.loop import Line
 
 Network = RecurrentAutoencoder | RecurrentClassifier
 TEMPERATURE = 0.1  # of contrast: the published one
-JUDGED = 128  # slides that go through a network at once where nothing is learned
+CHUNK = 128  # slides that go through a network at once where nothing is learned
 
 
 @dataclass(frozen=True)
@@ -29,18 +29,17 @@ class Weights:
     classification: float = 1.0
     alignment: float = 1.0  # 0: sensors are learned independently
     align_from: int = 20  # first epoch, from 0, in which the alignment counts
-    agreement: str = (
-        "pairs"  # what is aligned: pairs of one row, or each slide with all of its class, in contrast to others
-    )
+    # what is aligned: pairs of one row, or each slide with all of its class, in contrast to others
+    alignment_loss: str = "pairs"
 
     def __post_init__(self) -> None:
-        """Refuse an agreement that there is none of."""
-        if self.agreement not in ("pairs", "contrast"):
-            raise TacpipeError(f"agreement is {self.agreement!r}; it must be pairs or contrast.")
+        """Refuse an unknown alignment loss."""
+        if self.alignment_loss not in ("pairs", "contrast"):
+            raise TacpipeError(f"alignment_loss is {self.alignment_loss!r}; it must be pairs or contrast.")
 
 
 @dataclass(frozen=True)
-class Felt:
+class ScaledSlides:
     """Slides of one sensor as a network reads them."""
 
     frames: Tensor  # (slide, time, channel), scaled
@@ -69,24 +68,24 @@ class _Sums:
 class JointWork:
     """Networks of one or more sensors, learned side by side and, where ``weights.alignment`` is above 0, jointly.
 
-    Each sensor's network lowers the mean squared error of its slides made again and the negative log-likelihood of their
-    classes; from epoch ``align_from`` on also the mean squared difference of its latents to those of the other sensors'
-    slides in the same row of the batch (Gao et al. 2020, section IV). A sensor in ``known`` learns nothing: others
-    learn to meet its latents, without seeing a class. Joint networks are chosen together, by the mean validation
-    accuracy over sensors, others each by its own; of equals the later epoch.
+    Each sensor's network lowers the mean squared error of its reconstructed slides and the negative log-likelihood of
+    their classes; from epoch ``align_from`` on also the mean squared difference of its latents to those of the other
+    sensors' slides in the same row of the batch (Gao et al. 2020, section IV). The network of ``frozen_sensor`` is not
+    trained: the latents of others are aligned to its own, without their classes. Joint networks are chosen together, by
+    the mean validation accuracy over sensors, others each by its own; of equals the later epoch.
     """
 
     def __init__(
         self,
-        training: Mapping[str, Felt],
-        validation: Mapping[str, Felt],
+        training: Mapping[str, ScaledSlides],
+        validation: Mapping[str, ScaledSlides],
         pairs: Pairs,
         weights: Weights,
-        known: str = "",
+        frozen_sensor: str = "",
         drop_last: bool = False,
     ) -> None:
         self.training, self.validation, self.pairs, self.weights = training, validation, pairs, weights
-        self.known, self.drop_last = known, drop_last
+        self.frozen_sensor, self.drop_last = frozen_sensor, drop_last
         self._sums = _Sums()
 
     @property
@@ -101,47 +100,47 @@ class JointWork:
 
     def loss(self, model: nn.Module, batch: Mapping[str, Tensor], epoch: int) -> tuple[Tensor, int]:
         """Return the sum of all losses of a batch, and its rows."""
-        told, total = {}, torch.zeros(())
+        output, total = {}, torch.zeros(())
         for sensor, rows in batch.items():
             chosen = rows[rows != NONE]
             if len(chosen):
-                told[sensor], loss = self._own(sensor, model.get_submodule(sensor), chosen)
+                output[sensor], loss = self._own(sensor, model.get_submodule(sensor), chosen)
                 total = total.to(loss.device) + loss
         if self.joint:
-            aligned = self._alignment(batch, told)
-            if self.weights.agreement == "contrast":
-                aligned = self._contrast(batch, told)
+            aligned = self._alignment(batch, output)
+            if self.weights.alignment_loss == "contrast":
+                aligned = self._contrast(batch, output)
             if aligned is not None and epoch >= self.weights.align_from:
                 total = total + self.weights.alignment * aligned
         return total, max(int((rows != NONE).sum()) for rows in batch.values())
 
-    def _own(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[Told, Tensor]:
-        """Return what a network says of some slides, and the losses that are its own."""
-        felt, weights = self.training[sensor], self.weights
-        frames, classes = felt.batch(chosen), felt.classes[chosen]
-        if sensor == self.known:
+    def _own(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[NetworkOutput, Tensor]:
+        """Return the output of a network for some slides, and its own losses."""
+        slides, weights = self.training[sensor], self.weights
+        frames, classes = slides.batch(chosen), slides.classes[chosen]
+        if sensor == self.frozen_sensor:
             with torch.no_grad():
-                told: Told = network(frames, decode=False)
-            return told, told.latents.new_zeros(())
-        told = network(frames)
-        total = told.latents.new_zeros(())
+                output: NetworkOutput = network(frames, decode=False)
+            return output, output.latents.new_zeros(())
+        output = network(frames)
+        total = output.latents.new_zeros(())
         labelled = classes != NONE
         if labelled.any():
-            loss = nn.functional.cross_entropy(told.scores[labelled], classes[labelled])
+            loss = nn.functional.cross_entropy(output.scores[labelled], classes[labelled])
             self._sums.add(f"{sensor}.classification", loss, int(labelled.sum()))
-            if not self.known:  # a sensor that is mapped to a known space learns without classes
+            if not self.frozen_sensor:  # a sensor that is aligned to a frozen one learns without classes
                 total = total + weights.classification * loss
-        if told.frames is not None:
-            loss = nn.functional.mse_loss(told.frames, frames)
+        if output.frames is not None:
+            loss = nn.functional.mse_loss(output.frames, frames)
             self._sums.add(f"{sensor}.reconstruction", loss, len(chosen))
             total = total + weights.reconstruction * loss
-        return told, total
+        return output, total
 
-    def _alignment(self, batch: Mapping[str, Tensor], told: Mapping[str, Told]) -> Tensor | None:
+    def _alignment(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
         """Return the mean squared difference of latents in rows that two sensors share, averaged over their pairs."""
         found = []
-        for one, other in combinations(told, 2):
-            latents, valid = zip(*(self._by_row(batch[name], told[name], name) for name in (one, other)), strict=True)
+        for one, other in combinations(output, 2):
+            latents, valid = zip(*(self._by_row(batch[name], output[name], name) for name in (one, other)), strict=True)
             both = valid[0] & valid[1]
             if both.any():
                 found.append(nn.functional.mse_loss(latents[0][both], latents[1][both]))
@@ -151,8 +150,8 @@ class JointWork:
         self._sums.add("alignment", mean, 1)
         return mean
 
-    def _contrast(self, batch: Mapping[str, Tensor], told: Mapping[str, Told]) -> Tensor | None:
-        """Return how badly slides tell those of the same row's class, felt by another sensor, from all others of it.
+    def _contrast(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
+        """Return the contrastive loss between slides of the same row's class, of two sensors, and all others.
 
         The supervised contrastive loss (Khosla et al., Supervised Contrastive Learning, 2020, equation 2) between
         sensors: cosines of latents over a temperature, one term for each slide and direction. A row's class is that of
@@ -161,66 +160,68 @@ class JointWork:
         first = next(iter(batch))
         classes = torch.where(batch[first] != NONE, self.training[first].classes.cpu()[batch[first]], NONE)
         found = []
-        for one, other in permutations(told, 2):
-            (from_, valid), (to, known) = (self._by_row(batch[name], told[name], name) for name in (one, other))
+        for one, other in permutations(output, 2):
+            (from_, valid), (to, known) = (self._by_row(batch[name], output[name], name) for name in (one, other))
             here, there = (classes != NONE).to(valid.device) & valid, (classes != NONE).to(known.device) & known
             same = classes.to(valid.device)[here][:, None] == classes.to(valid.device)[there]  # (slide, other slide)
-            told_apart = same.any(dim=1)
-            if told_apart.any():
+            in_pairs = same.any(dim=1)
+            if in_pairs.any():
                 cosines = nn.functional.normalize(from_[here], dim=1) @ nn.functional.normalize(to[there], dim=1).t()
-                shares = nn.functional.log_softmax(cosines / TEMPERATURE, dim=1)[told_apart]
-                counted = same[told_apart]
+                shares = nn.functional.log_softmax(cosines / TEMPERATURE, dim=1)[in_pairs]
+                counted = same[in_pairs]
                 found.append(-((shares * counted).sum(dim=1) / counted.sum(dim=1)).mean())
         return torch.stack(found).mean() if found else None
 
-    def _by_row(self, rows: Tensor, told: Told, sensor: str) -> tuple[Tensor, Tensor]:
+    def _by_row(self, rows: Tensor, output: NetworkOutput, sensor: str) -> tuple[Tensor, Tensor]:
         """Return latents (row, latent), and which rows hold a slide with a label."""
         filled = rows != NONE
-        latents = told.latents.new_zeros(len(rows), told.latents.shape[1])
-        latents[filled.to(latents.device)] = told.latents
+        latents = output.latents.new_zeros(len(rows), output.latents.shape[1])
+        latents[filled.to(latents.device)] = output.latents
         valid = filled.clone()
         valid[filled] = (self.training[sensor].classes[rows[filled]] != NONE).cpu()
         return latents, valid.to(latents.device)
 
     def watch(self, model: nn.Module) -> Line:
         """Return the epoch's losses, and losses and accuracy of each sensor on its validation slides."""
-        judged = {sensor: self._judged(model.get_submodule(sensor), felt) for sensor, felt in self.validation.items()}
+        evaluated = {
+            sensor: self._evaluated(model.get_submodule(sensor), slides) for sensor, slides in self.validation.items()
+        }
         weights = self.weights
         return {
             "val_loss": sum(
                 weights.classification * one["classification"] + weights.reconstruction * one.get("reconstruction", 0.0)
-                for one in judged.values()
+                for one in evaluated.values()
             ),
             "alignment": self._sums.mean("alignment"),
             "train": {
                 sensor: {name: self._sums.mean(f"{sensor}.{name}") for name in ("reconstruction", "classification")}
                 for sensor in self.training
             },
-            "val": judged,
+            "val": evaluated,
         }
 
     @torch.no_grad()
-    def _judged(self, network: nn.Module, felt: Felt) -> dict[str, float]:
-        labelled = (felt.classes != NONE).nonzero()[:, 0]
+    def _evaluated(self, network: nn.Module, slides: ScaledSlides) -> dict[str, float]:
+        labelled = (slides.classes != NONE).nonzero()[:, 0]
         if self.drop_last:
             labelled = labelled[
                 : len(labelled) // self.pairs.batch * self.pairs.batch or None
             ]  # fewer than one count all
         right = loss = again = 0.0
-        for first in range(0, len(labelled), JUDGED):
-            some = labelled[first : first + JUDGED]
-            frames, classes = felt.batch(some), felt.classes[some]
-            told: Told = network(frames)
-            right += float((told.scores.argmax(dim=1) == classes).sum())
-            loss += float(nn.functional.cross_entropy(told.scores, classes, reduction="sum"))
-            if told.frames is not None:
-                again += float(nn.functional.mse_loss(told.frames, frames)) * len(some)
+        for first in range(0, len(labelled), CHUNK):
+            some = labelled[first : first + CHUNK]
+            frames, classes = slides.batch(some), slides.classes[some]
+            output: NetworkOutput = network(frames)
+            right += float((output.scores.argmax(dim=1) == classes).sum())
+            loss += float(nn.functional.cross_entropy(output.scores, classes, reduction="sum"))
+            if output.frames is not None:
+                again += float(nn.functional.mse_loss(output.frames, frames)) * len(some)
         count = len(labelled) or math.nan
         found = {"accuracy": right / count, "classification": loss / count}
         return found if isinstance(network, RecurrentClassifier) else {**found, "reconstruction": again / count}
 
     def ranks(self, line: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
-        """Return the wrong share of validation slides, of equals the later epoch being better."""
+        """Return the error rate on validation slides, of equals the later epoch being better."""
         wrong = {sensor: 1 - one["accuracy"] for sensor, one in line["val"].items()}
         later = -line["epoch"]
         if self.joint:

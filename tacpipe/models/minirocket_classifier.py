@@ -1,10 +1,10 @@
-"""The strong classifier: how often patterns occur in a slide, beside how strong it is, read out by the nearest mean.
+"""The MiniRocket classifier: how often patterns occur in a slide, with how strong it is, read out by the nearest mean.
 
-Patterns are those of MiniRocket, sought in the channels of a slide and in six more that say how pressure lies across all
-channels at each moment: mean, standard deviation, three quantiles and the highest. Strength is the mean, the standard
-deviation and the mean step of each channel's root, for variance grows with pressure. Where contact is loosely
-controlled, strength tells much about the material from few slides; where it drifts, it misleads. So how much it counts
-beside patterns is what errs least on training slides that are left out one by one.
+Patterns are those of MiniRocket, sought in the channels of a slide and in six more that describe how pressure lies
+across all channels at each moment: mean, standard deviation, three quantiles and the highest. Strength is the mean, the
+standard deviation and the mean step of each channel's root, for variance grows with pressure. Where contact is loosely
+controlled, strength depends much on the material from few slides; where it drifts, it misleads. So its weight next to
+patterns is the one that errs least on training slides that are left out one by one.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ Floats = NDArray[np.floating[Any]]
 Labels = NDArray[np.integer[Any]]
 
 QUANTILES = (0.5, 0.75, 0.9, 1.0)  # of the channels at one moment
-SHARES = (0.0, 0.3, 1.0)  # that strength may have beside the 1 of patterns; finer steps let it in by chance
+SHARES = (0.0, 0.3, 1.0)  # that strength may have next to the 1 of patterns; finer steps let it in by chance
 
 
 @dataclass(frozen=True)
-class Strong:
+class MinirocketClassifier:
     """What was fitted."""
 
     patterns: Rocket
     readout: Readout
-    share: float  # of strength, beside the 1 of patterns
+    share: float  # of strength, next to the 1 of patterns
 
     @classmethod
-    def fit(cls, x: Floats, labels: Labels, *, seed: int = 0, features: int = 10_000) -> Strong:
+    def fit(cls, x: Floats, labels: Labels, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:
         """Return the classifier of training slides (slide, time, channel) and their classes (slide,), whole numbers.
 
         ``features`` is the number of patterns; ``seed`` that of the draws among them. Raises `TacpipeError` for slides
@@ -46,10 +46,10 @@ class Strong:
         patterns = Rocket.fit(wide, features=features, seed=seed)
         return cls(patterns, *_read(patterns.transform(wide), _strength(wide), labels))
 
-    def relabelled(self, x: Floats, labels: Labels) -> Strong:
+    def relabelled(self, x: Floats, labels: Labels) -> MinirocketClassifier:
         """Return a classifier with the same patterns, its readout fitted to slides ``x`` and other ``labels``."""
         wide = _wide(x)
-        return Strong(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
+        return MinirocketClassifier(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
 
     @property
     def classes(self) -> NDArray[np.int32]:
@@ -76,7 +76,7 @@ class Strong:
         return tensors | {"share": np.array([self.share])}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Strong:
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> MinirocketClassifier:
         """Return the classifier that `to_tensors` described."""
         return cls(
             Rocket.from_tensors(under("patterns.", tensors)),
@@ -86,7 +86,7 @@ class Strong:
 
 
 def _read(patterns: Floats, strength: Floats, labels: Labels) -> tuple[Readout, float]:
-    """Return the readout of patterns and strength, each (slide, feature), and the share of strength."""
+    """Return the readout of patterns and strength, each (slide, feature), and the weight of strength."""
     found = np.concatenate([patterns, strength], axis=1)
 
     def shares(share: float) -> Floats:

@@ -17,7 +17,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.io import parquet
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.task import Forecaster
+from tacpipe.tasks.forward.task import ForwardModel
 from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
@@ -51,7 +51,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def latents() -> Mapping[str, Any]:
-    return {of: compressed(*TRAIN, of=of) for of in ("levels", "increments")}
+    return {of: compressed(*TRAIN, representation=of) for of in ("levels", "increments")}
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def latent_models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathF
     found = {}
     for name in ("gru levels", "recurrent levels", "gru increments"):
         architecture, of = name.split()
-        watched = compressed(held(10, "cup"), files=latents[of].files, of=of)
+        watched = compressed(held(10, "cup"), files=latents[of].files, representation=of)
         found[name] = trained(tmp_path_factory.mktemp("model"), latents[of], watched, architecture=architecture)
     return found
 
@@ -109,7 +109,7 @@ def test_persistence_and_context_mean_are_what_numpy_computes_from_the_columns(m
 
 def test_the_model_s_errors_are_those_of_a_loop_over_predict(model: dict[str, bytes]) -> None:
     metrics, result = judged(model, *TEST)
-    forecaster, errors = Forecaster.load(model), []
+    forecaster, errors = ForwardModel.load(model), []
     for shard in TEST:
         arm = tracks.track(shard, forecaster.codec).arm  # type: ignore[arg-type]
         rows = np.hstack([counts(shard), arm, np.zeros((len(arm), 1))])
@@ -242,7 +242,7 @@ def test_what_the_codec_alone_loses_stands_beside_the_model(
     name: str, rows: set[str], latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
 ) -> None:
     of = name.split()[1]
-    codec, test = latents[of], compressed(*TEST, files=latents[of].files, of=of)
+    codec, test = latents[of], compressed(*TEST, files=latents[of].files, representation=of)
     metrics, result = judged(latent_models[name], *test.recordings.values(), files=codec.files)
     assert set(metrics) - LINEAR - {"known", "unseen", "counts", "skill", "anticipation", "context_mean"} == {
         *("model", "persistence"),
@@ -262,7 +262,7 @@ def test_what_the_codec_alone_loses_stands_beside_the_model(
 def test_what_the_codec_loses_is_what_numpy_computes(
     latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
 ) -> None:
-    codec = Forecaster.load(latent_models["gru levels"]).codec
+    codec = ForwardModel.load(latent_models["gru levels"]).codec
     test = compressed(*TEST, files=latents["levels"].files)
     metrics, _ = judged(latent_models["gru levels"], *test.recordings.values(), files=latents["levels"].files)
     lost = {one.name: codec.decode(codec.encode(counts(one), CHANNELS)) - counts(one) for one in TEST}
@@ -329,7 +329,7 @@ def test_every_window_is_judged_in_contact_or_not(model: dict[str, bytes]) -> No
 
 def test_predictions_stand_at_the_time_they_are_known(model: dict[str, bytes]) -> None:
     _, result = judged(model, TEST[0])
-    _, _, some = foretold(Forecaster.load(model), TEST[0])
+    _, _, some = foretold(ForwardModel.load(model), TEST[0])
     found, name = result.recordings[TEST[0].name].streams[""], CHANNELS[0]
     assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
     assert [column for column in found.column_names if column.startswith(name)] == [name, f"{name}_t1", f"{name}_t3"]

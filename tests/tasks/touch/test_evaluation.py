@@ -222,10 +222,10 @@ def test_the_model_and_its_history_come_along(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_judged_is_refused(model: dict[str, bytes], tmp_path: Path) -> None:
-    with pytest.raises(TacpipeError, match="There is no grasp to judge the model on"):
+    with pytest.raises(TacpipeError, match="no grasp"):
         touch.evaluate(model, dataset())
-    with pytest.raises(TacpipeError, match="ball-000 has no reading of touch"):
+    with pytest.raises(TacpipeError, match="ball-000 has no tactile reading"):
         touch.evaluate(model, dataset(recording(0, felt=False)))
     bare = trained(tmp_path, **FAST, baselines=False)
-    with pytest.raises(TacpipeError, match="trained without baselines, and cannot be evaluated"):
+    with pytest.raises(TacpipeError, match="--baselines"):
         touch.evaluate(bare, recordings(6, 1))

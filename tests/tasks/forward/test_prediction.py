@@ -53,7 +53,7 @@ def test_a_recording_without_a_window_has_a_table_without_rows(model: dict[str, 
 
 @pytest.mark.parametrize("step", [0, HORIZON + 1, -1])
 def test_steps_that_the_model_does_not_reach_are_refused(step: int, model: dict[str, bytes]) -> None:
-    with pytest.raises(TacpipeError, match=rf"predicts 1 to {HORIZON} steps ahead, not {step}\."):
+    with pytest.raises(TacpipeError, match=rf" 1 to {HORIZON} steps ahead, not {step}\."):
         forward.predict(model, dataset(TEST), [1, step])
 
 

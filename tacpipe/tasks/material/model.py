@@ -1,0 +1,53 @@
+"""What `tacpipe.load` returns for a model of the task ``material``: it predicts for recordings and for arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.tasks.material import prediction
+from tacpipe.tasks.material.classifier import Classifier, Floats, Materials
+from tacpipe.tasks.opened import opened
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+class MaterialModel(Classifier):
+    """Predicts the material of slides: of recordings, or of arrays."""
+
+    @overload
+    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
+
+    @overload
+    def predict(self, slides: Floats | NDArray[np.float64], /, sensor: str = "") -> Materials: ...
+
+    def predict(
+        self, given: Dataset | Recording | Floats | NDArray[np.float64], /, sensor: str = ""
+    ) -> pa.Table | Materials:
+        """Return the material of slides: of a dataset or one of its recordings as a table, of arrays as an array.
+
+        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
+        a row a slide with ``recording``, ``sensor``, ``material`` (int32), a ``score_…`` of each class and, of networks, the
+        latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of a dataset are those of the command to the last bit;
+        those of one recording alone may differ in the last digits of a float32, because slides are computed together.
+        Raises `UsageError` where the recordings did not go through the stages that the model was trained behind.
+
+        **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them of a
+        recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64. Raises
+        `TacpipeError` for another shape than the model was trained on, and for values that are not finite.
+        """
+        if isinstance(given, Dataset | Recording):
+            return prediction.predictions(self, opened(given, self.chain))
+        return self.named(self.scores(given, sensor))
+
+    def frames(self, recording: Recording) -> tuple[Floats, str]:
+        """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.
+
+        The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.
+        """
+        ((sensor, slides),) = self.read(opened(recording, self.chain)).items()
+        return slides.frames[0], sensor

@@ -1,0 +1,181 @@
+"""How a classifier of materials is built and trained: the params of `tacpipe train material`, one class an architecture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from tacpipe.errors import UsageError
+from tacpipe.plugins.constraints import (
+    Assignments,
+    CommaList,
+    Names,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Seed,
+    StoredAs,
+)
+
+Presets = Mapping[str, Mapping[str, object]]
+Panels = Mapping[str, Sequence[str]]
+Dropout = Annotated[float, Range(0, below=1)]
+HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(NonNegativeInt, least=1)], between=";")]
+
+
+@dataclass(frozen=True)
+class Material:
+    """What every classifier of materials reads and learns."""
+
+    architecture: str
+    sensors: Names = ""  # sensors to learn for; empty for all
+    # quantities to read; empty: tactile, and for minirocket also vibration (22 readings a frame)
+    quantities: Names = ""
+    # label of this run in a report, next to others of the same method, as blocked
+    run_label: Annotated[str, StoredAs("setting")] = ""
+    seed: Seed = 0  # random seed of kernels, initial weights, the order of slides and pairs
+    baselines: bool = True  # fit the mean-level and shuffled-label baselines too, for evaluate to compare with
+    # labels to learn; permuted: those of the training slides in random order, a negative control
+    labels: Literal["true", "permuted"] = "true"
+    PANELS: ClassVar[Panels] = {
+        "Model": (
+            *("architecture", "features", "headers", "hidden", "latents", "decoder", "unpool"),
+            *("dropout", "scaling", "joint", "frozen_sensor"),
+        ),
+        "Training": (
+            *("reconstruction_weight", "classification_weight", "alignment_weight", "alignment_loss", "align_from"),
+            *("epochs", "batch", "learning_rate", "cycle", "patience", "shuffle", "drop_last", "select"),
+            *("seed", "baselines"),
+        ),
+        "Data": (
+            *("sensors", "quantities", "labels", "hold_out", "speeds", "use_validation", "pairing"),
+            *("subsample_sensor", "subsample_percent", "run_label"),
+        ),
+    }
+
+
+@dataclass(frozen=True)
+class Minirocket(Material):
+    """Random convolutions and a linear readout, of each sensor alone: the best classifier that we know."""
+
+    # classifier: minirocket, random convolutions and a linear readout
+    architecture: Literal["minirocket"] = "minirocket"
+    features: Annotated[int, Range(84)] = 10_000  # of each sensor
+    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    PRESETS: ClassVar[Presets] = {"quick": {"features": 1_000}}
+
+
+@dataclass(frozen=True)
+class Spectra(Material):
+    """Spectra over spatial frequency, by which sensors learn materials from one another."""
+
+    # spectra: power over spatial frequency
+    architecture: Literal["spectra"] = "spectra"
+    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
+    # metres a second of slides whose recordings have no speed
+    speeds: Annotated[str, Assignments(PositiveFloat)] = "biotac=0.025,roboskin=0.05"
+
+
+@dataclass(frozen=True)
+class Network(Material):
+    """What recurrent classifiers have in common."""
+
+    hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
+    # sensor that learns from a part of the batches alone; needs --no-shuffle
+    subsample_sensor: Annotated[str, StoredAs("reduce")] = ""
+    # percentage of the batches that it learns from
+    subsample_percent: Annotated[Literal[100, 90, 50, 25, 17, 11], StoredAs("ratio")] = 100
+    # network in front of a sensor's, as biotac=mlp; by default cnn for a 6 x 10 grid, else none
+    headers: Annotated[str, Assignments(Literal["none", "mlp", "cnn"])] = ""
+    hidden: PositiveInt = 90  # units of each LSTM
+    # of the input: none; standard: mean 0 and deviation 1 of each channel; spread: one deviation for all channels,
+    # zero stays zero; log: spread of log(1 + x)
+    scaling: Literal["none", "standard", "spread", "log"] = "none"
+    epochs: PositiveInt = 300  # maximum number of passes over the training slides
+    batch: PositiveInt = 32  # slides of each sensor per step of the optimiser
+    learning_rate: PositiveFloat = 5e-4  # of Adam
+    cycle: bool = False  # raise and lower the learning rate once over all epochs
+    patience: NonNegativeInt = 0  # epochs without a better validation accuracy after which training ends; 0: all epochs
+    shuffle: bool = True  # other batches every epoch
+    drop_last: bool = False  # leave out the batch that is not full, in evaluation too, as the published code does
+    # weights to keep: best, of the highest validation accuracy; last, of the last epoch
+    select: Literal["best", "last"] = "best"
+
+    def check(self) -> None:
+        """Refuse a subsampled sensor whose batches are shuffled, and a percentage without a sensor."""
+        if self.subsample_sensor and self.shuffle:
+            raise UsageError(
+                f"subsample_sensor is {self.subsample_sensor} and batches are shuffled, so that this sensor would learn "
+                f"from all slides over the epochs; give --no-shuffle with --subsample-sensor."
+            )
+        if self.subsample_percent != 100 and not self.subsample_sensor:
+            raise UsageError(
+                f"subsample_percent is {self.subsample_percent} and no sensor is subsampled; name one with "
+                f"--subsample-sensor."
+            )
+
+
+@dataclass(frozen=True)
+class Raec(Network):
+    """The paper's recurrent autoencoder with a classifier, learned jointly for unlike sensors or for each alone."""
+
+    # raec: the paper's recurrent autoencoder
+    architecture: Literal["raec"] = "raec"
+    joint: bool = True  # align the latents of unlike sensors on slides of the same material
+    # with --init: sensor of that model whose network is frozen; the latents of the others are aligned to its own
+    frozen_sensor: Annotated[str, StoredAs("known")] = ""
+    # pairs of joint learning: random; fixed: drawn once; permuted: of other materials, a negative control
+    pairing: Literal["random", "fixed", "permuted"] = "random"
+    # alignment loss: pairs of one material, or contrast with all other slides too
+    alignment_loss: Annotated[Literal["pairs", "contrast"], StoredAs("agreement")] = "pairs"
+    decoder: Literal["D1", "D2"] = "D1"  # D1: latents are its first state; D2: they are its input at every step
+    latents: PositiveInt = 40  # numbers that a slide is encoded to
+    # how a cnn is undone: nearest; last, with the last frame's indices, as published
+    unpool: Literal["nearest", "last"] = "nearest"
+    reconstruction_weight: NonNegativeFloat = 0.01  # of the squared error of reconstructed slides
+    classification_weight: NonNegativeFloat = 1.0  # of the negative log-likelihood of classes
+    alignment_weight: NonNegativeFloat = 1.0  # of the alignment loss between sensors
+    align_from: NonNegativeInt = 20  # first epoch, from 0, in which latents are aligned
+    dropout: Dropout = 0.0  # fraction of latents left out of each training step; 0 as in the published code
+    PRESETS: ClassVar[Presets] = {
+        "paper": {"epochs": 2000},
+        "authors": {  # the published code with its quirks; to be given slides of the layout authors
+            "epochs": 2000,
+            "pairing": "fixed",
+            "shuffle": False,
+            "drop_last": True,
+            "unpool": "last",
+            "select": "last",
+            "seed": 1,
+        },
+        "quick": {"epochs": 30},
+    }
+
+    def check(self) -> None:
+        """Refuse options of joint learning without it."""
+        super().check()
+        if not self.joint:
+            given = [(name, getattr(self, name)) for name in ("frozen_sensor", "pairing", "alignment_loss")]
+            odd = [(name, value) for name, value in given if value and value not in ("random", "fixed", "pairs")]
+            if odd:
+                name, value = odd[0]
+                option = name.replace("_", "-")
+                raise UsageError(
+                    f"{name} is {value} and sensors are not learned jointly; leave out --no-joint or --{option}."
+                )
+
+
+@dataclass(frozen=True)
+class XLSTM(Network):
+    """The recurrent classifier without decoder that the paper compares with, of each sensor alone."""
+
+    # x-lstm: the paper's classifier without decoder
+    architecture: Literal["x-lstm"] = "x-lstm"
+    PRESETS: ClassVar[Presets] = {"paper": {"epochs": 2000}, "quick": {"epochs": 30}}
+
+
+Params = Minirocket | Raec | XLSTM | Spectra

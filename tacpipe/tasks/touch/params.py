@@ -1,0 +1,137 @@
+"""How a model of touch is built and trained: the params of `tacpipe train touch`, one class an architecture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from tacpipe.plugins.constraints import (
+    CommaList,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Seed,
+    StoredAs,
+    Unit,
+)
+
+Presets = Mapping[str, Mapping[str, object]]
+Panels = Mapping[str, Sequence[str]]
+Dropout = Annotated[float, Range(0, below=1)]
+Draws = Annotated[int, Range(1, 100_000)]
+Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], least=1)]
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What every model of the task ``touch`` predicts and learns from."""
+
+    architecture: str
+    targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger
+    # label of this run in a report, next to others of the same method, as blocked
+    run_label: Annotated[str, StoredAs("setting")] = ""
+    seed: Seed = 0  # random seed of initial weights, the order of grasps, drawn points and cuts
+    baselines: bool = True  # keep the training readings, for evaluate to compare with constant, object mean and nearest
+    use_validation: bool = True  # learn from validation grasps too where nothing is chosen by them
+    PANELS: ClassVar[Panels] = {
+        "Model": (
+            *("architecture", "inputs", "place", "trees", "leaf", "multi_target", "networks", "points", "draws"),
+            *("backbone", "radius_mm", "hidden", "dropout", "normalisation", "wrist", "head", "transform"),
+        ),
+        "Training": (
+            *("loss", "epochs", "batch", "learning_rate", "cycle", "weight_decay", "patience", "select"),
+            *("rotation_deg", "seed", "baselines"),
+        ),
+        "Data": ("targets", "use_validation", "run_label"),
+    }
+
+
+@dataclass(frozen=True)
+class Trees(Touch):
+    """Forests over the geometry of a grasp: the best model that we know."""
+
+    # tree-ensemble: the mean of a forest a target and one forest of all targets; trees: a forest a target
+    architecture: Annotated[
+        Literal["tree-ensemble", "trees"], StoredAs("architecture", {"tree-ensemble": "strong"})
+    ] = "tree-ensemble"
+    inputs: Literal["rgb", "xyz"] = "rgb"  # what is read of a cloud: places and colours, or places alone
+    place: bool = False  # read where the grasp is before the camera too, not its shape alone
+    trees: PositiveInt = 300  # of each target's forest
+    leaf: NonNegativeInt = 0  # fewest training grasps of a leaf; 0: chosen of 2, 4 and 8 by out-of-bag error
+    PRESETS: ClassVar[Presets] = {"quick": {"trees": 100}}
+
+
+@dataclass(frozen=True)
+class PointNetwork(Touch):
+    """What networks that read points have in common."""
+
+    # one network for all targets; else one each, as in the paper
+    multi_target: Annotated[bool, StoredAs("together")] = True
+    networks: PositiveInt = 3  # networks of other initial weights, whose mean is the prediction
+    points: Draws = 128  # drawn of each cloud, or of each patch, anew at each visit
+    draws: Draws = 4  # of points, over which a prediction is averaged
+    # balanced: squared error in which all targets count the same; rmse of normalised values, the paper's
+    loss: Literal["balanced", "rmse"] = "balanced"
+    epochs: PositiveInt = 40  # passes over the training grasps
+    batch: Annotated[int, Range(2)] = 16  # grasps per step of the optimiser, which normalises them by their own spread
+    learning_rate: PositiveFloat = 2e-3  # of Adam; the peak if it goes through a cycle
+    cycle: bool = True  # raise and lower the learning rate once over all epochs
+    weight_decay: NonNegativeFloat = 0.0  # fraction of each weight that is added to its gradient
+    patience: NonNegativeInt = 0  # epochs without a lower validation loss after which training ends; 0: all epochs
+    # weights to keep: last, of the last epoch; best, of the lowest validation loss
+    select: Literal["last", "best"] = "last"
+
+
+@dataclass(frozen=True)
+class Patches(PointNetwork):
+    """Points about both contacts, in the axes of the grasp."""
+
+    # patches: networks that read points about both contacts
+    architecture: Literal["patches"] = "patches"
+    inputs: Literal["rgb", "xyz"] = "rgb"  # what is read of a point: place and colour, or place alone
+    place: bool = False  # read where the grasp is before the camera too, not its shape alone
+    backbone: Literal["points", "edges"] = "points"  # points: each alone; edges: each with its nearest ones
+    radius_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0  # radius of the patch about a contact
+    hidden: Annotated[int, Range(2)] = 256  # units of the first layer behind the points
+    dropout: Dropout = 0.3  # fraction of these left out of each training step
+    PRESETS: ClassVar[Presets] = {"quick": {"networks": 1, "epochs": 10, "points": 64}}
+
+
+@dataclass(frozen=True)
+class Pointnet(PointNetwork):
+    """The paper's network, which reads the whole cloud."""
+
+    # pointnet: the paper's network
+    architecture: Literal["pointnet"] = "pointnet"
+    # what is read: place (xyz) or place and colour (rgb) of points, with contact points (cont) and wrist (pose)
+    inputs: Literal["xyz", "rgb", "xyzcont", "rgbcont", "xyzpose", "rgbpose"] = "rgbcont"
+    # of a cloud; minmax of each axis; wrist's axes
+    normalisation: Literal["none", "sphere", "minmax", "wrist"] = "none"
+    # largest random rotation about each axis in training
+    rotation_deg: Annotated[float, Range(0, 180), Unit("degrees")] = 0.0
+    # rotation of the wrist: as recorded, or estimated from closing axis and line of sight
+    wrist: Literal["given", "estimated"] = "given"
+    head: Literal["fc1", "fc2", "fc3", "fc4", "fc5", "fc6"] = "fc3"  # fully connected layers
+    transform: bool = True  # transform all channels of a cloud first, by a learned map
+    PRESETS: ClassVar[Presets] = {
+        "paper": {
+            "multi_target": False,
+            "use_validation": False,
+            "networks": 1,
+            "points": 750,
+            "draws": 1,
+            "normalisation": "minmax",
+            "loss": "rmse",
+            "epochs": 250,
+            "batch": 10,
+            "learning_rate": 0.01,
+            "cycle": False,
+        },
+        "quick": {"networks": 1, "epochs": 10, "points": 64},
+    }
+
+
+Params = Trees | Patches | Pointnet
