@@ -140,7 +140,7 @@ def presets(stage: AnyStage) -> list[str]:
     return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
 
 
-def panels(stage: Stage) -> dict[str, str]:
+def panels(stage: AnyStage) -> dict[str, str]:
     """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses declare; no panel for others."""
     found: dict[str, str] = {}
     for kind in kinds(stage):

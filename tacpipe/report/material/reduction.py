@@ -25,7 +25,9 @@ def tables(methods: Sequence[Method]) -> str:
     chosen = [one for one in methods if one.differs_only("subsample_sensor", "few")]
     if not all(one.published for one in chosen):
         return ""
-    described = {str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("subsample_sensor", "few_of")}
+    described = {
+        str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("subsample_sensor", "few_of")
+    }
     return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in described)
 
 
