@@ -1,0 +1,122 @@
+"""Which columns of a file are read, as what: the rules of a stream applied to the names that a file has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.table import pattern
+from tacpipe.formats.table.layout import Column, Stream
+from tacpipe.printable import listed, plain
+
+TIME = "t_ns"
+TYPES = {
+    **{name: getattr(pa, name)() for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64")},
+    **{"float32": pa.float32(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()},
+}
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A column that is read: its name in the file, what it becomes, and the rule that says so."""
+
+    name: str
+    field: pa.Field
+    rule: Column
+
+    @property
+    def read_as(self) -> pa.DataType:
+        """The type that the cells are parsed as: of floats always 64 bits, since they may be scaled."""
+        return pa.float64() if pa.types.is_floating(self.field.type) else self.field.type
+
+
+class CellError(ValueError):
+    """A value that is not allowed: the index of its row, and what is wrong with it."""
+
+    def __init__(self, row: int, text: str) -> None:
+        super().__init__(text)
+        self.row = row
+
+
+def chosen(stream: Stream, names: Sequence[str], path: Path) -> list[Chosen]:
+    """Return the columns to read among those that ``path`` has, in the file's order.
+
+    Raises `TacpipeError` for a column that no rule matches, a rule that matches none, and two columns of one name.
+    """
+    found: list[Chosen] = []
+    used = set()
+    for name in names:
+        matches = ((rule, pattern.match(rule.match, name)) for rule in stream.columns)
+        rule, values = next(((rule, values) for rule, values in matches if values is not None), (None, {}))
+        if rule is None or values is None:
+            raise TacpipeError(
+                f"{path} has a column {plain(name)}, which no entry of [streams.{stream.name}] columns matches. "
+                f'Add {{ match = "{plain(name)}", quantity = "…" }} or {{ match = "{plain(name)}", skip = true }}.'
+            )
+        used.add(rule)
+        if not rule.skip:
+            found.append(Chosen(name, _field(rule, name, values), rule))
+    idle = [rule.match for rule in stream.columns if rule not in used]
+    if idle:
+        raise TacpipeError(
+            f"{path} has no column that matches {listed(idle, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
+        )
+    out = [one.field.name for one in found]
+    doubled = sorted({name for name in out if out.count(name) > 1})
+    if doubled or TIME in out:
+        raise TacpipeError(
+            f"{path}: [streams.{stream.name}] gives more than one column the name {listed(doubled or [TIME], 3)}; "
+            f"each name may be there once, and {TIME} is the time."
+        )
+    if not found:
+        raise TacpipeError(f"{path}: [streams.{stream.name}] skips all columns. Name one that is to be read.")
+    return found
+
+
+def _field(rule: Column, name: str, values: dict[str, str]) -> pa.Field:
+    made = pattern.filled(rule.name, values) if rule.name else name.strip()
+    about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values}
+    return pa.field(made, TYPES[rule.type], metadata={key: value for key, value in about.items() if value})
+
+
+def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool) -> pa.Array:
+    """Return a parsed column as its declared type, scaled; a missing value is NaN in floats and empty in text.
+
+    Raises `CellError` for a value that is missing where there is no NaN, infinite, or beyond the type; and for NaN unless
+    ``nan_allowed``, since a cell that says so may stand for a sensor that failed.
+    """
+    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    kind = one.field.type
+    if pa.types.is_string(kind):
+        return array.cast(kind).fill_null("")
+    if not pa.types.is_floating(kind):
+        if array.null_count:
+            row = int(array.is_null().to_numpy(zero_copy_only=False).argmax())
+            raise CellError(row, f'is missing, and {kind} has no value for that. Set type = "float64" for this column')
+        try:
+            return array.cast(kind)
+        except pa.ArrowInvalid:
+            row = next(row for row, value in enumerate(array) if not _fits(value, kind))
+            raise CellError(row, f"holds {array[row].as_py()}, which is not {kind}") from None
+    values = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    missing = array.is_null().to_numpy(zero_copy_only=False)
+    bad = np.isinf(values) | (np.isnan(values) & ~missing & (not nan_allowed))
+    if bad.any():
+        row = int(bad.argmax())
+        raise CellError(row, f"holds {values[row]}. Declare it in missing if it is to be read as a missing value")
+    scaled = values if one.rule.scale == 1.0 else values * one.rule.scale
+    with np.errstate(over="ignore"):
+        return pa.array(scaled.astype(kind.to_pandas_dtype()))
+
+
+def _fits(value: pa.Scalar, kind: pa.DataType) -> bool:
+    try:
+        value.cast(kind)
+    except pa.ArrowInvalid:
+        return False
+    return True

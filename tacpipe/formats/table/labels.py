@@ -1,0 +1,171 @@
+"""Labels of recordings from a lab's own tables and YAML files, and from the names of files and folders."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.table import pattern
+from tacpipe.formats.table.layout import Labels, Layout
+from tacpipe.formats.table.recordings import Source
+from tacpipe.io import regular, yaml_text
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import excerpt, listed, plain
+
+MOST_BYTES = 1 << 26  # of a file of labels
+
+
+def found(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, dict[str, Attribute]]:
+    """Return the labels of each recording: of the layout, of its files' names, then of each source of labels.
+
+    Values are read as numbers, true and false where they are written so. Raises `TacpipeError`, naming file and row, for
+    a recording without a row or a file, two rows of one recording, a missing column, and a value that is not plain.
+    """
+    made: dict[str, dict[str, Attribute]] = {
+        one.name: {**layout.attributes, **{name: plain_value(value) for name, value in one.values.items()}}
+        for one in sources
+    }
+    for labels in layout.labels:
+        shared = not pattern.placeholders(labels.file)
+        rows = _table(folder / labels.file, labels) if shared else {}
+        for one in sources:
+            values = _row(rows, one, folder / labels.file) if shared else _file(folder, labels, one)
+            made[one.name] |= _picked(values, labels, one.name)
+    return made
+
+
+def plain_value(text: str) -> Attribute:
+    """Return what a cell's text means: true, false, a number where it is written as one, else text.
+
+    A number with leading zeros is text, as it is most often a name.
+
+    >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan")]
+    [3, 0.5, '007', True, 'cork', None, 'nan']
+    """
+    text = text.strip()
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    if not text:
+        return None
+    digits = text.lstrip("-")
+    if digits.isascii() and digits.isdigit() and (digits == "0" or not digits.startswith("0")):
+        return int(text) if len(digits) < 19 else text
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    finite = number == number and abs(number) != float("inf")
+    return number if finite and not digits.startswith("00") and "_" not in text and not digits.isdigit() else text
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells of each line that holds some, the header first; all are as wide as it."""
+    text = _text(path)
+    separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+    header: list[str] = []
+    for cells in reader:
+        if not any(cell.strip() for cell in cells):
+            continue
+        header = header or cells
+        if len(cells) != len(header):
+            raise TacpipeError(
+                f"{path}, line {reader.line_num} has {len(cells)} cells under a header of {len(header)}."
+            )
+        yield reader.line_num, [cell.strip() for cell in cells]
+
+
+def _only_row(path: Path) -> dict[str, Attribute]:
+    """Return the one row of a table that describes one recording."""
+    rows = list(_rows(path))
+    if len(rows) != 2:
+        raise TacpipeError(
+            f"{path} has {max(len(rows) - 1, 0)} rows below its header; the labels of one recording are one row."
+        )
+    return {name: plain_value(cell) for name, cell in zip(rows[0][1], rows[1][1], strict=True)}
+
+
+def _table(path: Path, labels: Labels) -> dict[str, dict[str, Attribute]]:
+    """Return the rows of a table of labels by the value of its key."""
+    numbered = _rows(path)
+    header = next(numbered, (0, []))[1]
+    if labels.key not in header:
+        raise TacpipeError(f"{path} has no column {plain(labels.key)}; it has {listed(header, 6)}.")
+    at = header.index(labels.key)
+    rows: dict[str, dict[str, Attribute]] = {}
+    for line, cells in numbered:
+        key = cells[at]
+        if key in rows:
+            raise TacpipeError(f"{path}, line {line}: {plain(key)} has a row already. Keep one of them.")
+        rows[key] = {name: plain_value(cell) for name, cell in zip(header, cells, strict=True) if name != labels.key}
+    return rows
+
+
+def _row(rows: Mapping[str, dict[str, Attribute]], source: Source, path: Path) -> dict[str, Attribute]:
+    names = [name for name in (source.within, source.name, *source.values.values()) if name is not None]
+    for name in names:
+        if name in rows:
+            return rows[name]
+    raise TacpipeError(
+        f"{path} has no row for the recording {plain(source.name)} (looked for {listed(names, 4)}); its rows are "
+        f"{listed(rows, 4)}. Add the row, or set key to the column that holds these names."
+    )
+
+
+def _file(folder: Path, labels: Labels, source: Source) -> dict[str, Attribute]:
+    path = folder / pattern.filled(labels.file, {**source.values, "recording": source.within or source.name})
+    if path.suffix.lower() in (".csv", ".tsv"):
+        return _only_row(path)
+    text = _text(path)
+    try:
+        values = json.loads(text) if path.suffix.lower() == ".json" else yaml_text.load(text)
+    except (ValueError, RecursionError) as error:
+        raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
+    if not isinstance(values, dict):
+        raise TacpipeError(f"{path} holds {excerpt(values)}; labels are NAME: VALUE, one a line.")
+    return {plain(str(name)): _checked(value, name, path) for name, value in _flat(values).items()}
+
+
+def _flat(values: Mapping[Any, Any], before: str = "") -> dict[str, Any]:
+    """Return nested mappings as one, with dots between the names."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
+    return found
+
+
+def _checked(value: Any, name: Any, path: Path) -> Attribute:
+    if isinstance(value, datetime.date | datetime.datetime):
+        return value.isoformat()
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    raise TacpipeError(f"{path}: {plain(str(name))} is {excerpt(value)}; a label is text, a number, or true or false.")
+
+
+def _picked(values: dict[str, Attribute], labels: Labels, recording: str) -> dict[str, Attribute]:
+    if not labels.columns:
+        return values
+    missing = [name for name in labels.columns if name not in values]
+    if missing:
+        raise TacpipeError(
+            f"The labels of {plain(recording)} in {plain(labels.file)} lack {listed(missing, 3)}; there are "
+            f"{listed(values, 6)}."
+        )
+    return {name: values[name] for name in labels.columns}
+
+
+def _text(path: Path) -> str:
+    with regular.failing(path):
+        content = regular.content(path, MOST_BYTES)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise TacpipeError(
+            f"{path} is not UTF-8: byte {error.start} is {excerpt(content[error.start : error.end])}."
+        ) from error

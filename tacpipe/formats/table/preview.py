@@ -1,0 +1,116 @@
+"""What a layout would read from a folder, described before anything is written: streams, rates, gaps, ranges, first rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from tacpipe.formats.table import labels, reading, recordings
+from tacpipe.formats.table.columns import TIME
+from tacpipe.formats.table.layout import Layout
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import listed
+
+GAP = 3.0  # times the usual step
+ROWS = 3  # that are shown
+COLUMNS = 6  # that are shown
+
+
+@dataclass(frozen=True)
+class Read:
+    """What a stream of one recording holds."""
+
+    rows: int
+    first_ns: int
+    rate_hz: float  # 0 where there are fewer than two rows
+    gaps: int  # steps of more than `GAP` times the usual one
+    longest_s: float  # the longest step
+    columns: Mapping[str, tuple[str, str, str, float, float]]  # quantity, unit, type, least, most
+
+
+def of(table: pa.Table) -> Read:
+    """Return what a stream's table holds.
+
+    >>> found = of(pa.table({"t_ns": [0, 10**7, 2 * 10**7, 9 * 10**7], "a": [1, 5, 2, 3]}))
+    >>> found.rows, found.rate_hz, found.gaps, found.columns["a"][3:]
+    (4, 100.0, 1, (1, 5))
+    """
+    t_ns = table.column(TIME).to_numpy()
+    steps_ns = np.diff(t_ns)
+    usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+    columns = {}
+    for field in table.schema:
+        if field.name == TIME or pa.types.is_string(field.type):
+            continue
+        ends = pc.min_max(table.column(field.name)).as_py()
+        about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        columns[field.name] = (
+            about.get("quantity", ""),
+            about.get("unit", ""),
+            str(field.type),
+            ends["min"],
+            ends["max"],
+        )
+    return Read(
+        table.num_rows,
+        int(t_ns[0]),
+        1e9 / usual_ns if usual_ns else 0.0,
+        int((steps_ns > GAP * usual_ns).sum()),
+        float(steps_ns.max(initial=0)) / 1e9,
+        columns,
+    )
+
+
+def text(layout: Layout, folder: Path) -> str:
+    """Return what would be read as lines: all recordings and labels, and the first recording's streams in full."""
+    sources = recordings.found(layout, folder)
+    labelled = labels.found(layout, folder, sources)
+    lines = [f"{len(sources)} recordings: {listed([one.name for one in sources], 6)}"]
+    lines += _labels(labelled)
+    first = sources[0]
+    lines.append(f"\n{first.name}, the first:")
+    for stream in layout.streams:
+        if stream.name not in first.files:
+            lines.append(f"  {stream.name}: not there")
+            continue
+        table = reading.table(first.files[stream.name], stream, first.within)
+        lines += _stream(stream.name, table, first.files[stream.name])
+    return "\n".join(lines)
+
+
+def _labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:
+    names = sorted({name for values in labelled.values() for name in values})
+    lines = []
+    for name in names:
+        found: Sequence[object] = sorted({str(values[name]) for values in labelled.values() if name in values})
+        lines.append(f"  label {name}: {listed(found, 6)}")
+    return lines
+
+
+def _stream(name: str, table: pa.Table, path: Path) -> list[str]:
+    found = of(table)
+    start = np.datetime64(found.first_ns, "ns")
+    lines = [
+        f"  {name}: {found.rows} rows from {path}, {found.rate_hz:.6g} Hz, first stamp {start} UTC, {found.gaps} gaps, "
+        f"longest step {found.longest_s:.6g} s"
+    ]
+    by_kind: dict[tuple[str, str, str], list[str]] = {}
+    for column, (quantity, unit, kind, _, _) in found.columns.items():
+        by_kind.setdefault((quantity, unit, kind), []).append(column)
+    for (quantity, unit, kind), columns in by_kind.items():
+        least = min(found.columns[column][3] for column in columns)
+        most = max(found.columns[column][4] for column in columns)
+        about = f"{quantity or 'no quantity'}, {unit or 'no unit'}, {kind}"
+        lines.append(f"    {len(columns)} x {about}, from {least:.6g} to {most:.6g}: {listed(columns, COLUMNS)}")
+    shown = table.column_names[: COLUMNS + 1]
+    rows = table.slice(0, ROWS).select(shown).to_pylist()
+    return lines + ["    " + "  ".join(map(_cell, row.values())) for row in rows]
+
+
+def _cell(value: object) -> str:
+    return f"{value:.7g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,139 @@
+"""Which files below a folder make which recording, by the patterns of a layout."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from tacpipe.datasets import recording_names
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.formats.table import pattern, reading
+from tacpipe.formats.table.layout import Layout, Stream
+from tacpipe.io import files as file_system
+from tacpipe.printable import listed, plain
+
+
+@dataclass(frozen=True)
+class Source:
+    """The files of one recording: a path a stream, what the placeholders are, and its name where a file holds many."""
+
+    name: str
+    files: Mapping[str, Path]
+    values: Mapping[str, str]
+    within: str | None = None  # what its rows hold in the column ``recording``
+
+
+def found(layout: Layout, folder: Path) -> list[Source]:
+    """Return the recordings below ``folder``, sorted by name.
+
+    Raises `UsageError` where none is found, where one lacks a stream that is not optional, where two files of one stream
+    belong to one recording, and where two recordings get one name.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder. Give the folder that the patterns of the layout start from.")
+    every = [Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names]
+    matched = {stream.name: _matched(stream, every) for stream in layout.streams}
+    _refuse_idle(layout, matched, every, folder)
+    shared = layout.placeholders
+    groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
+    for stream in layout.streams:
+        for path, values in matched[stream.name]:
+            if not set(shared) <= set(values):
+                raise UsageError(
+                    f"[streams.{stream.name}] files has no {{{shared[0]}}}, by which files belong to a recording. Add it."
+                )
+            groups.setdefault(tuple(values[one] for one in shared), {}).setdefault(stream.name, []).append(path)
+    sources = []
+    for key, by_stream in sorted(groups.items()):
+        for name, paths in by_stream.items():
+            if len(paths) > 1:
+                raise UsageError(
+                    f"{listed(paths, 3)} are all the stream {name} of one recording ({_described(shared, key)}). Add a "
+                    f"placeholder to every files pattern that tells them apart."
+                )
+        lacking = [one.name for one in layout.streams if not one.optional and one.name not in by_stream]
+        if lacking:
+            there = next(iter(by_stream.values()))[0]
+            raise UsageError(
+                f"The recording of {there} ({_described(shared, key)}) has no file of the stream {listed(lacking, 3)}. Add "
+                f"it, or set optional = true in [streams.{lacking[0]}]."
+            )
+        files = {name: folder / paths[0] for name, paths in by_stream.items()}
+        sources += _named(layout, files, dict(zip(shared, key, strict=True)))
+    recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
+    return sorted(sources, key=lambda one: one.name)
+
+
+def _matched(stream: Stream, every: list[Path]) -> list[tuple[Path, Mapping[str, str]]]:
+    found: list[tuple[Path, Mapping[str, str]]] = []
+    for path in every:
+        values = pattern.match(stream.files, path.as_posix())
+        if values is not None:
+            found.append((path, {name: os.fsencode(value).decode(errors="replace") for name, value in values.items()}))
+    return found
+
+
+def _refuse_idle(layout: Layout, matched: Mapping[str, object], every: list[Path], folder: Path) -> None:
+    for stream in layout.streams:
+        if not matched[stream.name] and not stream.optional:
+            raise UsageError(
+                f"No file below {folder} matches {plain(stream.files, 120)} of [streams.{stream.name}]. There are "
+                f"{len(every)} files, as {listed(every, 3)}; patterns start from {folder}."
+            )
+
+
+def _named(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[Source]:
+    """Return the recording of these files, or those that they hold."""
+    several = [one for one in layout.streams if one.recording and one.name in files]
+    if not several:
+        return [Source(_name(layout, values, files), files, values)]
+    within: dict[str, set[str]] = {one.name: _within(files[one.name], one) for one in several}
+    first = next(iter(within.values()))
+    for stream, names in within.items():
+        if names != first:
+            odd = sorted(names ^ first)
+            raise UsageError(
+                f"{files[stream]} and {files[several[0].name]} hold different recordings: {listed(odd, 3)} is in one "
+                f"of them alone."
+            )
+    return [Source(_name(layout, {**values, "recording": one}, files), files, values, one) for one in sorted(first)]
+
+
+def _within(path: Path, stream: Stream) -> set[str]:
+    """Return what the column ``recording`` of a file holds."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    file = reading.opened(path, stream)
+    if stream.recording not in file.names():
+        raise TacpipeError(
+            f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."
+        )
+    found: set[str] = set()
+    for block in file.batches({stream.recording: pa.string()}):
+        names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
+        if None in names or "" in names:
+            raise TacpipeError(
+                f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or take the row away."
+            )
+        found |= set(names)
+    return found
+
+
+def _name(layout: Layout, values: Mapping[str, str], files: Mapping[str, Path]) -> str:
+    if layout.name:
+        text = pattern.filled(layout.name, values)
+    elif values:
+        text = "-".join(f"{name}-{value}" if value.isdigit() else value for name, value in values.items())
+    else:
+        text = next(iter(files.values())).name.partition(".")[0]
+    name = recording_names.valid(text)
+    if not name:
+        raise UsageError(f"{plain(text)} cannot be a recording's name. Set name in [recordings].")
+    return name
+
+
+def _described(names: tuple[str, ...], values: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} {plain(value)}" for name, value in zip(names, values, strict=True)) or "no placeholder"

@@ -1,0 +1,130 @@
+"""Stamps of any unit as whole nanoseconds, int64: exact where the file's own digits are.
+
+Text is read as decimal numbers and never through float64, in which a Unix time of today has steps of 238 ns.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tacpipe.formats.table.layout import TimeUnit
+
+DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
+DECIMAL = pa.decimal128(38, 18)  # as which text is read
+_ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
+_LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # as Python's logging writes seconds
+
+
+class StampError(ValueError):
+    """A stamp that is none: the index of its row within the column, and what is there."""
+
+    def __init__(self, row: int, found: str, wanted: str) -> None:
+        super().__init__(found)
+        self.row, self.found, self.wanted = row, found, wanted
+
+
+def nanoseconds(column: pa.Array, unit: TimeUnit, zone: str = "UTC") -> NDArray[np.int64]:
+    """Return stamps as nanoseconds (time,); numbers as ``unit`` has them, rounded half to even.
+
+    Raises `StampError` for a missing stamp, one that is not a time, and one beyond what 64 bits hold (the year 2262).
+
+    >>> nanoseconds(pa.array(["1744849152.0161362"]).cast(DECIMAL), "s"), nanoseconds(pa.array([1.5]), "ms")
+    (array([1744849152016136200]), array([1500000]))
+    >>> nanoseconds(pa.array(["1970-01-01T01:00:00.5+01:00"]), "iso8601")
+    array([500000000])
+    """
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    _refuse(column.is_null(), column, "a time; the cell is empty")
+    if pa.types.is_timestamp(column.type):
+        if column.type.tz is None and zone != "UTC":
+            column = pc.assume_timezone(column, zone)
+        stamps = _cast(column, pa.timestamp("ns", column.type.tz)).cast(pa.int64())
+        return np.asarray(stamps.to_numpy(zero_copy_only=False), np.int64)
+    if unit == "iso8601":
+        return _of_text(column, zone)
+    if pa.types.is_decimal(column.type):
+        return _of_decimals(column, DIGITS[unit])
+    if pa.types.is_integer(column.type):
+        return _of_integers(column, 10 ** DIGITS[unit])
+    return _of_floats(column, 10 ** DIGITS[unit])
+
+
+def _of_text(column: pa.Array, zone: str) -> NDArray[np.int64]:
+    text = pc.replace_substring_regex(pc.utf8_trim_whitespace(column.cast(pa.string())), _LOGGED, r"\1.\2")
+    zoned = [bool(_ZONED.fullmatch(one)) for one in text[:1].to_pylist()]
+    if zoned == [True]:
+        stamps = _parsed(text, pa.timestamp("ns", "UTC"))
+    else:
+        stamps = pc.assume_timezone(_parsed(text, pa.timestamp("ns")), zone)
+    found: NDArray[np.int64] = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
+    return found
+
+
+def _parsed(text: pa.Array, kind: pa.DataType) -> pa.Array:
+    try:
+        return text.cast(kind)
+    except pa.ArrowInvalid:
+        for row, one in enumerate(text):
+            try:
+                one.cast(kind)
+            except pa.ArrowInvalid:
+                zone = (
+                    "with a zone, as the first row has one" if kind.tz else "without a zone, as the first row has none"
+                )
+                raise StampError(row, one.as_py(), f"a time in ISO 8601, {zone}") from None
+        raise
+
+
+def _of_decimals(column: pa.Array, digits: int) -> NDArray[np.int64]:
+    kept = pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))
+    # A decimal128 is a whole number of its last digit in two words of eight bytes, the low one first.
+    words = np.frombuffer(kept.buffers()[1], dtype="<i8").reshape(-1, 2)[kept.offset :][: len(kept)]
+    t_ns: NDArray[np.int64] = words[:, 0].astype(np.int64)
+    _refuse(pa.array(words[:, 1] != t_ns >> 63), column, "a time before the year 2262")
+    return t_ns
+
+
+def _of_integers(column: pa.Array, factor: int) -> NDArray[np.int64]:
+    values = column.to_numpy(zero_copy_only=False)
+    most = np.iinfo(np.int64).max // factor
+    _refuse(
+        pa.array((values > most) | (values < -most if values.dtype.kind == "i" else False)),
+        column,
+        "a time before the year 2262",
+    )
+    t_ns: NDArray[np.int64] = values.astype(np.int64) * factor
+    return t_ns
+
+
+def _of_floats(column: pa.Array, factor: int) -> NDArray[np.int64]:
+    values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
+    _refuse(pa.array(bad), column, "a time before the year 2262")
+    whole = np.floor(values)  # apart from the rest: their product with the factor would be rounded
+    t_ns: NDArray[np.int64] = whole.astype(np.int64) * factor + np.rint((values - whole) * factor).astype(np.int64)
+    return t_ns
+
+
+def _cast(column: pa.Array, kind: pa.DataType) -> pa.Array:
+    try:
+        return column.cast(kind)
+    except pa.ArrowInvalid:
+        for row, one in enumerate(column):
+            try:
+                one.cast(kind)
+            except pa.ArrowInvalid:
+                raise StampError(row, str(one.as_py()), "a time before the year 2262") from None
+        raise
+
+
+def _refuse(bad: Any, column: pa.Array, wanted: str) -> None:
+    flags = bad.to_numpy(zero_copy_only=False)
+    if flags.any():
+        row = int(flags.argmax())
+        raise StampError(row, str(column[row].as_py()), wanted)

@@ -1,0 +1,49 @@
+"""A lab's folder, written by pandas and numpy as a lab's own scripts write it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tacpipe.formats.table import layout
+from tacpipe.formats.table.layout import Layout, Stream
+
+START_S = 1_700_000_000
+
+
+def frame(rows: int = 50, rate_hz: float = 100.0, seed: int = 0) -> pd.DataFrame:
+    """Return stamps in Unix seconds, four taxels as whole numbers and a force."""
+    rng = np.random.default_rng(seed)
+    found: dict[str, Any] = {"time": START_S + np.arange(rows) / rate_hz}
+    found |= {f"taxel{taxel}": rng.integers(0, 4096, rows) for taxel in range(1, 5)}
+    found["fx"] = rng.normal(size=rows).round(6)
+    return pd.DataFrame(found)
+
+
+def write(folder: Path, trials: int = 3, **options: Any) -> list[pd.DataFrame]:
+    """Write ``trials`` folders with a ``skin.csv`` each and return what they hold."""
+    made = []
+    for trial in range(trials):
+        place = folder / f"trial_{trial}"
+        place.mkdir(parents=True)
+        made.append(frame(seed=trial))
+        made[-1].to_csv(place / "skin.csv", index=False, **options)
+    return made
+
+
+def stream(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv") -> Stream:
+    """Return the stream of a layout with some entries of its own."""
+    return of(extra, columns, files).streams[0]
+
+
+def of(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv", rest: str = "") -> Layout:
+    """Return a layout of one stream, ``skin``."""
+    columns = columns or (
+        '{ match = "taxel{taxel}", quantity = "tactile", unit = "count", type = "uint16" }, '
+        '{ match = "fx", name = "force_x_n", quantity = "force", unit = "N", component = "x" }'
+    )
+    time = "" if "time =" in extra else 'time = { column = "time" }'
+    return layout.parse(f'[streams.skin]\nfiles = "{files}"\n{time}\n{extra}\ncolumns = [{columns}]\n{rest}')

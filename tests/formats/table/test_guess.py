@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tacpipe.errors import UsageError
+from tacpipe.formats.table import dialect, guess, labels, layout, reading, recordings
+from tests.formats.table import labs
+
+
+def answered(text: str, **answers: str) -> layout.Layout:
+    """Return a guessed layout in which what it could not know is replaced, in order."""
+    for wanted, answer in answers.items():
+        text = text.replace(f'{wanted} = "?"', f'{wanted} = "{answer}"')
+    return layout.parse(text)
+
+
+def test_a_guess_with_its_questions_answered_reads_what_pandas_wrote(tmp_path: Path) -> None:
+    frames = labs.write(tmp_path, sep=";", decimal=",")
+    text = guess.layout(tmp_path)
+    found = answered(text, unit="N", sensor="mine")
+    assert found.streams[0].separator == ";" and found.streams[0].decimal == ","
+    for one, frame in zip(recordings.found(found, tmp_path), frames, strict=True):
+        table = reading.table(one.files["skin"], found.streams[0])
+        assert np.array_equal(table.column("fx").to_numpy(), frame["fx"].to_numpy())
+        assert table.column("taxel3").to_pylist() == frame["taxel3"].tolist()
+        assert abs(table.column("t_ns")[0].as_py() - labs.START_S * 10**9) == 0
+
+
+def test_what_a_file_cannot_say_is_refused_until_somebody_writes_it(tmp_path: Path) -> None:
+    labs.write(tmp_path, 1)
+    with pytest.raises(UsageError, match="unit is"):
+        layout.parse(guess.layout(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("stamps", "unit"),
+    [
+        (1.7e9 + np.arange(5) / 100, "s"),
+        (1.7e12 + np.arange(5) * 10, "ms"),
+        (1.7e15 + np.arange(5) * 10_000, "us"),
+        (1_700_000_000_000_000_000 + np.arange(5) * 10_000_000, "ns"),
+        (["2024-05-01T12:00:00.1", "2024-05-01T12:00:00.2"], "iso8601"),
+    ],
+)
+def test_the_unit_of_stamps_is_found_by_their_size(tmp_path: Path, stamps: object, unit: str) -> None:
+    pd.DataFrame({"stamp": stamps}).assign(taxel1=1).to_csv(tmp_path / "skin_1.csv", index=False)
+    assert f'column = "stamp", unit = "{unit}" }}' in guess.layout(tmp_path)
+
+
+def test_stamps_that_count_from_a_start_have_a_unit_only_if_their_name_says_it(tmp_path: Path) -> None:
+    pd.DataFrame({"time_ms": [0, 10, 20], "taxel1": 1}).to_csv(tmp_path / "skin_1.csv", index=False)
+    assert 'unit = "ms", origin = "start"' in guess.layout(tmp_path)
+    pd.DataFrame({"time": [0, 10, 20], "taxel1": 1}).to_csv(tmp_path / "skin_1.csv", index=False)
+    assert 'unit = "?", origin = "start"' in guess.layout(tmp_path)
+
+
+def test_tables_and_files_of_labels_are_found(tmp_path: Path) -> None:
+    labs.write(tmp_path, 2)
+    pd.DataFrame({"trial": [0, 1], "material": ["cork", "felt"]}).to_csv(tmp_path / "labels.csv", index=False)
+    for trial in range(2):
+        (tmp_path / f"trial_{trial}" / "meta.yaml").write_text("object: cup\n")
+    found = answered(guess.layout(tmp_path), unit="N", sensor="mine")
+    made = labels.found(found, tmp_path, recordings.found(found, tmp_path))
+    assert made["trial-1"] == {"sensor": "mine", "trial": 1, "material": "felt", "object": "cup"}
+
+
+def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:
+    for trial in range(3):
+        for sensor in (1, 2):
+            (tmp_path / f"t{trial}").mkdir(exist_ok=True)
+            labs.frame().to_csv(tmp_path / f"t{trial}" / f"skin{sensor}.csv", index=False)
+    found = answered(guess.layout(tmp_path), unit="N", sensor="mine")
+    assert [(one.name, one.files) for one in found.streams] == [
+        ("skin1", "t{trial}/skin1.csv"),
+        ("skin2", "t{trial}/skin2.csv"),
+    ]
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("header", [True, False])
+def test_how_a_file_is_written_is_found_from_its_lines(separator: str, header: bool) -> None:
+    rows = [[f"{row / 100:.2f}", str(row), "1.5"] for row in range(5)]
+    lines = [separator.join(row) for row in ([["t", "a", "b"]] if header else []) + rows]
+    found = dialect.of(lines)
+    assert (found.separator, found.header, len(found.rows)) == (separator, header, 5)
+
+
+def test_a_folder_without_tables_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.md").write_text("nothing")
+    with pytest.raises(UsageError, match=r"\.csv"):
+        guess.layout(tmp_path)

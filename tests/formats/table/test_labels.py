@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.table import labels, recordings
+from tests.formats.table import labs
+
+
+def found(folder: Path, rest: str) -> dict[str, dict[str, object]]:
+    layout = labs.of(rest=rest)
+    return {
+        name: dict(values) for name, values in labels.found(layout, folder, recordings.found(layout, folder)).items()
+    }
+
+
+def test_a_table_labels_each_recording_by_its_row(tmp_path: Path) -> None:
+    labs.write(tmp_path, 2)
+    (tmp_path / "labels.csv").write_text("trial,material,force\n1,cork,2.5\n0,felt,1\n")
+    assert found(tmp_path, '[[labels]]\nfile = "labels.csv"\nkey = "trial"') == {
+        "trial-0": {"trial": 0, "material": "felt", "force": 1},
+        "trial-1": {"trial": 1, "material": "cork", "force": 2.5},
+    }
+
+
+def test_a_yaml_file_labels_its_recording_over_what_all_share(tmp_path: Path) -> None:
+    labs.write(tmp_path, 1)
+    (tmp_path / "trial_0" / "meta.yaml").write_text(
+        "material: cork\nsensor: {name: mine, serial: 7}\nwhen: 2024-05-01\n"
+    )
+    rest = '[[labels]]\nfile = "trial_{trial}/meta.yaml"\n[attributes]\nmaterial = "unknown"\nlab = "ours"'
+    assert found(tmp_path, rest)["trial-0"] == {
+        "trial": 0,
+        "lab": "ours",
+        "material": "cork",
+        "sensor.name": "mine",
+        "sensor.serial": 7,
+        "when": "2024-05-01",
+    }
+
+
+def test_a_table_of_one_row_labels_its_recording(tmp_path: Path) -> None:
+    labs.write(tmp_path, 1)
+    (tmp_path / "trial_0" / "meta.csv").write_text("object,seen\ncup,true\n")
+    rest = '[[labels]]\nfile = "trial_{trial}/meta.csv"\ncolumns = ["object"]'
+    assert found(tmp_path, rest)["trial-0"] == {"trial": 0, "object": "cup"}
+
+
+WRONG = {  # the file; what the sentence must name
+    "trial,material\n0,cork\n": ("trial-1", "no row"),
+    "trial,material\n0,cork\n1,felt\n1,foam\n": ("line 4", "1"),
+    "trial,material\n0,cork\n1\n": ("line 3", "1 cells"),
+    "name,material\n0,cork\n": ("trial", "name"),
+}
+
+
+@pytest.mark.parametrize("content", WRONG)
+def test_a_wrong_table_of_labels_is_one_sentence_with_its_place(tmp_path: Path, content: str) -> None:
+    labs.write(tmp_path, 2)
+    (tmp_path / "labels.csv").write_text(content)
+    with pytest.raises(TacpipeError) as error:
+        found(tmp_path, '[[labels]]\nfile = "labels.csv"\nkey = "trial"')
+    assert all(part in str(error.value) for part in ("labels.csv", *WRONG[content])), str(error.value)

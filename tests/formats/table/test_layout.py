@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import pytest
+
+from tacpipe.errors import UsageError
+from tacpipe.formats.table import layout
+from tests.formats.table import labs
+
+STREAM = '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "t" }\ncolumns = [{ match = "x" }]\n'
+WRONG = {  # a layout, and what the sentence about it must name
+    "": ("stream",),
+    "x = [": ("TOML",),
+    "[stream.skin]": ("stream", "streams"),
+    "[streams.skin]\nfiles = 'x'": ("[streams.skin]", "time"),
+    STREAM.replace("column =", "colunm ="): ("[streams.skin]", "colunm", "column"),
+    STREAM.replace('column = "t"', 'column = "t", unit = "h"'): ("[streams.skin]", "unit", "'h'", "iso8601"),
+    STREAM.replace('column = "t"', 'column = "t", rate_hz = 5'): ("[streams.skin]", "rate_hz"),
+    STREAM.replace('column = "t"', "rate_hz = -5"): ("[streams.skin]", "rate_hz", "-5"),
+    STREAM.replace('match = "x"', 'match = "x", type = "uint12"'): ("columns 1", "uint12"),
+    STREAM.replace('match = "x"', 'match = "x", name = "{taxel}"'): ("{taxel}",),
+    STREAM.replace('match = "x"', 'match = "x", quantity = "?"'): ("quantity", "?"),
+    STREAM.replace("{trial}", "{trial"): ("{trial", "brace"),
+    STREAM + 'separator = ",,"\n': ("separator", ",,"),
+    STREAM + '[recordings]\nname = "{subject}"': ("{subject}", "trial"),
+    STREAM + '[[labels]]\nfile = "labels.csv"': ("labels.csv", "key"),
+    STREAM + "[attributes]\nlist = [1]": ("list", "[1]"),
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_wrong_layout_is_one_sentence_with_its_entry(text: str) -> None:
+    with pytest.raises(UsageError) as found:
+        layout.parse(text, "layout.toml")
+    assert all(part in str(found.value) for part in ("", *WRONG[text])), str(found.value)
+    assert "\n" not in str(found.value)
+
+
+def test_placeholders_that_all_streams_share_make_a_recording() -> None:
+    text = STREAM + STREAM.replace("skin", "arm").replace("{trial}.csv", "{arm}/{trial}.csv")
+    assert layout.parse(text).placeholders == ("trial",)
+
+
+def test_the_format_follows_the_extension_unless_the_layout_names_one() -> None:
+    from pathlib import Path
+
+    stream = labs.stream()
+    assert [stream.format_of(Path(name)) for name in ("a.TSV", "a.csv.gz", "a.parquet", "a.jsonl")] == [
+        "csv",
+        "csv",
+        "parquet",
+        "jsonl",
+    ]
+    assert labs.stream('format = "csv"').format_of(Path("a.log")) == "csv"
+    with pytest.raises(UsageError, match=r"a\.log"):
+        stream.format_of(Path("a.log"))

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.table import reading
+from tests.formats.table import labs
+
+T_NS = labs.START_S * 10**9 + np.arange(50) * 10_000_000
+
+
+def expect(found: pa.Table, frame: pd.DataFrame) -> None:
+    """Compare a table that was read with what pandas wrote."""
+    assert found.column("t_ns").to_pylist() == T_NS.tolist()
+    for taxel in range(1, 5):
+        column = found.column(f"taxel{taxel}")
+        assert column.type == pa.uint16() and column.to_pylist() == frame[f"taxel{taxel}"].tolist()
+        assert found.schema.field(f"taxel{taxel}").metadata[b"taxel"] == str(taxel).encode()
+    assert np.array_equal(found.column("force_x_n").to_numpy(), frame["fx"].to_numpy())
+    assert found.schema.field("force_x_n").metadata[b"unit"] == b"N"
+
+
+def test_a_csv_that_pandas_wrote_is_read_to_the_bit(tmp_path: Path) -> None:
+    (frame,) = labs.write(tmp_path, 1)
+    expect(reading.table(tmp_path / "trial_0/skin.csv", labs.stream()), frame)
+
+
+@pytest.mark.parametrize(
+    ("options", "extra"),
+    [
+        ({"sep": ";", "decimal": ","}, 'separator = ";"\ndecimal = ","'),
+        ({"sep": "\t"}, 'separator = "\\t"'),
+        ({"encoding": "utf-8-sig"}, ""),
+        ({"lineterminator": "\r\n"}, ""),
+        ({"quoting": 1}, ""),
+    ],
+)
+def test_other_ways_to_write_the_same_table_give_the_same(tmp_path: Path, options: dict[str, str], extra: str) -> None:
+    (frame,) = labs.write(tmp_path, 1, **options)
+    expect(reading.table(tmp_path / "trial_0/skin.csv", labs.stream(extra)), frame)
+
+
+def test_a_compressed_file_with_comments_and_lines_before_its_header_gives_the_same(tmp_path: Path) -> None:
+    frame = labs.frame()
+    text = frame.to_csv(index=False).splitlines()
+    lines = ["recorded by nobody", "", *text[:1], "# pause", *text[1:20], "", "  # more", *text[20:]]
+    (tmp_path / "skin.csv.gz").write_bytes(gzip.compress("\n".join(lines).encode()))
+    expect(reading.table(tmp_path / "skin.csv.gz", labs.stream('skip_lines = 2\ncomment = "#"')), frame)
+
+
+def test_a_file_without_header_has_numbered_columns(tmp_path: Path) -> None:
+    frame = labs.frame()
+    frame.to_csv(tmp_path / "skin.csv", index=False, header=False)
+    columns = (
+        '{ match = "column6", name = "force_x_n", unit = "N" }, '
+        '{ match = "column{taxel}", name = "cell{taxel}", type = "uint16" }'
+    )
+    found = reading.table(tmp_path / "skin.csv", labs.stream('header = false\ntime = { column = "column1" }', columns))
+    assert found.column("cell2").to_pylist() == frame["taxel1"].tolist()
+
+
+def test_parquet_npz_and_json_lines_give_the_same_as_csv(tmp_path: Path) -> None:
+    frame = labs.frame()
+    pq.write_table(pa.Table.from_pandas(frame), tmp_path / "skin.parquet")
+    np.savez(tmp_path / "skin.npz", allow_pickle=False, **{str(name): frame[name].to_numpy() for name in frame})
+    frame.to_json(tmp_path / "skin.jsonl", orient="records", lines=True, double_precision=15)
+    for name in ("skin.parquet", "skin.npz", "skin.jsonl"):
+        found = reading.table(tmp_path / name, labs.stream())
+        expect(found.set_column(0, "t_ns", pa.array(T_NS)), frame)
+        assert np.abs(found.column("t_ns").to_numpy() - T_NS).max() < 240  # what float64 keeps of Unix seconds
+
+
+def test_arrays_of_two_dimensions_are_columns(tmp_path: Path) -> None:
+    grid = np.arange(12, dtype=np.uint16).reshape(3, 2, 2)
+    np.savez(tmp_path / "skin.npz", stamp=np.arange(3) * 10**9, grid=grid)
+    columns = '{ match = "grid_{cell}", type = "uint16" }'
+    found = reading.table(tmp_path / "skin.npz", labs.stream('time = { column = "stamp", unit = "ns" }', columns))
+    assert [found.column(f"grid_{cell}").to_pylist() for cell in range(4)] == grid.reshape(3, 4).T.tolist()
+
+
+def test_long_form_becomes_a_column_a_channel(tmp_path: Path) -> None:
+    frame = labs.frame()
+    frame.melt("time", var_name="sensor", value_name="reading").to_csv(tmp_path / "skin.csv", index=False)
+    found = reading.table(tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }'))
+    expect(found, frame)
+
+
+def test_a_moment_at_which_a_channel_is_missing_is_nan_in_long_form(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n0,fy,2\n1,fx,3\n")
+    extra = 'long = { channel = "sensor", value = "reading" }\ntime = { column = "time", origin = "start" }'
+    found = reading.table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "f{component}" }'))
+    assert found.column("fx").to_pylist() == [1.0, 3.0]
+    assert np.isnan(found.column("fy")[1].as_py())
+
+
+def test_two_values_of_a_channel_at_one_moment_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n0,fx,2\n")
+    with pytest.raises(TacpipeError, match=r"two values of fx .* row 2"):
+        reading.table(
+            tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
+        )
+
+
+def test_the_rows_of_one_recording_are_picked_from_a_file_of_many(tmp_path: Path) -> None:
+    frames = {f"t{trial}": labs.frame(seed=trial) for trial in range(3)}
+    every = pd.concat([frame.assign(trial=name) for name, frame in frames.items()])
+    every.to_csv(tmp_path / "all.csv", index=False)
+    stream = labs.stream('recording = "trial"', files="all.csv")
+    for name, frame in frames.items():
+        expect(reading.table(tmp_path / "all.csv", stream, name), frame)
+
+
+def test_a_rate_makes_the_stamps_where_no_column_has_them(tmp_path: Path) -> None:
+    frame = labs.frame().drop(columns="time")
+    frame.to_csv(tmp_path / "skin.csv", index=False)
+    extra = 'time = { rate_hz = 100, start = "2023-11-14T22:13:20" }'
+    found = reading.table(tmp_path / "skin.csv", labs.stream(extra))
+    expect(found, frame)
+    assert found.schema.field("t_ns").metadata[b"made"] == b"from rate"
+
+
+def test_missing_cells_are_nan_where_they_are_declared(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text("time,fx\n0,1.5\n1,NA\n2,\n")
+    found = reading.table(tmp_path / "skin.csv", labs.stream('missing = ["NA", ""]', '{ match = "fx" }'))
+    assert found.column("fx").to_pylist()[0] == 1.5
+    assert np.isnan(found.column("fx").to_numpy()[1:]).all()
+
+
+def test_a_scaled_column_is_in_its_unit(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text("time,fx\n0,1500\n1,-20\n")
+    found = reading.table(tmp_path / "skin.csv", labs.stream("", '{ match = "fx", unit = "N", scale = 0.001 }'))
+    assert found.column("fx").to_pylist() == [1.5, -0.02]
+
+
+WRONG = {  # content of a file, and what the sentence about it must name
+    "time,taxel1,fx\n0,1,1\n1,x,1\n": ("line 3", "taxel1", "'x'"),
+    "time,taxel1,fx\n0,1,1\n\n1,2\n": ("line 4", "2 cells instead of 3"),
+    "time,taxel1,fx\n0,1,1\n1,70000,1\n": ("line 3", "taxel1", "70000", "65535"),
+    "time,taxel1,fx\n0,1,1\n1,1.5,1\n": ("line 3", "taxel1", "1.5"),
+    "time,taxel1,fx\n0,1,1\n1,2,nan\n": ("line 3", "fx", "nan"),
+    "time,taxel1,fx\n0,1,1\n1,2,inf\n": ("line 3", "fx", "inf"),
+    "time,taxel1,fx\n0,1,1\n1,,1\n": ("line 3", "taxel1"),
+    "time,taxel1,fx\n0,1,1\n,2,1\n": ("line 3", "time"),
+    "time,taxel1,fx\n5,1,1\n4,2,1\n": ("line 3", "1 s before"),
+    "time,taxel1,fx\n": ("no row",),
+    "": ("no row",),
+    "time,taxel1,taxel1,fx\n0,1,1,1\n": ("taxel1", "more than one"),
+    "time,taxel1,fx,extra\n0,1,1,1\n": ("extra", "[streams.skin]"),
+    "time,taxel1\n0,1\n": ("fx", "[streams.skin]"),
+    "stamp,taxel1,fx\n0,1,1\n": ("time", "stamp"),
+    'time,taxel1,fx\n0,"1,1\n': ("line 2",),
+}
+
+
+@pytest.mark.parametrize("content", WRONG)
+def test_a_wrong_file_is_one_sentence_with_its_place(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "skin.csv"
+    path.write_text(content)
+    with pytest.raises(TacpipeError) as found:
+        reading.table(path, labs.stream())
+    assert all(part in str(found.value) for part in (str(path), *WRONG[content])), str(found.value)
+    assert "\n" not in str(found.value)
+
+
+def test_a_value_that_is_wrong_in_a_later_block_is_named_by_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tacpipe.formats.table.text.BLOCK_BYTES", 64)
+    rows = [f"{row},1,0.5" for row in range(100)]
+    rows[80] = "80,1,inf"
+    (tmp_path / "skin.csv").write_text("\n".join(["time,taxel1,fx", *rows]))
+    with pytest.raises(TacpipeError, match="line 82"):
+        reading.table(tmp_path / "skin.csv", labs.stream())
+
+
+def test_pickles_in_an_archive_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "skin.npz", time=np.array([{}, {}], dtype=object))
+    with pytest.raises(TacpipeError, match=r"skin\.npz"):
+        reading.table(tmp_path / "skin.npz", labs.stream())
+
+
+def test_json_lines_with_lists_are_columns(tmp_path: Path) -> None:
+    lines = [json.dumps({"time": row, "taxels": [row, row + 1]}) for row in range(3)]
+    (tmp_path / "skin.jsonl").write_text("\n".join(lines))
+    found = reading.table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "taxels_{taxel}", type = "uint16" }'))
+    assert found.column("taxels_1").to_pylist() == [1, 2, 3]

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import datetime
+from decimal import Decimal
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tacpipe.formats.table import stamps
+from tacpipe.formats.table.layout import TimeUnit
+
+YEAR_2262_NS = 2**63 - 1
+
+
+@given(st.integers(0, YEAR_2262_NS), st.sampled_from(["s", "ms", "us", "ns"]))
+def test_text_of_any_unit_is_read_to_the_nanosecond(t_ns: int, unit: TimeUnit) -> None:
+    text = format(Decimal(t_ns).scaleb(-stamps.DIGITS[unit]), "f")
+    column = pa.array([text]).cast(stamps.DECIMAL)
+    assert stamps.nanoseconds(column, unit).tolist() == [t_ns]
+
+
+def test_more_decimals_than_nanoseconds_are_rounded() -> None:
+    column = pa.array(["1.0000000004999", "1.0000000005001"]).cast(stamps.DECIMAL)
+    assert stamps.nanoseconds(column, "s").tolist() == [1_000_000_000, 1_000_000_001]
+
+
+@given(st.integers(0, 2**33), st.integers(0, 2**20 - 1))
+def test_float_seconds_are_read_as_near_as_the_float_is(whole: int, part: int) -> None:
+    value = whole + part / 2**20  # exact in float64
+    (found,) = stamps.nanoseconds(pa.array([value]), "s").tolist()
+    assert abs(found - Decimal(value).scaleb(9)) <= Decimal("0.5")
+
+
+@pytest.mark.parametrize(
+    ("text", "zone", "hours"),
+    [
+        ("2024-07-01T12:00:00Z", "UTC", 12),
+        ("2024-07-01 12:00:00", "UTC", 12),
+        ("2024-07-01 12:00:00", "Europe/Berlin", 10),
+        ("2024-07-01T12:00:00+05:30", "UTC", 6.5),
+    ],
+)
+def test_iso_stamps_are_read_in_their_zone(text: str, zone: str, hours: float) -> None:
+    day = datetime.datetime(2024, 7, 1, tzinfo=datetime.UTC).timestamp()
+    expected = int((day + hours * 3600) * 10**9)
+    assert stamps.nanoseconds(pa.array([text]), "iso8601", zone).tolist() == [expected]
+
+
+def test_the_comma_of_pythons_logging_is_a_decimal_one() -> None:
+    found = stamps.nanoseconds(pa.array(["1970-01-01 00:00:01,250"]), "iso8601")
+    assert found.tolist() == [1_250_000_000]
+
+
+@pytest.mark.parametrize(
+    ("column", "unit", "row"),
+    [
+        (pa.array(["1", None]).cast(stamps.DECIMAL), "s", 1),
+        (pa.array(["1", "9999999999999"]).cast(stamps.DECIMAL), "s", 1),
+        (pa.array([1.0, 2.0, np.nan]), "s", 2),
+        (pa.array([2**62]), "s", 0),
+        (pa.array(["2024-01-01T00:00:00Z", "2024-01-01T00:00:00"]), "iso8601", 1),
+        (pa.array(["2024-01-01", "yesterday"]), "iso8601", 1),
+    ],
+)
+def test_a_stamp_that_is_none_is_named_by_its_row(column: pa.Array, unit: TimeUnit, row: int) -> None:
+    with pytest.raises(stamps.StampError) as found:
+        stamps.nanoseconds(column, unit)
+    assert found.value.row == row
