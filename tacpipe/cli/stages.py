@@ -30,7 +30,7 @@ def add(program: typer.Typer, name: str, command: str) -> None:
     """Add stage ``name`` to ``program`` as ``command``."""
     stage = registry.load(name)
     fields = params_of.fields(stage)
-    parameters = [*_arguments(stage), *_shared(stage), *_options(stage, fields)]
+    parameters = [*_arguments(stage), *_shared(stage), *_options(stage, fields), *_looks(stage)]
 
     def call(**given: Any) -> None:
         _call(name, stage, given, [field for field in fields if given.get(field) is not None])
@@ -44,6 +44,9 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     progress.set_quiet(given["quiet"])
     for flag, kind in _CHECKED.items():
         fields_of.check(given.get(flag), kind, f"--{flag}")
+    if given.get("guess") and stage.guess is not None:
+        terminal.result(stage.guess(given["source"]).rstrip("\n"))
+        return
     params = params_of.build(
         name,
         stage,
@@ -55,6 +58,9 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     )
     if given["print_params"]:
         terminal.result(json.dumps(params_of.to_input(params), indent=1))
+        return
+    if given.get("dry_run") and stage.preview is not None:
+        terminal.result(stage.preview(params, given["source"]))
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
@@ -113,7 +119,7 @@ def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
     found = []
     if "Files" in kinds:
-        found.append(_parameter("source", Path, typer.Argument(help="Folder of the published recordings.")))
+        found.append(_parameter("source", Path, typer.Argument(help="Folder of the recordings.")))
     if stage.reads_model:
         found.append(_parameter("model", Path, typer.Argument(help="A trained model.")))
     if kinds & {"Recording", "Dataset", "Datasets"}:
@@ -201,6 +207,18 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),
     ]
     return [*found, *(_parameter(*item) for item in more)]
+
+
+def _looks(stage: AnyStage) -> list[inspect.Parameter]:
+    """Return the options that print something of a source and write nothing."""
+    found = []
+    if stage.guess is not None:
+        text = "Print a first layout file for this folder, and stop."
+        found.append(_parameter("guess", bool, typer.Option(False, "--guess", help=text)))
+    if stage.preview is not None:
+        text = "Describe what would be read, and stop."
+        found.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
+    return found
 
 
 def _parsed(given: Any, wanted: Any) -> Any:

@@ -18,6 +18,7 @@ from tacpipe.printable import excerpt, plain
 
 FORMAT = 1
 NAME = "manifest.json"
+VALUES = "{values}"  # among the files of a source: the digest of what was read beside them, as labels
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
 NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add to it
 _PART = r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*"

@@ -19,7 +19,7 @@ from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import recording_names
-from tacpipe.datasets.manifest import ACQUIRE, Manifest
+from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.hashing import bytes_digest, digest
@@ -150,8 +150,14 @@ def _gone(name: str, before: Manifest, after: Manifest) -> bool:
     """
     if name not in after.recordings:
         return True
-    same_files = name in before.sources and before.sources[name] == after.sources.get(name) and before.stage != ACQUIRE
+    sources = (_raw(one.sources.get(name, {})) for one in (before, after))
+    same_files = name in before.sources and next(sources) == next(sources) and before.stage != ACQUIRE
     return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
+
+
+def _raw(source: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the digests of a recording's raw files, without that of the labels that were read with them."""
+    return {file: one for file, one in source.items() if file != VALUES}
 
 
 def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
@@ -160,7 +166,8 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
         return
     if before.stage != plan.stage:
         raise UsageError(f"{output} holds {_described(before)}; {plan.stage} would replace it. {_KEEP}")
-    changed = [name for name in plan.sources if before.sources.get(name, plan.sources[name]) != plan.sources[name]]
+    given = {name: (_raw(before.sources.get(name, source)), _raw(source)) for name, source in plan.sources.items()}
+    changed = [name for name, (earlier, now) in given.items() if earlier != now]
     alone = f"or --replace, after which {output} holds the recordings of this source alone. {_BACK}"
     if changed:
         raise UsageError(

@@ -14,7 +14,7 @@ from typing import Any
 
 from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.datasets.manifest import ACQUIRE, Manifest, shard_path
+from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest, shard_path
 from tacpipe.engine import provenance
 from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
 from tacpipe.io import memory
@@ -115,13 +115,14 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
 
 def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
     """Return a manifest of one recording that was read from published files."""
-    (entry,), files = result["recordings"].values(), task.identity["inputs"][stage.argument("Files")]
+    (entry,), inputs = result["recordings"].values(), task.identity["inputs"]
+    files, values = inputs[stage.argument("Files")], inputs.get(stage.argument("Values"))
     return Manifest(
         task.name,
         stage.version,
         task.identity["params"],
         recordings={task.recording: entry},
-        sources={task.recording: files},
+        sources={task.recording: {**files, **({VALUES: digest(values)} if values else {})}},
     )
 
 
@@ -263,7 +264,7 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
             found[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
             found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
-        elif kind == "Trial":
+        elif kind in ("Trial", "Values"):
             found[name] = inputs[name]
         elif kind == "Roles":
             found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine.execution import Task
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import AnyStage
+from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
 
 
@@ -70,21 +69,23 @@ def source_tasks(
     name: str,
     stage: AnyStage,
     params: Any,
-    sources: Mapping[str, Mapping[str, Path]],
+    sources: Mapping[str, Source],
     digests: Mapping[str, Mapping[str, str]],
 ) -> list[Task]:
     """Return one task a recording of a published source."""
-    (argument,) = (found for found, kind in stage.arguments.items() if kind == "Files")
-    return [
-        Task(
-            str(store.root),
-            name,
-            identity(name, stage.version, params, {argument: digests[recording]}),
-            recording,
-            files={file: str(path) for file, path in files.items()},
+    argument, values = stage.argument("Files"), stage.argument("Values")
+    assert argument is not None
+
+    def task(recording: str, source: Source) -> Task:
+        inputs: dict[str, Any] = {argument: {file: digests[recording][file] for file in source.files}}
+        if values is not None:
+            inputs[values] = dict(source.values)
+        named = identity(name, stage.version, params, inputs)
+        return Task(
+            str(store.root), name, named, recording, files={file: str(path) for file, path in source.files.items()}
         )
-        for recording, files in sources.items()
-    ]
+
+    return [task(recording, source) for recording, source in sources.items()]
 
 
 def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[Task]:

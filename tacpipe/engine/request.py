@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets import manifest, recording_names, roles
-from tacpipe.datasets.manifest import Entry, Found, Manifest
+from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
 from tacpipe.datasets.replacing import Plan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
-from tacpipe.io.hashing import remembered_file_digest
+from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import AnyStage
+from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
 
 
@@ -151,20 +151,27 @@ class Inputs:
         return chosen
 
 
-def _discover(stage: AnyStage, request: Request) -> dict[str, dict[str, Path]]:
+def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
     if not stage.source:
         return {}
     if request.source is None or stage.discover is None:
         raise UsageError(f"{request.name} needs a folder of recordings to read.")
     if not request.source.exists():
         raise UsageError(f"There is no {request.source} to read recordings from.")
-    found = {name: dict(files) for name, files in sorted(stage.discover(request.params, request.source).items())}
-    recording_names.refuse_shared((name, next(iter(files.values()), request.source)) for name, files in found.items())
+    found = {
+        name: one if isinstance(one, Source) else Source(one)
+        for name, one in sorted(stage.discover(request.params, request.source).items())
+    }
+    recording_names.refuse_shared((name, next(iter(one.files.values()), request.source)) for name, one in found.items())
     return found
 
 
-def _hash(sources: Mapping[str, Mapping[str, Path]]) -> dict[str, dict[str, str]]:
-    """Return the digest of each file; threads were tried and gain nothing on files of some 100 kB."""
+def _hash(sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
+    """Return the digest of each file, and of values where there are; threads gain nothing on files of some 100 kB."""
     return {
-        name: {file: remembered_file_digest(path) for file, path in files.items()} for name, files in sources.items()
+        name: {
+            **{file: remembered_file_digest(path) for file, path in one.files.items()},
+            **({VALUES: digest(dict(one.values))} if one.values else {}),
+        }
+        for name, one in sources.items()
     }

@@ -6,11 +6,18 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+from tacpipe.errors import UsageError
+from tacpipe.io import regular
 from tacpipe.plugins import fields
+from tacpipe.printable import plain
+
+MOST_BYTES = 1 << 20  # of a TOML file
 
 
 @dataclass(frozen=True)
@@ -133,6 +140,34 @@ class StoredAs:
 
     name: str
     choices: Mapping[str, str] = field(default_factory=dict)  # today's choice to that which is stored
+
+
+@dataclass(frozen=True)
+class TomlFile:
+    """A path of a TOML file; the param is what the file holds, as canonical JSON: neither path nor comments count."""
+
+    def allows(self, value: str) -> bool:
+        """Return True: whether there is such a file is known when it is read."""
+        return True
+
+    def describe(self, kind: str) -> str:
+        """Return what the text is."""
+        return "the path of a TOML file"
+
+    def read(self, path: str) -> str:
+        """Return what the file at ``path`` holds. Raises `UsageError` where there is none or it is not TOML."""
+        if not path:
+            return path
+        try:
+            content = regular.content(path, MOST_BYTES)
+        except FileNotFoundError:
+            raise UsageError(f"There is no file {path}. Give the path of a TOML file.") from None
+        try:
+            return json.dumps(
+                tomllib.loads(content.decode("utf-8-sig")), sort_keys=True, ensure_ascii=False, default=str
+            )
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise UsageError(f"{path} is not TOML: {plain(str(error), 200)}.") from error
 
 
 PositiveInt = Annotated[int, Range(1)]

@@ -22,7 +22,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular, yaml_text
 from tacpipe.plugins import fields as fields_of
-from tacpipe.plugins.constraints import StoredAs
+from tacpipe.plugins.constraints import StoredAs, TomlFile
 from tacpipe.plugins.fields import filled as filled
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.printable import excerpt, listed
@@ -363,7 +363,9 @@ def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, An
         if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
             rule = f"with {name} {current} it must be {fields_of.describe(wanted)}"
             raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {rule}.")
-        return fields_of.check(given.value, wanted, given.name, given.place)
+        value = fields_of.check(given.value, wanted, given.name, given.place)
+        files = [mark for mark in fields_of.metadata(wanted) if isinstance(mark, TomlFile)]
+        return files[0].read(value) if files else value
     owners = having(stage, given.key)
     raise UsageError(
         f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "

@@ -10,7 +10,8 @@ by its annotation what the stage reads:
 ``Datasets``    several datasets side by side, as a tuple
 ``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
 ``Fitted``      the files that the stage's ``fit`` made of the training recordings
-``Files``       the files of one recording of a published source; the stage's ``discover`` finds them
+``Files``       the files of one recording of a source; the stage's ``discover`` finds them
+``Values``      what ``discover`` gave for one recording beside its files, as labels; part of its key
 ``Trial``       the number of one recording to simulate, from 0 to ``params.trials``
 ``Roles``       the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
 ``Workspace``   a folder that survives an interruption, for checkpoints
@@ -36,13 +37,14 @@ if TYPE_CHECKING:
 ROLES = ("train", "val", "test")
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
+Values = Mapping[str, Any]  # of JSON, by name
 Fitted = Mapping[str, bytes]  # file name, content
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
-_KINDS = ("Recording", "Dataset", "Datasets", "Model", "Fitted", "Files", "Trial", "Roles", "Workspace")
+_KINDS = ("Recording", "Dataset", "Datasets", "Model", "Fitted", "Files", "Values", "Trial", "Roles", "Workspace")
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,17 @@ class RecordingOutput:
 
 
 @dataclass(frozen=True)
+class Source:
+    """What ``discover`` finds of one recording: its files, and values that the stage needs besides, such as labels."""
+
+    files: Files
+    values: Values = field(default_factory=dict)
+
+
+Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
+
+
+@dataclass(frozen=True)
 class Result:
     """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`)."""
 
@@ -82,8 +95,10 @@ class Stage(Generic[P, R]):
         None  # attributes that the function looks at; None: none of a Recording, all of a Dataset
     )
     fit: AnyStage | None = None  # makes what a ``Fitted`` argument holds
-    discover: Callable[[Any, Path], Mapping[str, Mapping[str, Path]]] | None = None
+    discover: Discover | None = None
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
+    preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
+    guess: Callable[[Path], str] | None = None  # of a source: a first layout file (--guess)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Return what the function returns: no store is involved."""
@@ -155,11 +170,14 @@ def stage(
     version: int,
     reads: tuple[str, ...] | None = None,
     fit: AnyStage | None = None,
-    discover: Callable[[Any, Path], Mapping[str, Mapping[str, Path]]] | None = None,
+    discover: Discover | None = None,
     headline: str | None = None,
+    preview: Callable[[Any, Path], str] | None = None,
+    guess: Callable[[Path], str] | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
     """Declare the decorated function a stage, whose signature it keeps. Raise ``version`` whenever its result changes.
 
     ``headline`` names the file of its result (`tacpipe.metrics.headline`) that the command prints as a table.
+    ``preview`` returns what ``discover`` and the stage would read of a source, in words; ``guess`` a first layout of one.
     """
-    return lambda function: Stage(function, version, reads, fit, discover, headline)
+    return lambda function: Stage(function, version, reads, fit, discover, headline, preview, guess)

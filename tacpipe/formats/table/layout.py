@@ -149,6 +149,11 @@ def parse(text: str, where: str = "The layout") -> Layout:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"{where} is not TOML: {plain(str(error), 200)}.") from error
+    return of(tables, where)
+
+
+def of(tables: Mapping[str, Any], where: str = "The layout") -> Layout:
+    """Return the layout that these tables of TOML are."""
     _refuse_unknown(tables, where)
     for key in tables:
         if key not in ("recordings", "streams", "labels", "attributes"):

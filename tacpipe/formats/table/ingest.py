@@ -1,0 +1,86 @@
+"""Read a lab's own tables, as a layout file describes them.
+
+CSV, TSV, Parquet, NPZ and JSON lines, one file or several a recording. ``--guess`` prints a first layout, ``--dry-run``
+describes what a layout would read.
+
+Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tacpipe.errors import UsageError
+from tacpipe.formats.table import layout as layouts
+from tacpipe.plugins.constraints import TomlFile
+from tacpipe.plugins.stage import Files, RecordingOutput, Source, Values, stage
+
+WITHIN = "recording"  # among a source's values: what its rows hold in the column that names recordings
+LABELS = "labels"
+
+
+@dataclass(frozen=True)
+class Params:
+    """How the tables are laid out."""
+
+    layout: Annotated[str, TomlFile()] = ""  # layout file; docs/own-data.md describes its entries
+
+    def check(self) -> None:
+        """Raise `UsageError` for a layout that is missing or wrong, before any file is looked for."""
+        self.parsed()
+
+    def parsed(self) -> layouts.Layout:
+        """Return the layout."""
+        if not self.layout:
+            raise UsageError("--layout must be given: the file that describes the tables. --guess prints a first one.")
+        return layouts.of(json.loads(self.layout), "The layout")
+
+
+def discover(params: Params, source: Path) -> dict[str, Source]:
+    """Return the files and labels of each recording below ``source``."""
+    from tacpipe.formats.table import labels, recordings
+
+    layout = params.parsed()
+    found = recordings.found(layout, source)
+    labelled = labels.found(layout, source, found)
+    return {
+        one.name: Source(
+            one.files, {LABELS: labelled[one.name], **({} if one.within is None else {WITHIN: one.within})}
+        )
+        for one in found
+    }
+
+
+def preview(params: Params, source: Path) -> str:
+    """Return what would be read, in words."""
+    from tacpipe.formats.table import preview
+
+    return preview.text(params.parsed(), source)
+
+
+def guess(source: Path) -> str:
+    """Return the text of a first layout."""
+    from tacpipe.formats.table import guess
+
+    return guess.layout(source)
+
+
+@stage(version=1, discover=discover, preview=preview, guess=guess)
+def table(params: Params, files: Files, values: Values) -> RecordingOutput:
+    """Read a lab's own tables (CSV, Parquet, NPZ, JSON lines).
+
+    A layout file names the files of each recording, their columns with quantity and unit, where time stamps and labels
+    come from. Start with ``--guess``, replace each "?" in what it prints, look at the result with ``--dry-run``.
+
+    Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
+    """
+    from tacpipe.formats.table import reading
+
+    layout = params.parsed()
+    streams = {
+        one.name: reading.table(files[one.name], one, values.get(WITHIN)) for one in layout.streams if one.name in files
+    }
+    return RecordingOutput(streams, dict(values[LABELS]))

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import tacpipe
+from tests.conftest import Lab, Ran
+from tests.formats.table import labs
+
+LAYOUT = """
+[streams.skin]
+files = "trial_{trial}/skin.csv"
+time = { column = "time" }
+columns = [
+    { match = "taxel{taxel}", quantity = "tactile", unit = "count", type = "uint16" },
+    { match = "fx", name = "force_x_n", quantity = "force", unit = "N" },
+]
+
+[[labels]]
+file = "labels.csv"
+key = "trial"
+"""
+INGEST = "ingest table own --layout layout.toml -o data/rec"
+
+
+@pytest.fixture
+def own(lab: Lab) -> Lab:
+    """A project with a lab's own folder of three trials, their labels and a layout."""
+    labs.write(lab.folder / "own")
+    _label(lab, ["cork", "felt", "cork"])
+    (lab.folder / "layout.toml").write_text(LAYOUT)
+    return lab
+
+
+def _label(lab: Lab, materials: list[str]) -> None:
+    frame = pd.DataFrame({"trial": range(3), "material": materials})
+    frame.to_csv(lab.folder / "own" / "labels.csv", index=False)
+
+
+def counts(ran: Ran) -> tuple[int, int]:
+    """Return how many recordings were read, and how many were in the store."""
+    found = json.loads(ran.out)
+    return found["ran"], found["reused"]
+
+
+def test_a_labs_own_tables_become_recordings_with_labels(own: Lab) -> None:
+    own.run(INGEST)
+    found = tacpipe.open("data/rec")
+    assert [one.name for one in found] == ["trial-0", "trial-1", "trial-2"]
+    assert [one.attributes["material"] for one in found] == ["cork", "felt", "cork"]
+    frame = labs.frame(seed=1)
+    assert found["trial-1"].table("skin").column("taxel4").to_pylist() == frame["taxel4"].tolist()
+
+
+def test_what_did_not_change_is_not_read_again(own: Lab) -> None:
+    assert counts(own.run(f"{INGEST} --json")) == (3, 0)
+    (own.folder / "layout.toml").write_text("# a comment\n" + LAYOUT)
+    assert counts(own.run(f"{INGEST} --json")) == (0, 3)
+
+
+def test_one_changed_line_of_a_shared_table_of_labels_costs_one_recording(own: Lab) -> None:
+    own.run(INGEST)
+    _label(own, ["cork", "foam", "cork"])
+    assert counts(own.run(f"{INGEST} --json")) == (1, 2)
+    assert [one.attributes["material"] for one in tacpipe.open("data/rec")] == ["cork", "foam", "cork"]
+
+
+def test_one_changed_file_costs_one_recording_and_is_not_taken_for_the_same(own: Lab) -> None:
+    own.run(INGEST)
+    labs.frame(seed=7).to_csv(own.folder / "own" / "trial_2" / "skin.csv", index=False)
+    refused = own.call(INGEST)
+    assert refused.code == 2 and "trial-2" in refused.err
+    assert counts(own.run(f"{INGEST} --replace --json")) == (1, 2)
+
+
+def test_a_dry_run_describes_and_writes_nothing(own: Lab) -> None:
+    printed = own.run("ingest table own --layout layout.toml --dry-run").out
+    for part in ("3 recordings", "100 Hz", "tactile, count, uint16", "label material: cork, felt"):
+        assert part in printed
+    assert not (own.folder / "data").exists()
+
+
+def test_a_guess_needs_no_layout(own: Lab) -> None:
+    printed = own.run("ingest table own --guess").out
+    assert 'files = "trial_{trial}/skin.csv"' in printed and 'file = "labels.csv"' in printed
+
+
+def test_many_recordings_in_one_file_are_recordings_each(lab: Lab) -> None:
+    every = pd.concat([labs.frame(seed=trial).assign(trial=f"t{trial}") for trial in range(3)])
+    (lab.folder / "own").mkdir()
+    every.to_csv(lab.folder / "own" / "all.csv", index=False)
+    text = LAYOUT.partition("[[labels]]")[0].replace('"trial_{trial}/skin.csv"', '"all.csv"\nrecording = "trial"')
+    (lab.folder / "layout.toml").write_text(text)
+    lab.run(INGEST)
+    found = tacpipe.open("data/rec")
+    assert [one.name for one in found] == ["t0", "t1", "t2"]
+    assert found["t2"].table("skin").column("taxel1").to_pylist() == labs.frame(seed=2)["taxel1"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "parts"),
+    [
+        (lambda folder: (folder / "layout.toml").unlink(), 2, ("layout.toml",)),
+        (lambda folder: (folder / "layout.toml").write_text("x = ["), 2, ("layout.toml", "TOML")),
+        (
+            lambda folder: (folder / "own/trial_1/skin.csv").write_text("time,fx\n0,1\n"),
+            1,
+            ("trial_1/skin.csv", "taxel"),
+        ),
+        (
+            lambda folder: (folder / "own/labels.csv").write_text("trial,material\n0,cork\n"),
+            1,
+            ("labels.csv", "trial-1"),
+        ),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_its_place(
+    own: Lab, change: Callable[[Path], object], code: int, parts: tuple[str, ...]
+) -> None:
+    change(own.folder)
+    ran = own.call(INGEST)
+    assert ran.code == code and all(part in ran.err for part in parts), ran.err
+    assert not (own.folder / "data/rec").exists()
