@@ -35,9 +35,8 @@ class Params:
     object_points: PositiveInt = 50  # points that a thing must have; fewer are noise of the table
     # largest distance of the object from the line between the fingers, or from its sight line
     near_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0
-    outlier_neighbours: PositiveInt = (
-        20  # nearest points whose mean distance identifies stray points at the object's rim
-    )
+    # nearest points whose mean distance identifies stray points at the object's rim
+    outlier_neighbours: PositiveInt = 20
     # standard deviations of that distance above its mean, beyond which it is stray
     outlier_deviations: PositiveFloat = 5.0
     # time at the start whose median is each finger's pressure without load

@@ -253,9 +253,9 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
 
     All slides have the same number of frames, and single wrong tactile readings are replaced by a median.
 
-    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure goes
-    on; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm ``profile``,
-    its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
+    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure
+    changes; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
+    ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
     ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
 
     Example: tacpipe segment slides data/touched -o data/slides

@@ -49,7 +49,7 @@ COMMANDS = [
 
 def blocks(text: str, language: str) -> list[str]:
     """Return the fenced blocks of a language."""
-    found: list[str] = re.findall(rf"^```{language}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    found: list[str] = re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
     return found
 
 

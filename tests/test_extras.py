@@ -41,6 +41,9 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "ingest biotac-slide biotac -o {o}",
     "ingest roboskin roboskin -o {o}",
     "ingest vision2tactile grasps -o {o}",
+    "ingest table tables --layout tables/layout.toml -o {o}",
+    "ingest table tables --guess",
+    "version",
     "synchronize data/recordings -o {o} --rate-hz 20",
     "segment contacts data/synced -o {o} --pad-s 0.4",
     "segment slips data/synced -o {o}",
@@ -120,6 +123,10 @@ def prepare(folder: Path) -> None:
     points_m = shapes.seen(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]
     (folder / "bottle.ply").write_text(HEADER.format(len(lines)) + "\n".join(lines) + "\n")
+    (folder / "tables").mkdir()
+    (folder / "tables" / "a.csv").write_text("time,x\n0,1\n1,2\n")
+    layout = '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "time" }\ncolumns = [{ match = "x" }]\n'
+    (folder / "tables" / "layout.toml").write_text(layout)
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
 

@@ -126,7 +126,7 @@ def _too_wide(widths_m: list[float], opening_m: tuple[float, float]) -> str:
 def _thinned(cloud: Cloud, seed: int) -> Cloud:
     if len(cloud) < FEWEST:
         raise TacpipeError(
-            f"The cloud has {len(cloud)} points; to state a shape it takes {FEWEST} or more. Is it the object's cloud?"
+            f"The cloud has {len(cloud)} points; to find its shape it takes {FEWEST} or more. Is it the object's cloud?"
         )
     if len(cloud) <= MOST:
         return cloud

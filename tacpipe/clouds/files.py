@@ -82,7 +82,7 @@ def _told(path: Path) -> int:
     if path.suffix.lower() != ".pts":
         return len(filled)
     if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > DIGITS:
-        raise TacpipeError(f"{path} is no PTS file: its first line must be the number of points alone.")
+        raise TacpipeError(f"{path} is not a PTS file: its first line must be the number of points alone.")
     told = int(filled[0][0])
     if _rows(path) < told:  # open3d takes memory for as many as are told
         raise TacpipeError(

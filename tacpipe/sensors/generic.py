@@ -65,7 +65,7 @@ class Generic(Sensor):
             _bytes(name, getattr(self, name))
         if not (self.marker or self.tail or self.packets):
             raise UsageError(
-                'generic: nothing states where a frame begins; give marker or tail, such as marker = "AA 55", or '
+                'generic: no option marks where a frame begins; give marker or tail, such as marker = "AA 55", or '
                 "packets = true where each packet of the link is a frame."
             )
         if self.size > MOST:

@@ -42,6 +42,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "learn": LEARN,
     "clouds": CLOUDS,
     "devices": DEVICES,
+    "frames": (),
     "all": (*LEARN, *CLOUDS, *DEVICES),
 }
 IMPORT_ALL = """

@@ -180,9 +180,9 @@ def _of(chain: str, names: dict[int, str]) -> list[Case]:
 
 
 def _ingest(name: str) -> Case:
-    return Case(
-        f"ingest.{name}", f"ingest {name} src -o data/r", sources=lambda lab: _publish(name, lab / "src"), durable=True
-    )
+    options = " --layout src/layout.toml" if name == "table" else ""
+    command = f"ingest {name} src -o data/r{options}"
+    return Case(f"ingest.{name}", command, sources=lambda lab: _publish(name, lab / "src"), durable=True)
 
 
 def _publish(name: str, place: Path) -> None:
@@ -195,6 +195,13 @@ def _publish(name: str, place: Path) -> None:
         slide_files.write_roboskin(place, slide_files.felt(2))
     elif name == "vision2tactile":
         grasp_files.write_grasp(place)
+    elif name == "table":
+        place.mkdir()
+        for trial in "ab":
+            (place / f"{trial}.csv").write_text("time,x\n0,1.5\n0.01,2\n")
+        (place / "layout.toml").write_text(
+            '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "time" }\ncolumns = [{ match = "x" }]\n'
+        )
     elif name == "xela-flat":
         xela_files.write_flat(place / "data_sample_2021-11-24-15-19-34")
     else:
@@ -217,7 +224,7 @@ STAGES = (
     ),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
     Case("report", "report results/f -o report.html", FORWARD),
-    *(_ingest(name) for name in ("biotac-slide", "roboskin", "vision2tactile", "xela-flat", "xela-psc")),
+    *(_ingest(name) for name in ("biotac-slide", "roboskin", "table", "vision2tactile", "xela-flat", "xela-psc")),
 )
 CASES = {case.name: case for case in (*TOYS, *STAGES)}
 assert len(CASES) == len(TOYS) + len(STAGES)

@@ -13,6 +13,7 @@ import json
 import re
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +33,10 @@ from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import report_descriptor
 from tacpipe.plugins import params, registry
+from tacpipe.plugins.stage import Source
 from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
+from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xela_files
 from tests.promises import decoding
 from tests.sensors.test_every_sensor import CASES
@@ -243,9 +246,26 @@ def _grasps(folder: Path) -> None:
     grasp_files.write_grasp(folder)
 
 
+LAYOUT = """
+[streams.skin]
+files = "{trial}.csv"
+time = { column = "time" }
+columns = [{ match = "x", unit = "N" }]
+[[labels]]
+file = "{trial}.yaml"
+"""
+
+
+def _tables(folder: Path) -> None:
+    (folder / "a.csv").write_text("time,x\n0,1.5\n0.01,2\n0.02,-3e2\n")
+    (folder / "a.yaml").write_text("material: cork\nforce: 2.5\n")
+
+
+PARAMS = {"table": {"layout": json.dumps(tomllib.loads(LAYOUT))}}  # of formats that need some
 TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of each format
     "biotac-slide": _biotac,
     "roboskin": _roboskin,
+    "table": _tables,
     "vision2tactile": _grasps,
     "xela-flat": lambda folder: xela_files.write_flat(folder / "data_sample_a"),
     "xela-psc": lambda folder: xela_files.write_psc(folder / "data_sample_a"),
@@ -276,8 +296,20 @@ def ingested(name: str, folder: Path) -> list[Any]:
     """Return the recordings that a format reads in a folder."""
     stage = registry.load(f"ingest.{name}")
     assert stage.discover is not None
-    given = stage.params()
-    return [stage(given, files=files) for files in list(stage.discover(given, folder).values())[:3]]
+    given = stage.params(**PARAMS.get(name, {}))
+    found = []
+    for one in list(stage.discover(given, folder).values())[:3]:
+        source = one if isinstance(one, Source) else Source(one)
+        values = {"values": source.values} if stage.argument("Values") else {}
+        found.append(stage(given, files=source.files, **values))
+    return found
+
+
+def ingest(lab: Lab, name: str) -> Ran:
+    """Run the command that ingests the folder ``source``."""
+    (lab.folder / "layout.toml").write_text(LAYOUT)
+    options = "--layout layout.toml" if name == "table" else ""
+    return lab.call(f"ingest {name} source -o data {options}")
 
 
 def _trees(name: str) -> list[bytes]:

@@ -365,7 +365,7 @@ def ingested_with(lab: Lab, name: str, kind: str) -> None:
     path = sorted(one for one in (lab.folder / "source").rglob("*") if one.is_file())[0]
     put(kind, path)
     with bounded(4 * GIB):
-        ran = lab.call(f"ingest {name} source -o data")
+        ran = targets.ingest(lab, name)
     assert ran.code in (1, 2)
     assert is_sentence(ran.err.removeprefix("tacpipe: ").rstrip("\n")), ran.err
     assert not (lab.folder / "data").exists()

@@ -18,7 +18,6 @@ from tests.report.touch import touch_fakes
 from tests.stages.learning_fakes import FakeDataset, FakeShard
 
 INSPECTION = (Path(__file__).parent / "inspection.js").read_text()
-DOCS = Path(__file__).parents[2] / "docs"
 WIDTHS = (1280, 400)
 LONG = "2026-11-22T10-32-33_gripper-left_carpet-with-long-pile_operator-two_trial"  # how a lab names a recording
 BOTH = {"biotac": 1, "roboskin": 2}
@@ -115,13 +114,6 @@ def rendered(request: pytest.FixtureRequest) -> bytes:
 @pytest.mark.parametrize("width", WIDTHS)
 def test_what_a_reader_sees_of_a_page_is_whole_text(chromium: Browser, rendered: bytes, width: int) -> None:
     chromium.show(rendered, width)
-    assert chromium.run(INSPECTION) == []
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", ["forward", "material", "touch"])
-def test_the_published_pages_are_whole_text_too(chromium: Browser, name: str, width: int) -> None:
-    chromium.show((DOCS / f"{name}.html").read_bytes(), width)
     assert chromium.run(INSPECTION) == []
 
 

@@ -141,7 +141,8 @@ def test_other_modules_than_in_the_rig_file_are_told_with_what_to_write() -> Non
     with pytest.raises(DeviceError) as caught:
         held(sensor.opening({}), HAND.device())
     assert str(caught.value) == (
-        "The board (PX-HS V1.0.0) has thumb_tip of 52 points, index_tip of 31 points, palm1 of 9 points; the rig file says "
+        "The board (PX-HS V1.0.0) has thumb_tip of 52 points, index_tip of 31 points, palm1 of 9 points; the rig file "
+        "states "
         'index_tip of 52 points. Correct modules and variants there: modules = ["thumb_tip", "index_tip", "palm1"], '
         'variants = ["DP-S2015-Elite", "DP-S1813-Elite", "MC-M2020-Elite"].'
     )

@@ -26,7 +26,7 @@ LABELS = "labels"
 class Params:
     """How the tables are laid out."""
 
-    layout: Annotated[str, TomlFile()] = ""  # layout file; docs/own-data.md describes its entries
+    layout: Annotated[str, TomlFile()] = ""  # layout file; docs/tutorials/own-data.md describes its entries
 
     def check(self) -> None:
         """Raise `UsageError` for a layout that is missing or wrong, before any file is looked for."""

@@ -198,7 +198,7 @@ def _long(file: Rows, stream: Stream, recording: str | None) -> pa.Table:
         row = int(np.setdiff1d(np.arange(len(flat)), first)[0])
         raise TacpipeError(
             f"{file.path} has two values of {plain(names[codes[row]])} at one moment, the second in data row {row + 1}. "
-            f"Name the column that tells them apart, or take one away."
+            f"Name the column that distinguishes them, or remove one."
         )
     grid = np.full((len(t_ns), len(names)), np.nan)
     grid.flat[flat] = np.concatenate(values)

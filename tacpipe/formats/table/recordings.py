@@ -51,7 +51,7 @@ def found(layout: Layout, folder: Path) -> list[Source]:
             if len(paths) > 1:
                 raise UsageError(
                     f"{listed(paths, 3)} are all the stream {name} of one recording ({_described(shared, key)}). Add a "
-                    f"placeholder to every files pattern that tells them apart."
+                    f"placeholder to every files pattern that distinguishes them."
                 )
         lacking = [one.name for one in layout.streams if not one.optional and one.name not in by_stream]
         if lacking:

@@ -146,7 +146,7 @@ class TextTable:
     def _allowed(self, cell: str, kind: pa.DataType) -> bool:
         if cell in self.stream.missing:
             return True
-        text = pa.BufferReader(f'"{cell}"\n'.encode())
+        text = pa.BufferReader(owned(f'"{cell}"\n'.encode()))
         options = pc.ConvertOptions(column_types={"x": kind}, null_values=[], decimal_point=self.stream.decimal)
         try:
             pc.read_csv(text, pc.ReadOptions(column_names=["x"], use_threads=False), convert_options=options)

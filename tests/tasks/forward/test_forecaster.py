@@ -13,6 +13,7 @@ import pytest
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load as load_stage
+from tacpipe.plugins.stage import Source
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel, load
@@ -240,7 +241,7 @@ def test_raw_counts_of_published_trials_are_always_refused_and_counts_above_rest
     ingest = load_stage("ingest.xela-flat")
     assert ingest.discover is not None
     found = list(ingest.discover(ingest.params(), sample_data() / "xela_flat_pick_move").values())[::4]
-    training, watched, *others = (published(files) for files in found)
+    training, watched, *others = (published(dict(files)) for files in found if not isinstance(files, Source))
     asked_for = {"epochs": 1, "stride": 10, "baselines": False}  # trained on one trial, where the limit is least sure
     made = load(trained(tmp_path, dataset(training), dataset(watched), **asked_for))
     refused = 0
