@@ -133,7 +133,7 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
         here: set[str] = set()
         for block in found:
             if block.title:
-                (tmp_path / block.title).write_text(block.text)
+                (tmp_path if block.title.endswith(".py") else project).joinpath(block.title).write_text(block.text)
             elif block.language == "python":
                 run_python(page, block.text, project, environment)
             elif block.language == "console":
