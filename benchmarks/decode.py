@@ -21,7 +21,6 @@ import optoforce
 import timing
 from anyskin.sensor import AnySkinBase
 from flexitac import FlexiTacSensor
-from numpy.typing import NDArray
 from paxini_sdk import protocol
 from paxini_sdk.boards.high_speed import AutoPushConfig, AutoPushFrame
 from paxini_sdk.transport import SerialTransport
@@ -29,6 +28,7 @@ from pyrobotiqtactile.protocol import PacketParser
 from RSIPI.xml_handler import FastXMLParser
 from tactile_sdk.protocol.modbus_rtu import ModbusRTU
 
+from tacpipe.arrays import AnyArray
 from tacpipe.sensors import anyskin, kuka_rsi, xela
 from tacpipe.sensors.anyskin import AnySkin
 from tacpipe.sensors.flexitac import FlexiTac
@@ -44,7 +44,6 @@ from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.sensors.xela import Xela
 
 FRAMES, PIECE_S, BAR = 2000, 0.1, 10.0
-Table = NDArray[Any]  # (frame, number)
 
 
 class Port:
@@ -99,8 +98,8 @@ class Contest:
     name: str
     sensor: Sensor
     frames: Any  # (frame, byte), or lines
-    vendor: Callable[[bytes, int], Table]  # of all bytes and how many come in a piece
-    ours: Callable[[Samples], Table]  # the numbers of samples as the vendor gives them
+    vendor: Callable[[bytes, int], AnyArray]  # of all bytes and how many come in a piece
+    ours: Callable[[Samples], AnyArray]  # the numbers of samples as the vendor gives them
 
     packets: bool = False  # a link gives the frames one by one
     forget: Callable[[], object] = dict  # what the driver keeps of texts, so that each round reads them anew
@@ -125,7 +124,7 @@ class Contest:
         for place in range(0, len(self.data), size):
             yield Chunks.of([(place, self.data[place : place + size])])
 
-    def read(self, count: int) -> Table:
+    def read(self, count: int) -> AnyArray:
         """Return what our driver makes of the bytes of so many frames at a time."""
         self.forget()
         framer, found = self.sensor.framer(), []
@@ -192,7 +191,7 @@ def _flexitac(rng: np.random.Generator) -> Contest:
     sensor = FlexiTac()
     taxels = rng.integers(0, 255, (FRAMES, 384), dtype=np.uint8)
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         client = FlexiTacSensor("nowhere", baseline=0.0)
         client._serial = Port(data, 386)  # what it reads beyond a frame piles up until it throws it away
         return np.stack([client.read().raw.ravel() for _ in range(FRAMES)])
@@ -204,7 +203,7 @@ def _anyskin(rng: np.random.Generator, mode: Any) -> Contest:
     sensor = AnySkin(mode=mode)
     numbers = np.round(rng.normal(0, 300, (FRAMES, 20)), 2).astype(np.float32)
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         client = AnySkinOnBytes(data + data[:600], mode == "binary")  # it reads no frame that is the last
         return np.stack([client.get_sample()[1] for _ in range(FRAMES)]).astype(np.float32)
 
@@ -213,17 +212,17 @@ def _anyskin(rng: np.random.Generator, mode: Any) -> Contest:
     return Contest(name, sensor, frames, vendor, lambda samples: samples.values[0], forget=anyskin._table.cache_clear)
 
 
-def _daq(rng: np.random.Generator) -> tuple[OptoForce, Samples, Callable[[bytes, int], Table]]:
+def _daq(rng: np.random.Generator) -> tuple[OptoForce, Samples, Callable[[bytes, int], AnyArray]]:
     status = np.zeros((FRAMES, 1), dtype=np.uint16)
     axes = rng.integers(-3000, 3000, (FRAMES, 6), dtype=np.int16)
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         logging.getLogger("optoforce").setLevel(logging.ERROR)  # it warns that it was not tested
         client = optoforce.OptoForce22("nowhere")
         client.opt_ser, client.close = Port(data, len(data)), lambda: None
         readings = [client.read(only_latest_data=False) for _ in range(FRAMES)]
         scale = np.array([300 / 7925, 300 / 8641, 2000 / 6049, 1, 1, 1])
-        counts: Table = np.rint(np.array([reading[2:8] for reading in readings]) / scale).astype(np.int16)
+        counts: AnyArray = np.rint(np.array([reading[2:8] for reading in readings]) / scale).astype(np.int16)
         return counts
 
     return OptoForce(axes=6), Samples((status, axes), seq=np.arange(FRAMES)), vendor
@@ -261,7 +260,7 @@ def _paxini(rng: np.random.Generator) -> Contest:
     slots = {SLOTS.index(module): count for module, count in sensor.points.items()}
     config = AutoPushConfig(list(slots), True, True, slots)
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         transport = SerialTransport("nowhere")
         transport._ser, found = Port(data, len(data) // FRAMES), []
         for _ in range(FRAMES):
@@ -288,7 +287,7 @@ def _robotiq(rng: np.random.Generator) -> Contest:
     signed = rng.integers(-3000, 3000, (FRAMES, 22), dtype=np.int16)
     clocks = (np.arange(FRAMES, dtype=np.uint64)[:, None] * np.uint64(10_000)).repeat(2, axis=1)
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         parser, found = PacketParser(), []
         for place in range(0, len(data), size):
             for packet in parser.feed(data[place : place + size]):
@@ -304,7 +303,7 @@ def _modbus(rng: np.random.Generator) -> Contest:
     sensor = ModbusTactile()
     taxels = rng.integers(0, 5000, (FRAMES, 60), dtype=np.uint16)
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         client = ModbusRTU(Port(data, 126))
         return np.array([client.read_all_pressure_values_fast(1) for _ in range(FRAMES)])
 
@@ -320,7 +319,7 @@ def _kuka(rng: np.random.Generator) -> Contest:
     poses = np.hstack([rng.uniform(-2, 2, (FRAMES, 3)), still])
     frames = sensor.encode(Samples((poses, joints_rad), seq=4 * np.arange(FRAMES)))
 
-    def vendor(data: bytes, size: int) -> Table:
+    def vendor(data: bytes, size: int) -> AnyArray:
         blank: dict[str, Any] = {
             "RIst": dict.fromkeys("XYZABC", 0.0),
             "AIPos": {f"A{n}": 0.0 for n in range(1, 7)},
@@ -342,7 +341,7 @@ def _xela(rng: np.random.Generator) -> Contest:
     t_ns = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(FRAMES)
     frames = sensor.encode(Samples((counts,), seq=np.arange(FRAMES), t_device_ns=t_ns))
 
-    def loop(data: bytes, size: int) -> Table:
+    def loop(data: bytes, size: int) -> AnyArray:
         readings = [json.loads(frame)["1"]["data"] for frame in frames]
         return np.array([[int(count, 16) for count in reading.split(",")] for reading in readings], dtype=np.uint16)
 

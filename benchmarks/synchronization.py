@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import timing
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Times
 from tacpipe.plugins.registry import load
 from tacpipe.signals import holds, resampling
 from tacpipe.signals.clocks import fit_clock
@@ -29,8 +29,8 @@ STREAMS = {"tactile1": (48, 100.0, np.uint16), "tactile2": (48, 100.0, np.uint16
 class Stream:
     """Stamps and samples of one sensor, and the same as a frame."""
 
-    t_ns: NDArray[np.int64]  # (time,)
-    values: NDArray[Any]  # (time, channel)
+    t_ns: Times  # (time,)
+    values: AnyArray  # (time, channel)
     frame: pd.DataFrame
 
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Unit
@@ -18,10 +18,9 @@ from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
-    from numpy.typing import NDArray
 
+    from tacpipe.arrays import AnyArray, Floats, Times
     from tacpipe.datasets.dataset import Recording
     from tacpipe.signals.contact import Thresholds
 
@@ -85,7 +84,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
     table = recording.table()
     t_ns = table.column("t_ns").to_numpy()  # (time,)
-    loads: list[NDArray[np.float64]] = []
+    loads: list[Floats] = []
     limits: list[Thresholds] = []
     rest: dict[str, dict[str, str]] = {}
     sensors = _sensors(recording.name, table)
@@ -299,7 +298,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     return RecordingOutput(tables, attributes)
 
 
-def _tared(tare: str, values: NDArray[Any], level: NDArray[np.float64], axes: int) -> NDArray[np.float64]:
+def _tared(tare: str, values: AnyArray, level: Floats, axes: int) -> Floats:
     """Return what is taken off each channel (channel,); ``level`` is the median of the first seconds."""
     import numpy as np
 
@@ -308,7 +307,7 @@ def _tared(tare: str, values: NDArray[Any], level: NDArray[np.float64], axes: in
     if tare == "median":
         return level
     if tare == "first":
-        first: NDArray[np.float64] = values[0].astype(np.float64)
+        first: Floats = values[0].astype(np.float64)
         return first
     if tare == "axis_mean":
         return axis_mean_level(values, axes)
@@ -411,7 +410,7 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
     return found[0]
 
 
-def _rate_hz(name: str, t_ns: NDArray[np.int64]) -> float:
+def _rate_hz(name: str, t_ns: Times) -> float:
     """Return how many rows there are a second. Raises `TacpipeError` where their steps are not even."""
     import numpy as np
 

@@ -17,10 +17,9 @@ from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
-    from numpy.typing import NDArray
 
+    from tacpipe.arrays import AnyArray, Bools, Floats, Int32s, Int64s, Times
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
 
@@ -56,10 +55,10 @@ class _Stream:
 
     name: str
     columns: Columns
-    t_ns: NDArray[np.int64]  # (time,)
-    held: NDArray[np.bool_]  # (time,)
+    t_ns: Times  # (time,)
+    held: Bools  # (time,)
     attributes: dict[str, Attribute] = field(default_factory=dict)  # what the fit of its clock gave
-    unwrapped: Mapping[str, NDArray[np.int32]] = field(default_factory=dict)  # channels whose counts had wrapped around
+    unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
 
     @property
     def channels(self) -> list[str]:
@@ -72,7 +71,7 @@ class _Stream:
         found = self.columns.schema.field(name)
         return found.with_type(pa.int32()) if name in self.unwrapped else found
 
-    def values(self, name: str) -> NDArray[Any]:
+    def values(self, name: str) -> AnyArray:
         """A channel of numbers (time,)."""
         found = self.unwrapped.get(name)
         return self.columns.column(name).to_numpy() if found is None else found
@@ -144,8 +143,8 @@ def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:
 
 
 def _on_host_clock(
-    recording: str, stream: str, columns: Columns, arrival_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], dict[str, Attribute]]:
+    recording: str, stream: str, columns: Columns, arrival_ns: Times
+) -> tuple[Int64s, dict[str, Attribute]]:
     """Return when samples were taken by their device's clock, mapped to the host's, and what the fit gave."""
     import pyarrow as pa
 
@@ -169,15 +168,15 @@ def _on_host_clock(
     }
 
 
-def _certain(columns: Columns) -> NDArray[np.bool_] | None:
+def _certain(columns: Columns) -> Bools | None:
     """Return which rows have an arrival that was recorded in time, None where all have."""
     if UNCERTAIN not in columns.column_names:
         return None
-    found: NDArray[np.bool_] = columns.column(UNCERTAIN).to_numpy() == 0
+    found: Bools = columns.column(UNCERTAIN).to_numpy() == 0
     return found
 
 
-def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
+def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
     """Return the stamps of a stream. Raises `TacpipeError` if there are none or where they run backwards."""
     import numpy as np
 
@@ -186,7 +185,7 @@ def _stamps(recording: str, stream: str, columns: Columns) -> NDArray[np.int64]:
             f"Recording {recording}: stream {stream!r} has no rows with t_ns; nothing can be brought onto a clock. "
             f"Exclude the recording with `tacpipe label --exclude`, or record it again."
         )
-    t_ns: NDArray[np.int64] = columns.column("t_ns").to_numpy()
+    t_ns: Times = columns.column("t_ns").to_numpy()
     back = np.diff(t_ns) < 0
     if back.any():
         row = int(back.argmax()) + 1
@@ -209,9 +208,7 @@ def _master(recording: str, wanted: str, streams: Mapping[str, Columns]) -> str:
     raise TacpipeError(f"Recording {recording} has no tactile stream; name the master among {_list(streams)}.")
 
 
-def _grid(
-    recording: str, params: Params, streams: Mapping[str, _Stream], master: _Stream
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _grid(recording: str, params: Params, streams: Mapping[str, _Stream], master: _Stream) -> tuple[Int64s, Int64s]:
     """Return the grid points that lie within every stream, and the row of each: of the master, or of the grid itself.
 
     A uniform grid is on the phase of the master's first sample.
@@ -241,7 +238,7 @@ def _unwrapped(stream: _Stream) -> tuple[_Stream, int]:
 
     from tacpipe.signals.unwrap import unwrapped
 
-    changed: dict[str, NDArray[np.int32]] = {}
+    changed: dict[str, Int32s] = {}
     for kind in stream.columns.schema:
         tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
         if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
@@ -252,9 +249,7 @@ def _unwrapped(stream: _Stream) -> tuple[_Stream, int]:
     return replace(stream, unwrapped=changed), len(changed)
 
 
-def _channels(
-    stream: _Stream, grid_ns: NDArray[np.int64], exact: NDArray[np.int64] | None
-) -> list[tuple[pa.Field, Any]]:
+def _channels(stream: _Stream, grid_ns: Times, exact: Int64s | None) -> list[tuple[pa.Field, Any]]:
     """Return field and values of each channel on the grid, in the order of the stream."""
     import pyarrow as pa
 
@@ -291,9 +286,7 @@ def _blocks(stream: _Stream, members: list[str], how: str, points: int) -> list[
     return [members[first : first + size] for first in range(0, len(members), size)]
 
 
-def _between_samples(
-    stream: _Stream, names: list[str], how: str, grid_ns: NDArray[np.int64], used: Any
-) -> NDArray[np.float64]:
+def _between_samples(stream: _Stream, names: list[str], how: str, grid_ns: Times, used: Any) -> Floats:
     """Return channels between their samples (grid, channel), from the rows ``used`` alone."""
     import numpy as np
 
@@ -308,15 +301,13 @@ def _between_samples(
     return linear(t_ns, values, grid_ns)
 
 
-def _as_stored(kind: pa.Field, column: NDArray[np.float64]) -> tuple[pa.Field, Any]:
+def _as_stored(kind: pa.Field, column: Floats) -> tuple[pa.Field, Any]:
     import numpy as np
 
     return kind, np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype())
 
 
-def _masks(
-    stream: _Stream, grid_ns: NDArray[np.int64], exact: NDArray[np.int64] | None, gap_ns: int
-) -> list[tuple[pa.Field, Any]]:
+def _masks(stream: _Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[tuple[pa.Field, Any]]:
     """Return where the nearest sample was held, where there is a gap, and how far the nearest sample is."""
     import numpy as np
     import pyarrow as pa
@@ -335,16 +326,14 @@ def _masks(
     ]
 
 
-def _rows_at(
-    t_ns: NDArray[np.int64], grid_ns: NDArray[np.int64], grid_rows: NDArray[np.int64]
-) -> NDArray[np.int64] | None:
+def _rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s) -> Int64s | None:
     """Return the rows whose stamps are the grid's, or None if the stream has no sample at some grid point.
 
     ``grid_rows`` (grid,) are the rows that a stream has there which was stamped along with the grid's.
     """
     import numpy as np
 
-    rows: NDArray[np.int64] = np.searchsorted(t_ns, grid_ns[0]) + grid_rows - grid_rows[0]
+    rows: Int64s = np.searchsorted(t_ns, grid_ns[0]) + grid_rows - grid_rows[0]
     if rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns):
         return rows  # one clock for both, equal stamps in a row included
     rows = np.searchsorted(t_ns, grid_ns).astype(np.int64)
@@ -352,7 +341,7 @@ def _rows_at(
     return rows if found else None
 
 
-def _held(columns: Columns) -> NDArray[np.bool_]:
+def _held(columns: Columns) -> Bools:
     """Return which rows repeat the one before in all channels but labels, which are meant to stay."""
     import numpy as np
 

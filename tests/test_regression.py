@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from numpy.typing import NDArray
 from sklearn import metrics as sklearn_metrics
 
+from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import regression
@@ -25,7 +24,7 @@ PRINTED = {  # normalised RMSE and device units, test and novel objects (RA-L 20
 }
 
 
-def values(width: int = 3, grasps: int = 40, seed: int = 0) -> tuple[NDArray[Any], NDArray[Any]]:
+def values(width: int = 3, grasps: int = 40, seed: int = 0) -> tuple[AnyArray, AnyArray]:
     rng = np.random.default_rng(seed)
     true = rng.normal(5, 2, (grasps, width)) * np.arange(1, width + 1)
     return true, true + rng.normal(0.1, 1, true.shape)
@@ -67,7 +66,7 @@ def test_a_batch_mean_is_the_mean_of_batches_errors_the_last_of_which_may_be_sma
     arrays.arrays(np.float64, st.tuples(st.just(30), st.integers(1, 4)), elements=st.floats(-1e3, 1e3)),
     st.sampled_from([1, 2, 3, 5, 10, 15, 30]),
 )
-def test_the_global_error_is_at_least_the_mean_over_equal_batches(error: NDArray[Any], batch: int) -> None:
+def test_the_global_error_is_at_least_the_mean_over_equal_batches(error: AnyArray, batch: int) -> None:
     true = np.zeros_like(error)
     over_all, over_batches = regression.rmse(true, error), regression.batch_mean_rmse(true, error, batch)
     assert over_all >= over_batches * (1 - 1e-12)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.channels.streams import signal
 from tacpipe.signals import kinematics
@@ -17,8 +18,6 @@ from tacpipe.signals.resampling import linear
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Times = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 MEDIAN_ROWS = 3  # a controller that lost cycles takes several for one and gives a single speed that is times too high
 
@@ -42,9 +41,7 @@ def profile(streams: Mapping[str, pa.Table], t_ns: Times) -> dict[str, Floats]:
     return {"speed_raw_m_s": rough_m_s, "speed_m_s": smooth_m_s, "force_n": force_n}
 
 
-def profile_table(
-    t_ns: Times, pressure: NDArray[Any], moved: Mapping[str, Floats], phase: NDArray[np.int8]
-) -> pa.Table:
+def profile_table(t_ns: Times, pressure: AnyArray, moved: Mapping[str, Floats], phase: NDArray[np.int8]) -> pa.Table:
     """Return what `profile` gave, with pressure and phase, as the table of a stream; all are (time,)."""
     columns = [pressure, *(moved[name] for name in ("speed_raw_m_s", "speed_m_s", "force_n")), phase]
     return schema.stream(t_ns, columns, schema.profile_fields())

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Int64s
 from tacpipe.channels.streams import of_quantity
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.spikes import hampel
@@ -27,7 +27,7 @@ def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
     return streams[found[0]]
 
 
-def mended(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, NDArray[np.int64]]:
+def mended(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, Int64s]:
     """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`."""
     import pyarrow as pa
 

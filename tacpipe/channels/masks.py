@@ -11,7 +11,8 @@ from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from numpy.typing import NDArray
+
+    from tacpipe.arrays import Bools, Int64s
 
 GRID = "grid"  # attribute of a synchronized recording: uniform, logged or fresh
 _GAP = "_gap"  # how the masks of gaps end
@@ -19,7 +20,7 @@ _APART = {"logged": 3.0, "fresh": 3.0}  # times the median step, by grid: furthe
 _UNIFORM = 1.5
 
 
-def gaps(table: pa.Table) -> NDArray[np.bool_]:
+def gaps(table: pa.Table) -> Bools:
     """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` says so."""
     gap = np.zeros(table.num_rows, dtype=bool)
     for name in table.column_names:
@@ -33,7 +34,7 @@ def apart(attributes: Mapping[str, Any]) -> float:
     return _APART.get(str(attributes.get(GRID, "uniform")), _UNIFORM)
 
 
-def times(table: pa.Table) -> NDArray[np.int64]:
+def times(table: pa.Table) -> Int64s:
     """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
     if "t_ns" not in table.column_names:
         raise TacpipeError("There is no column t_ns, so the order of the rows in time is unknown.")

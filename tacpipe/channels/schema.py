@@ -10,7 +10,8 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import Times
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -138,9 +139,7 @@ def label_field(name: str) -> pa.Field:
     return pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})
 
 
-def stream(
-    t_ns: NDArray[np.int64], columns: Iterable[Any], fields: Sequence[pa.Field], made: str | None = None
-) -> pa.Table:
+def stream(t_ns: Times, columns: Iterable[Any], fields: Sequence[pa.Field], made: str | None = None) -> pa.Table:
     """Return the table of a stream: ``t_ns`` (time,) and one column a field, each (time,), cast to the field's type."""
     import pyarrow as pa
 

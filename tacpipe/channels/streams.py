@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
-    from numpy.typing import NDArray
 
+    from tacpipe.arrays import AnyArray, Int64s
     from tacpipe.datasets.dataset import Recording
 
 NO_SIGNALS = ("events", "truth")  # streams of what went wrong, and of what a simulation knows
@@ -57,7 +56,7 @@ def of_quantity(table: pa.Table, quantity: str) -> list[str]:
     return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]
 
 
-def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[NDArray[np.int64], NDArray[Any]] | None:
+def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyArray] | None:
     """Return stamps (time,) and values (time, channel) of the first stream with ``quantity``; None if there is none."""
     import numpy as np
 

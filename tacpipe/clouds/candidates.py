@@ -13,15 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Indices
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import axes
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.clouds.normals import CAMERA_M, normals
 from tacpipe.errors import TacpipeError, UsageError
-
-Floats = NDArray[np.float64]
 
 COUNT = 10
 SHIFT = 0.4  # fraction of the object's length; nine in ten of the published grasps lie within 0.33 of its middle
@@ -200,7 +198,7 @@ class _Cuts:
         score = float(scores[left, right] - OFF_CENTRE * abs(shift_m) / self._frame.length_m)
         return Candidate(grasp, score, off_deg, float(shift_m))
 
-    def _scored(self, lefts: NDArray[np.intp], rights: NDArray[np.intp], shift_m: float) -> tuple[Floats, Floats]:
+    def _scored(self, lefts: Indices, rights: Indices, shift_m: float) -> tuple[Floats, Floats]:
         """Return the scores (left, right) of all pairs, and the cosine of the closing axis to the worse normal."""
         apart = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
         opening = np.linalg.norm(apart, axis=2)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Float32s
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ COLOUR = ("red", "green", "blue")
 class Cloud:
     """Points in the camera's frame; raises `TacpipeError` where one is not finite."""
 
-    points_m: NDArray[np.float32]  # (point, xyz), metres
-    colours: NDArray[np.uint8] | None = None  # (point, rgb), 0 to 255
+    points_m: Float32s  # (point, xyz), metres
+    colours: Bytes | None = None  # (point, rgb), 0 to 255
 
     def __post_init__(self) -> None:
         """Refuse what is not a cloud."""

@@ -6,8 +6,8 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Counts, Float32s
 from tacpipe.errors import TacpipeError
 
 MAGIC = b"TPDF"
@@ -19,13 +19,13 @@ HEADER = struct.Struct("<4sHHBxxx5f")  # magic, width, height, whether colours f
 class DepthFrame:
     """A depth image without distortion, and where its pixels look."""
 
-    depth: NDArray[np.uint16]  # (row, column), along the optical axis in units of ``unit_m``; 0: nothing was measured
+    depth: Counts  # (row, column), along the optical axis in units of ``unit_m``; 0: nothing was measured
     focal: tuple[float, float]  # in pixels, along a row and along a column
     centre: tuple[float, float]  # the optical axis in the image: column, row
     unit_m: float  # metres a count of depth
-    colours: NDArray[np.uint8] | None = None  # (row, column, rgb)
+    colours: Bytes | None = None  # (row, column, rgb)
 
-    def points(self) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    def points(self) -> tuple[Float32s, Bytes | None]:
         """Return the points that were measured (point, xyz), metres, and their colours (point, rgb).
 
         In the camera's frame: x to the right of the image, y down, z along the optical axis.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.library import open3d
 from tacpipe.errors import TacpipeError
@@ -115,7 +114,7 @@ def _by_open3d(path: Path, told: int) -> Cloud:
     return Cloud(points, np.rint(colours * 255).astype(np.uint8))
 
 
-def _require_finite(path: Path, points: NDArray[Any]) -> None:
+def _require_finite(path: Path, points: AnyArray) -> None:
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
         raise TacpipeError(

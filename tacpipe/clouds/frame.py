@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.clouds.grasp import Grasp
-
-Floats = NDArray[np.float64]
 
 STEEPEST = 0.999  # cosine between closing axis and line of sight beyond which another direction is taken
 
@@ -49,7 +47,7 @@ def wrist_of(grasp: Grasp) -> Floats:
     return axes(approach, grasp.closing)
 
 
-def local_points(points_m: NDArray[np.floating], grasp: Grasp) -> Floats:
+def local_points(points_m: AnyFloats, grasp: Grasp) -> Floats:
     """Return points (point, axis) in the axes of the grasp, about the middle between the fingers, metres.
 
     g1 is at (0, -opening / 2, 0), g2 at (0, opening / 2, 0).

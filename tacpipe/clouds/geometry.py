@@ -11,14 +11,12 @@ from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds import quadric
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import local_points, wrist_of
 from tacpipe.clouds.grasp import Grasp
-
-Floats = NDArray[np.float64]
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 RADII_M = (0.015, 0.025, 0.04)  # of the patches about each contact: a fingertip's pad, and what lies next to it

@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Indices
 from tacpipe.clouds.cloud import Cloud
-
-Floats = NDArray[np.floating]
 
 NORMALISATIONS = ("none", "sphere", "minmax", "wrist")
 SMALLEST_M = 1e-6  # a cloud's extent along an axis counts as at least this, so that a flat one can be divided by it
@@ -24,9 +22,9 @@ SMALLEST_M = 1e-6  # a cloud's extent along an axis counts as at least this, so 
 class Extent:
     """How far a cloud reaches."""
 
-    corners_m: Floats  # (corner, xyz), of the convex hull
-    centroid_m: Floats  # (xyz), mean of all points
-    colours: Floats | None  # (lowest and highest, rgb), 0 to 1; None where the cloud has no colours
+    corners_m: AnyFloats  # (corner, xyz), of the convex hull
+    centroid_m: AnyFloats  # (xyz), mean of all points
+    colours: AnyFloats | None  # (lowest and highest, rgb), 0 to 1; None where the cloud has no colours
 
     @classmethod
     def of(cls, cloud: Cloud) -> Extent:
@@ -38,41 +36,43 @@ class Extent:
         return cls(points[_corners(points)], points.mean(axis=0), colours)
 
 
-def _corners(points_m: Floats) -> NDArray[np.intp]:
+def _corners(points_m: AnyFloats) -> Indices:
     """Return which points are the corners of the convex hull; all of them where they lie in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        found: NDArray[np.intp] = ConvexHull(points_m).vertices
+        found: Indices = ConvexHull(points_m).vertices
     except QhullError:
         return np.arange(len(points_m))
     return found
 
 
-def minmax(points: Floats, extent: Extent, rotation: Floats) -> Floats:
+def minmax(points: AnyFloats, extent: Extent, rotation: AnyFloats) -> AnyFloats:
     """Return points (point, xyz), turned already, so that the cloud fills -1 to 1 along each axis.
 
     Sizes and proportions are lost: that is what the letter does, and why a turn before it distorts.
     """
     corners = extent.corners_m @ rotation.T
     low, high = corners.min(axis=0), corners.max(axis=0)
-    scaled: Floats = 2 * (points - low) / np.maximum(high - low, SMALLEST_M) - 1
+    scaled: AnyFloats = 2 * (points - low) / np.maximum(high - low, SMALLEST_M) - 1
     return scaled
 
 
-def sphere(points: Floats, extent: Extent, rotation: Floats) -> Floats:
+def sphere(points: AnyFloats, extent: Extent, rotation: AnyFloats) -> AnyFloats:
     """Return points (point, xyz), turned already, about the cloud's centroid and with its largest radius as unit."""
     radius = np.linalg.norm(extent.corners_m - extent.centroid_m, axis=1).max()  # a farthest point is a corner
-    scaled: Floats = (points - rotation @ extent.centroid_m) / max(radius, SMALLEST_M)
+    scaled: AnyFloats = (points - rotation @ extent.centroid_m) / max(radius, SMALLEST_M)
     return scaled
 
 
-def to_wrist(points: Floats, wrist: Floats) -> Floats:
+def to_wrist(points: AnyFloats, wrist: AnyFloats) -> AnyFloats:
     """Return points (point, xyz) in the axes of the wrist (component, axis), whose place is not taken off: R^T p."""
     return points @ wrist
 
 
-def normalised(method: str, points: Floats, extent: Extent, rotation: Floats, wrist: Floats | None) -> Floats:
+def normalised(
+    method: str, points: AnyFloats, extent: Extent, rotation: AnyFloats, wrist: AnyFloats | None
+) -> AnyFloats:
     """Return points (point, xyz), turned by ``rotation`` (3, 3) already, normalised by one of `NORMALISATIONS`.
 
     ``wrist`` (component, axis) is turned already too; only ``wrist`` needs it.
@@ -87,23 +87,23 @@ def normalised(method: str, points: Floats, extent: Extent, rotation: Floats, wr
     return points
 
 
-def colours_normalised(method: str, colours: Floats, extent: Extent) -> Floats:
+def colours_normalised(method: str, colours: AnyFloats, extent: Extent) -> AnyFloats:
     """Return colours (point, rgb) of 0 to 1: to -1 to 1 by the cloud's extremes (minmax) or by black and white (wrist)."""
     if method == "minmax":
         assert extent.colours is not None
         low, high = extent.colours
-        scaled: Floats = 2 * (colours - low) / np.maximum(high - low, 1 / 255) - 1
+        scaled: AnyFloats = 2 * (colours - low) / np.maximum(high - low, 1 / 255) - 1
         return scaled
     if method == "wrist":
         return 2 * colours - 1
     return colours
 
 
-def random_rotation(rng: np.random.Generator, largest_deg: float) -> Floats:
+def random_rotation(rng: np.random.Generator, largest_deg: float) -> AnyFloats:
     """Return a rotation (3, 3) about x, y and z in turn, by angles drawn evenly from ±``largest_deg``."""
     from scipy.spatial.transform import Rotation
 
     if not largest_deg:
         return np.eye(3)
-    found: Floats = Rotation.from_euler("xyz", rng.uniform(-largest_deg, largest_deg, 3), degrees=True).as_matrix()
+    found: AnyFloats = Rotation.from_euler("xyz", rng.uniform(-largest_deg, largest_deg, 3), degrees=True).as_matrix()
     return found

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.library import open3d
-
-Floats = NDArray[np.float64]
 
 RADIUS_M = 0.015  # of 10 to 30 mm, that under which the published grasps close most squarely on the surface
 CAMERA_M = (0.0, 0.0, 0.0)  # a cloud in the camera's frame is seen from its origin

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Float32s
 from tacpipe.clouds import text_points
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
@@ -61,7 +62,7 @@ def read(path: Path) -> Cloud:
     return Cloud(xyz, colours)
 
 
-def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+def parsed(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
     """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
 
     Raises `TacpipeError`, naming the file, as `read` does but for points that are not finite.
@@ -126,7 +127,7 @@ def require_compressed(path: Path, content: bytes, header: Header) -> None:
         )
 
 
-def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
+def unpacked(packed: NDArray[np.uint32]) -> Bytes:
     """Return colours (point, rgb), 0 to 255, of numbers 0x00RRGGBB (point,).
 
     >>> unpacked(np.array([0x00FF8001], np.uint32)).tolist()

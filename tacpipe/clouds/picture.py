@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds.candidates import Candidate
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.io.files import readable_errors, write_whole
@@ -71,7 +71,7 @@ def _panel(axes: Axes, cloud: Cloud, found: Sequence[Candidate], shown: tuple[in
     axes.set_ylabel(f"{'xyz'[down]} (mm)")
 
 
-def _line(axes: Axes, ends_mm: NDArray[np.float64], rank: int, *, named: bool) -> None:
+def _line(axes: Axes, ends_mm: Floats, rank: int, *, named: bool) -> None:
     faint = 1.0 if rank == 1 else 0.75
     axes.plot(*ends_mm.T, color="white", linewidth=3.5 if rank == 1 else 2.5, alpha=faint)  # a rim, seen on any colour
     axes.plot(*ends_mm.T, color="black", linewidth=2 if rank == 1 else 1, alpha=faint)

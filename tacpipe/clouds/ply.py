@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Float32s
 from tacpipe.clouds import text_points
 from tacpipe.clouds.cloud import COLOUR
 from tacpipe.errors import TacpipeError
@@ -44,7 +44,7 @@ class _Header:
     skipped: int  # of other elements before the vertices: bytes, or lines where it is text
 
 
-def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+def parsed(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
     """Return points (point, xyz) as they stand, those that are not finite too, and colours (point, rgb) if there are any.
 
     Raises `TacpipeError`, naming the file, where it is no PLY file, its vertices are not its first element or have no x, y
@@ -68,7 +68,7 @@ def parsed(path: Path, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.
     return xyz, np.column_stack([points[name] for name in COLOUR])
 
 
-def packed(points_m: NDArray[np.float32], colours: NDArray[np.uint8] | None) -> bytes:
+def packed(points_m: Float32s, colours: Bytes | None) -> bytes:
     """Return the binary PLY file of points (point, xyz) and colours (point, rgb)."""
     vertex = np.dtype([(axis, "<f4") for axis in POSITION] + [(name, "u1") for name in COLOUR if colours is not None])
     rows = np.zeros(len(points_m), vertex)

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import Floats
 
 UNIT_M = 0.05  # length in which coefficients are given, so that they are of one order
 SMALLEST = 1e-9  # added to the mean squared gradient, for points that state nothing of a coefficient

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Indices, Int64s
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.clouds.library import open3d
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 PLANES = 4  # the largest ones, among which the table is looked for: a floor, walls and sides of boxes may be larger
 LONGEST_M = 0.4  # that an object may be along any axis; the published ones are 0.28 m at most
@@ -43,7 +40,7 @@ class Limits:
     outlier_deviations: float  # standard deviations of that distance above its mean, beyond which a point is stray
 
 
-def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Rows:
+def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Indices:
     """Return which points of a view (point,) are the grasped object, in their order; the camera is at the origin.
 
     Raises `TacpipeError` where no table is found, nothing stands on it, nothing that stands there is near
@@ -74,7 +71,7 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: Limits, seed: int = 0) -> Ro
             f"What is near the grasp is {1e3 * length_m:.0f} mm long, and what a hand lifts {1e3 * LONGEST_M:g} mm at most: "
             f"it has grown together with the table, or with things next to it. Raise --plane-mm or lower --cluster-mm."
         )
-    found: Rows = rows[_inliers(points_m[rows], limits)]
+    found: Indices = rows[_inliers(points_m[rows], limits)]
     return found
 
 
@@ -149,7 +146,7 @@ def _largest_plane(points_m: Floats, limits: Limits, seed: int) -> Floats:
     return found if found[3] >= 0 else -found
 
 
-def _clusters(points_m: Floats, limits: Limits) -> NDArray[np.int64]:
+def _clusters(points_m: Floats, limits: Limits) -> Int64s:
     """Return the number of the cluster of each point (point,), -1 for those of none with ``object_points``."""
     if not len(points_m):
         return np.zeros(0, dtype=np.int64)
@@ -160,7 +157,7 @@ def _clusters(points_m: Floats, limits: Limits) -> NDArray[np.int64]:
     return np.where(sizes[labels + 1] >= limits.object_points, labels, -1)
 
 
-def _inliers(points_m: Floats, limits: Limits) -> Rows:
+def _inliers(points_m: Floats, limits: Limits) -> Indices:
     """Return which points (point, xyz) are not a stray ones."""
     with open3d() as library:
         _, kept = _cloud(library, points_m).remove_statistical_outlier(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import plain
 
@@ -44,7 +45,7 @@ def parsed(path: Path, lines: Sequence[str], point: np.dtype[np.void], wanted: C
     return found
 
 
-def _cast(path: Path, name: str, column: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
+def _cast(path: Path, name: str, column: Floats, kind: np.dtype[Any]) -> AnyArray:
     """Return a column (point,) in the type of its field; what a float cannot hold becomes infinite."""
     if kind.kind in "iu":
         limits = np.iinfo(kind)

@@ -6,16 +6,11 @@ stretch: its first row stands in for the rows before it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.windows import breaks as breaks
-
-Floats = NDArray[np.floating[Any]]
-Flags = NDArray[np.bool_]
 
 LEVELS, INCREMENTS = "levels", "increments"
 
@@ -26,7 +21,7 @@ def check(representation: str) -> None:
         raise TacpipeError(f"representation is {representation!r}; a codec is fitted on {LEVELS} or {INCREMENTS}.")
 
 
-def inputs(values: Floats, begins: Flags | None, representation: str, frames: int) -> Floats:
+def inputs(values: AnyFloats, begins: Bools | None, representation: str, frames: int) -> AnyFloats:
     """Return what a codec reads of each row of ``values`` (time, channel): (time, frames * channel), newest frame last.
 
     ``representation`` is levels, ``values`` as they are, or increments, what was added since the row before. ``begins``

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels.streams import TRUTH
 from tacpipe.errors import UsageError
 
@@ -32,22 +32,20 @@ class Arrays:
     ``quantity``, never from their values.
     """
 
-    by_column: Mapping[
-        str, NDArray[Any]
-    ]  # name -> (time,), in the column's own type; a masked array where it has nulls
+    by_column: Mapping[str, AnyArray]  # name -> (time,), in the column's own type; a masked array where it has nulls
     columns: tuple[str, ...]  # the channels: names of the columns of `values`, in order
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> AnyArray:
         """Return one column, channel or not, in its own type (time,). Raises `KeyError` where it was not read."""
         return self.by_column[name]
 
     @property
-    def t_ns(self) -> NDArray[np.int64] | None:
+    def t_ns(self) -> Int64s | None:
         """The times of the rows in nanoseconds, int64 (time,); None where the stream has none or they were not read."""
         return self.by_column.get(TIME)
 
     @cached_property
-    def values(self) -> NDArray[Any]:
+    def values(self) -> AnyArray:
         """The channels side by side (time, channel), in the smallest type that holds each of them; null becomes NaN.
 
         Raises `UsageError` where no common type holds every value: an integer beyond 2^53 next to a float.
@@ -114,20 +112,20 @@ def is_channel(field: pa.Field) -> bool:
     return (field.metadata or {}).get(b"quantity", b"").decode() not in NOT_CHANNELS
 
 
-def _array(column: pa.ChunkedArray) -> NDArray[Any]:
+def _array(column: pa.ChunkedArray) -> AnyArray:
     """Return a column in its own type (time,): pyarrow alone would make floats of integers with nulls."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     kind = column.type
     if not column.null_count or not (pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
-        values: NDArray[Any] = column.to_numpy()
+        values: AnyArray = column.to_numpy()
         return values
     filled = pc.fill_null(column, pa.scalar(0, pa.int8()).cast(kind)).to_numpy()
-    masked: NDArray[Any] = np.ma.masked_array(filled, mask=column.is_null().to_numpy())
+    masked: AnyArray = np.ma.masked_array(filled, mask=column.is_null().to_numpy())
     return masked
 
 
-def _beyond(array: NDArray[Any]) -> bool:
+def _beyond(array: AnyArray) -> bool:
     held = np.ma.getdata(array)
     return held.dtype.itemsize == 8 and bool(((held > EXACT) | (held < -EXACT)).any())

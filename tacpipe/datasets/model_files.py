@@ -19,7 +19,8 @@ from tacpipe.printable import excerpt, plain
 
 if TYPE_CHECKING:
     import torch
-    from numpy.typing import NDArray
+
+    from tacpipe.arrays import AnyArray
 
 CONFIG = "config.json"
 MOST = 100_000  # rows, points, units: what no model of touch comes near
@@ -96,7 +97,7 @@ def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
     return found
 
 
-def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, NDArray[Any]]:
+def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, AnyArray]:
     """Return the arrays of a safetensors file, all finite ``but`` those whose names end so.
 
     Raises `TacpipeError` where it is none.
@@ -105,7 +106,7 @@ def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, ND
     from safetensors.numpy import load
 
     with _readable(name, SafetensorError):
-        found: dict[str, NDArray[Any]] = load(content)
+        found: dict[str, AnyArray] = load(content)
         told = {key: value for key, value in found.items() if but is None or not key.endswith(but)}
         _require_finite(name, {key: bool(np.isfinite(value).all()) for key, value in told.items()})
     return found

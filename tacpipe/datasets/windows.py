@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels import masks
 from tacpipe.datasets import arrays
 from tacpipe.errors import UsageError
@@ -35,7 +35,7 @@ class _Read(NamedTuple):
 
     values: torch.Tensor  # (time, channel)
     t_ns: torch.Tensor  # (time,)
-    starts: NDArray[np.int64]  # (window,), first rows of the windows
+    starts: Int64s  # (window,), first rows of the windows
 
 
 class Windows(torch.utils.data.Dataset[Window]):
@@ -77,7 +77,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         self.stream, self.dtype = stream, dtype
         self._asked = None if columns is None else tuple(dict.fromkeys(columns))
         self._names = list(dataset.recordings)
-        self._ends: NDArray[np.int64] | None = None  # (recording,), windows up to the end of each
+        self._ends: Int64s | None = None  # (recording,), windows up to the end of each
         self._columns: tuple[str, ...] | None = None
         self._kept: OrderedDict[str, _Read] = OrderedDict()
 
@@ -117,7 +117,7 @@ class Windows(torch.utils.data.Dataset[Window]):
             self._index()
         return self._columns or ()
 
-    def _index(self) -> NDArray[np.int64]:
+    def _index(self) -> Int64s:
         if self._ends is None:
             self._ends = np.cumsum([len(self._read(name).starts) for name in self._names], dtype=np.int64)
         return self._ends
@@ -150,7 +150,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         return _Read(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 
 
-def _matrix(found: arrays.Arrays, dtype: str, name: str) -> NDArray[Any]:
+def _matrix(found: arrays.Arrays, dtype: str, name: str) -> AnyArray:
     """Return the channels as (time, channel). Raises `UsageError` where ``dtype`` would round a whole number."""
     exact = found.values
     values = exact.astype(dtype)

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.parquet import owned
@@ -182,12 +182,12 @@ def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds
     return None
 
 
-def _nanoseconds(path: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.int64]:
+def _nanoseconds(path: Path, name: str, column: pa.ChunkedArray) -> Int64s:
     """Return decimal seconds as whole nanoseconds, int64 (time,). Raises `TacpipeError` for those that are none."""
     chunk = column.combine_chunks()
     # A decimal128(19, 9) is stored as its number of 1e-9ths in two words of eight bytes, the low one first.
     words = np.frombuffer(chunk.buffers()[1], dtype="<i8").reshape(-1, 2)[chunk.offset :][: len(chunk)]
-    t_ns: NDArray[np.int64] = words[:, 0].astype(np.int64)
+    t_ns: Times = words[:, 0].astype(np.int64)
     bad = (words[:, 1] != 0) | (t_ns < 0)
     if bad.any():
         index = int(bad.argmax())
@@ -198,7 +198,7 @@ def _nanoseconds(path: Path, name: str, column: pa.ChunkedArray) -> NDArray[np.i
     return t_ns
 
 
-def _check_values(path: Path, name: str, array: NDArray[np.float64], integers: pa.DataType | None, nan: bool) -> None:
+def _check_values(path: Path, name: str, array: Floats, integers: pa.DataType | None, nan: bool) -> None:
     """Raise for the first value of a column that is not allowed."""
     if nan:
         bad, wanted = np.isinf(array), "a finite number or NaN"

@@ -16,7 +16,7 @@ import re
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
@@ -26,8 +26,7 @@ from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
 from tacpipe.printable import excerpt, plain
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from tacpipe.arrays import AnyArray, Float32s
 
 BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
 PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
@@ -175,7 +174,7 @@ def _part(block: Path) -> dict[str, Attribute]:
     return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
 
 
-def _values(path: Path, place: int) -> NDArray[np.float32]:
+def _values(path: Path, place: int) -> Float32s:
     """Return a slide as it was measured (triangle, taxel, time), float32; its values are checked.
 
     Where a slide alone does not state which of its axes is time, because next to nothing was touched, its block does.
@@ -205,7 +204,7 @@ def _values(path: Path, place: int) -> NDArray[np.float32]:
         if is_time(evidence, -1, ALONG_TIME):
             return slide
         if is_time(unscramble(evidence), -1, ALONG_TIME):
-            values: NDArray[np.float32] = unscramble(slide)
+            values: Float32s = unscramble(slide)
             return values
     raise TacpipeError(
         f"{path}, slide {place}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
@@ -230,7 +229,7 @@ def _label(block: Path, path: Path, place: int) -> int:
     return int(label)
 
 
-def _array(path: Path) -> NDArray[Any]:
+def _array(path: Path) -> AnyArray:
     """Return an array. Raises `TacpipeError` if the file is none; a pickle is never opened."""
     with regular.failing(path):
         stat = path.stat()
@@ -238,7 +237,7 @@ def _array(path: Path) -> NDArray[Any]:
 
 
 @functools.lru_cache(maxsize=2)  # a block and its labels: the slides of a block are read one after another
-def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
+def _read(path: Path, size: int, t_ns: int) -> AnyArray:
     """Return the array of a file, for as long as the file has this size and time of change.
 
     Not as a map of memory: a disk that fails ends the process there, with SIGBUS.
@@ -253,7 +252,7 @@ def _read(path: Path, size: int, t_ns: int) -> NDArray[Any]:
         shape, _, kind = read_head(file)
         if math.prod(shape) * kind.itemsize > len(content):  # before memory is taken for it
             raise ValueError(f"its head declares {math.prod(shape)} numbers, and it has {len(content)} bytes")
-        found: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
+        found: AnyArray = np.load(io.BytesIO(content), allow_pickle=False)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
     found.flags.writeable = False

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute
@@ -25,7 +25,7 @@ UNSEEN = 10.0  # in all seven columns of a marker that the camera did not see; f
 UNIT_TOLERANCE = 1e-3  # by how much a quaternion's length may differ from 1; the recordings stay below 1e-6
 
 
-def read_uskin(path: Path) -> list[NDArray[np.uint16]]:
+def read_uskin(path: Path) -> list[Counts]:
     """Return the 48 columns of one uSkin, each (time,), uint16 counts, taxel by taxel."""
     import pyarrow as pa
 
@@ -36,7 +36,7 @@ def read_uskin(path: Path) -> list[NDArray[np.uint16]]:
     return [table.column(name).to_numpy() for name in names]
 
 
-def read_floats(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
+def read_floats(path: Path, names: Sequence[str]) -> Floats:
     """Return the columns ``names`` as an array (time, channel)."""
     from tacpipe.formats.csv_table import read_csv
 
@@ -44,7 +44,7 @@ def read_floats(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
     return np.column_stack([table.column(name).to_numpy() for name in names])
 
 
-def read_marker(path: Path, name: str) -> tuple[NDArray[np.float64], float]:
+def read_marker(path: Path, name: str) -> tuple[Floats, float]:
     """Return the pose of a marker (time, 7), NaN where the camera did not see it, and the fraction of such rows.
 
     Raises `TacpipeError`, naming file and row, where the quaternion has not length 1.
@@ -57,7 +57,7 @@ def read_marker(path: Path, name: str) -> tuple[NDArray[np.float64], float]:
     return pose, float(unseen.mean())
 
 
-def require_unit(path: Path, quaternions: NDArray[np.float64], name: str) -> None:
+def require_unit(path: Path, quaternions: Floats, name: str) -> None:
     """Raise `TacpipeError`, naming file and row, where a quaternion (time, 4) has not length 1; NaN is let through."""
     from tacpipe.formats.csv_table import file_row
 
@@ -131,9 +131,7 @@ class Meta:
         raise TacpipeError(f"{self.path}, column {name} {held}; it must be {wanted}. Put the file right and try again.")
 
 
-def tactile_streams(
-    columns: Mapping[str, Sequence[NDArray[np.uint16]]], t_ns: NDArray[np.int64], made: str | None
-) -> dict[str, pa.Table]:
+def tactile_streams(columns: Mapping[str, Sequence[Counts]], t_ns: Times, made: str | None) -> dict[str, pa.Table]:
     """Return the tables of the sensors by stream name."""
     fields = schema.uskin_fields()
     return {name: schema.stream(t_ns[: len(found[0])], found, fields, made) for name, found in columns.items()}

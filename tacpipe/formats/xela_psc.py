@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from tacpipe.arrays import Floats, Int64s
+
 ROBOT, MARKER, LABELS = "robot_state.csv", "marker.csv", "slip_label.csv"
 NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, LABELS, "meta_data.csv")
 ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R Rᵀ - 1 that is let through; the recordings stay below 1e-5
@@ -84,7 +86,7 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
     )
 
 
-def _poses(path: Path) -> NDArray[np.float64]:
+def _poses(path: Path) -> Floats:
     """Return position and quaternion (time, 7) of the 4x4 transforms in a file, which are stored column by column."""
     import numpy as np
 
@@ -107,7 +109,7 @@ def _poses(path: Path) -> NDArray[np.float64]:
     return np.column_stack([moved, continuous(quaternions_of(turned))])
 
 
-def _stamps_ns(path: Path, time_s: NDArray[np.float64]) -> NDArray[np.int64]:
+def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
     """Return seconds as whole nanoseconds (time,). Raises `TacpipeError` where they run backwards."""
     import numpy as np
 

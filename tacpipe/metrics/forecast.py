@@ -8,12 +8,10 @@ recordings (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
+from tacpipe.arrays import AnyFloats, Int64s, Ints
 
 RESAMPLES = 2000
 COVERAGE = 0.95
@@ -23,35 +21,35 @@ COVERAGE = 0.95
 class Interval:
     """An estimate on all recordings, and the 95 % interval of it over resampled recordings."""
 
-    mean: Floats
-    low: Floats
-    high: Floats
+    mean: AnyFloats
+    low: AnyFloats
+    high: AnyFloats
 
 
-def squared_sums(predicted: Floats, truth: Floats) -> Floats:
+def squared_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
     """Return the sum over windows of the squared error, (window, step, channel) to (step, channel), as float64."""
     error = predicted.astype(np.float64) - truth
-    total: Floats = np.einsum("wsc,wsc->sc", error, error)
+    total: AnyFloats = np.einsum("wsc,wsc->sc", error, error)
     return total
 
 
-def absolute_sums(predicted: Floats, truth: Floats) -> Floats:
+def absolute_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
     """Return the sum over windows of the absolute error, (window, step, channel) to (step, channel), as float64."""
-    total: Floats = np.abs(predicted.astype(np.float64) - truth).sum(axis=0)
+    total: AnyFloats = np.abs(predicted.astype(np.float64) - truth).sum(axis=0)
     return total
 
 
-def mean_error(sums: Floats, windows: NDArray[np.integer[Any]]) -> Floats:
+def mean_error(sums: AnyFloats, windows: Ints) -> AnyFloats:
     """Return the error of each step, averaged over all windows and channels, shape (step,).
 
     ``sums`` is (recording, step, channel) as summed above, ``windows`` is (recording,). NaN without windows.
     """
     count = windows.sum() * sums.shape[2]
-    total: Floats = sums.sum(axis=(0, 2))
+    total: AnyFloats = sums.sum(axis=(0, 2))
     return total / count if count else np.full(sums.shape[1], np.nan)
 
 
-def skill(model: Floats, baseline: Floats) -> Floats:
+def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
     """Return 1 - model / baseline: 1 is perfect, 0 no better than the baseline, below 0 worse. NaN where it never errs.
 
     >>> skill(np.array([1.0, 3.0]), np.array([2.0, 2.0])).tolist()
@@ -61,7 +59,7 @@ def skill(model: Floats, baseline: Floats) -> Floats:
     return np.where(errs, 1 - model / np.where(errs, baseline, 1), np.nan)
 
 
-def skill_interval(model: Floats, baseline: Floats, *, seed: int = 0, resamples: int = RESAMPLES) -> Interval:
+def skill_interval(model: AnyFloats, baseline: AnyFloats, *, seed: int = 0, resamples: int = RESAMPLES) -> Interval:
     """Return the skill of each step and its 95 % interval, each (step,).
 
     ``model`` and ``baseline`` are sums of squared errors (recording, step). Each resample draws as many recordings as
@@ -75,7 +73,7 @@ def skill_interval(model: Floats, baseline: Floats, *, seed: int = 0, resamples:
     return Interval(mean, *bounds(skill(weights @ model, weights @ baseline)))
 
 
-def draws(recordings: int, *, seed: int = 0, resamples: int = RESAMPLES) -> NDArray[np.int64]:
+def draws(recordings: int, *, seed: int = 0, resamples: int = RESAMPLES) -> Int64s:
     """Return how often each resample holds each recording, shape (resample, recording).
 
     >>> draws(3, resamples=4).sum(axis=1).tolist()
@@ -85,7 +83,7 @@ def draws(recordings: int, *, seed: int = 0, resamples: int = RESAMPLES) -> NDAr
     return np.random.default_rng(seed).multinomial(recordings, even, size=resamples)
 
 
-def bounds(drawn: Floats) -> tuple[Floats, Floats]:
+def bounds(drawn: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
     """Return where the middle 95 % of what was found in each resample lies, (resample, step) to two of (step,).
 
     Resamples in which a value is not defined do not count; NaN where it is defined in none.

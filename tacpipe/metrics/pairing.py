@@ -9,16 +9,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import forecast
 from tacpipe.metrics.headline import Headline, Row
 
-Floats = NDArray[np.floating[Any]]
-Sums = Mapping[tuple[Hashable, str], Floats]  # by seed and recording, (part,): what adds up over recordings
+Sums = Mapping[tuple[Hashable, str], AnyFloats]  # by seed and recording, (part,): what adds up over recordings
 _draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 
@@ -31,9 +29,9 @@ class Measure:
     ranked_by: str  # what ``error`` is, in words
     name: str  # of the gain: "skill" or "points"
     cluster: str  # what recordings and their clusters are called, in the plural
-    error: Callable[[Floats], Floats]  # sums (draw, part) to (draw,): the lower the better, NaN where not defined
-    gain: Callable[[Floats, Floats], Floats]  # errors of model and baseline (draw,) to (draw,)
-    values: Callable[[Floats], tuple[float, ...]]  # sums (part,) to a value a column
+    error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to (draw,): the lower the better, NaN where not defined
+    gain: Callable[[AnyFloats, AnyFloats], AnyFloats]  # errors of model and baseline (draw,) to (draw,)
+    values: Callable[[AnyFloats], tuple[float, ...]]  # sums (part,) to a value a column
 
 
 def headline(
@@ -90,9 +88,9 @@ def headline(
     )
 
 
-def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tuple[Floats, list[str]]:
+def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
     """Return sums of the model, then of another predictor, (seed, cluster, part), and the clusters' names."""
-    elsewhere: dict[str, list[Floats]] = {}
+    elsewhere: dict[str, list[AnyFloats]] = {}
     for (_, recording), one in other.items():
         elsewhere.setdefault(recording, []).append(one)
     rows = [
@@ -116,7 +114,7 @@ def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tup
     return found, list(places)
 
 
-def _interval(sums: Floats, statistic: Callable[[Floats], Floats]) -> tuple[float, float, float]:
+def _interval(sums: AnyFloats, statistic: Callable[[AnyFloats], AnyFloats]) -> tuple[float, float, float]:
     """Return a statistic of sums (seed, cluster, part) and its 95 % interval; NaN bounds with fewer than two clusters."""
     mean = float(statistic(sums.sum(axis=(0, 1))[None])[0])
     seeds, clusters, _ = sums.shape

@@ -11,11 +11,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools
 from tacpipe.errors import TacpipeError
 
 COVERAGE = 0.95
@@ -47,7 +47,7 @@ def wilson(correct: int, n: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def mcnemar(first_correct: NDArray[np.bool_], second_correct: NDArray[np.bool_]) -> float:
+def mcnemar(first_correct: Bools, second_correct: Bools) -> float:
     """Return the two-sided p of two classifiers that are equally good, from who is right on each slide, both (slide,).
 
     It is 1 where they are right on the same slides. Raises `TacpipeError` where the slides are not as many.
@@ -70,7 +70,7 @@ def mcnemar(first_correct: NDArray[np.bool_], second_correct: NDArray[np.bool_])
     return float(binomtest(only_first, only_first + only_second, 0.5).pvalue)
 
 
-def paired_t(first: Sequence[float] | NDArray[Any], second: Sequence[float] | NDArray[Any]) -> Difference:
+def paired_t(first: Sequence[float] | AnyArray, second: Sequence[float] | AnyArray) -> Difference:
     """Return the mean of ``second`` less ``first`` over pairs, its t and the two-sided p, with pairs - 1 freedoms.
 
     Raises `TacpipeError` where there are fewer than two pairs.

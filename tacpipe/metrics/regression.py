@@ -8,15 +8,13 @@ Published figures are often means over batches instead, which are never larger a
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import forecast
-
-Floats = NDArray[np.floating[Any]]
 
 BATCH = 10  # grasps over which the letter (RA-L 2020) takes each RMSE before it averages them
 _draws = functools.lru_cache(maxsize=8)(forecast.draws)
@@ -30,17 +28,17 @@ class Interval(NamedTuple):
     high: float
 
 
-def squared_sums(true: Floats, predicted: Floats) -> Floats:
+def squared_sums(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     """Return the sum over values of each grasp's squared error, (grasp, value) to (grasp,).
 
     Raises `TacpipeError` where the two are not of one such shape.
     """
     error = _error(true, predicted)
-    total: Floats = np.einsum("gv,gv->g", error, error)
+    total: AnyFloats = np.einsum("gv,gv->g", error, error)
     return total
 
 
-def rmse(true: Floats, predicted: Floats) -> float:
+def rmse(true: AnyFloats, predicted: AnyFloats) -> float:
     """Return the root of the mean squared error over all grasps and values; NaN without any.
 
     >>> rmse(np.array([[0.0], [0.0]]), np.array([[1.0], [7.0]]))
@@ -49,7 +47,7 @@ def rmse(true: Floats, predicted: Floats) -> float:
     return _root_mean_square(_error(true, predicted))
 
 
-def batch_mean_rmse(true: Floats, predicted: Floats, batch: int = BATCH) -> float:
+def batch_mean_rmse(true: AnyFloats, predicted: AnyFloats, batch: int = BATCH) -> float:
     """Return the mean of the RMSE of successive batches of grasps, the last of which may be smaller; NaN without any.
 
     It is no larger than `rmse` where batches are as large (Jensen), which is why both are reported.
@@ -65,13 +63,13 @@ def batch_mean_rmse(true: Floats, predicted: Floats, batch: int = BATCH) -> floa
     return float(np.mean([_root_mean_square(error[first : first + batch]) for first in range(0, len(error), batch)]))
 
 
-def mae(true: Floats, predicted: Floats) -> float:
+def mae(true: AnyFloats, predicted: AnyFloats) -> float:
     """Return the mean absolute error over all grasps and values; NaN without any."""
     error = _error(true, predicted)
     return float(np.abs(error).mean()) if error.size else float("nan")
 
 
-def r2(true: Floats, predicted: Floats) -> float:
+def r2(true: AnyFloats, predicted: AnyFloats) -> float:
     """Return the share of variance that is explained, each value's about its own mean; NaN where nothing varies.
 
     1 is perfect; 0 is as good as the mean of these very grasps, which nobody knows beforehand: a constant that was fitted
@@ -81,12 +79,12 @@ def r2(true: Floats, predicted: Floats) -> float:
     return _explained(error.sum(), spread.sum())
 
 
-def r2_by_value(true: Floats, predicted: Floats) -> Floats:
+def r2_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     """Return `r2` of each value alone, (grasp, value) to (value,)."""
     return np.array([_explained(*pair) for pair in zip(*_sums_by_value(true, predicted), strict=True)])
 
 
-def rmse_by_value(true: Floats, predicted: Floats) -> Floats:
+def rmse_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     """Return `rmse` of each value alone, (grasp, value) to (value,)."""
     error = _error(true, predicted)
     return np.array([_root_mean_square(column) for column in error.T])
@@ -101,7 +99,7 @@ def skill(rmse: float, baseline: float) -> float:
     return float(forecast.skill(np.asarray(rmse), np.asarray(baseline)))
 
 
-def skill_interval(model: Floats, baseline: Floats, clusters: NDArray[Any]) -> Interval:
+def skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Interval:
     """Return the skill of a model over a baseline and its 95 % interval, from `squared_sums` of both, each (grasp,).
 
     ``clusters`` (grasp,) groups the grasps that depend on each other: those of an object where the next object counts, a
@@ -125,7 +123,7 @@ def skill_interval(model: Floats, baseline: Floats, clusters: NDArray[Any]) -> I
     return Interval(mean, float(low[0]), float(high[0]))
 
 
-def _error(true: Floats, predicted: Floats) -> Floats:
+def _error(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     """Return predicted less true as float64."""
     if np.ndim(true) != 2 or np.shape(true) != np.shape(predicted):
         raise TacpipeError(
@@ -135,11 +133,11 @@ def _error(true: Floats, predicted: Floats) -> Floats:
     return np.asarray(predicted, np.float64) - np.asarray(true, np.float64)
 
 
-def _root_mean_square(error: Floats) -> float:
+def _root_mean_square(error: AnyFloats) -> float:
     return float(np.sqrt(np.mean(np.square(error)))) if error.size else float("nan")
 
 
-def _sums_by_value(true: Floats, predicted: Floats) -> tuple[Floats, Floats]:
+def _sums_by_value(true: AnyFloats, predicted: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
     """Return each value's sum of squared errors and that of its distances from its mean, two of (value,)."""
     error = _error(true, predicted)
     if not len(error):

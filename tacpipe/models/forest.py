@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import AnyArray, Float32s, Floats, Int32s
 
 FEATURES = 0.4  # fraction of all features that is tried at a cut
 LEAF = -1  # in place of a child where there is none
@@ -25,11 +23,11 @@ LEAF = -1  # in place of a child where there is none
 class Forest:
     """Trees side by side in arrays of all nodes, each tree beginning at one of ``roots``."""
 
-    roots: NDArray[np.int32]  # (tree,)
-    children: NDArray[np.int32]  # (node, left or right); LEAF at a leaf
-    features: NDArray[np.int32]  # (node,)
-    cuts: NDArray[np.float64]  # (node,); a row goes left where its feature is at most that
-    values: NDArray[np.float32]  # (node, value)
+    roots: Int32s  # (tree,)
+    children: Int32s  # (node, left or right); LEAF at a leaf
+    features: Int32s  # (node,)
+    cuts: Floats  # (node,); a row goes left where its feature is at most that
+    values: Float32s  # (node, value)
 
     @classmethod
     def fitted(
@@ -89,7 +87,7 @@ class Forest:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what `of` reads."""
-        kept: dict[str, NDArray[Any]] = {"roots": self.roots, "children": self.children, "features": self.features}
+        kept: dict[str, AnyArray] = {"roots": self.roots, "children": self.children, "features": self.features}
         kept |= {"cuts": self.cuts, "values": self.values}
         return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in kept.items()}
 

@@ -11,28 +11,24 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Int32s, Ints
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.floating[Any]]
-Labels = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)
 class Level:
     """What was fitted: scores are bias + (levels - centre) @ weight, log-likelihoods up to what classes share."""
 
-    classes: NDArray[np.int32]  # (class,), sorted
-    centre: Floats  # (channel,), in the slides' unit
-    weight: Floats  # (channel, class)
-    bias: Floats  # (class,)
+    classes: Int32s  # (class,), sorted
+    centre: AnyFloats  # (channel,), in the slides' unit
+    weight: AnyFloats  # (channel, class)
+    bias: AnyFloats  # (class,)
 
     @classmethod
-    def fit(cls, x: Floats, labels: Labels) -> Level:
+    def fit(cls, x: AnyFloats, labels: Ints) -> Level:
         """Return the analysis of training slides (slide, time, channel) and their classes (slide,).
 
         A channel that never changes counts for nothing. Raises `TacpipeError` where arrays do not fit one another, a
@@ -75,31 +71,31 @@ class Level:
         parts = (part.astype(np.float32) for part in (centre, weight, bias))
         return cls(classes.astype(np.int32), *parts)
 
-    def scores(self, x: Floats) -> Floats:
+    def scores(self, x: AnyFloats) -> AnyFloats:
         """Return the scores of slides (slide, time, channel), (slide, class)."""
         if x.ndim != 3 or x.shape[2] != len(self.centre):
             raise TacpipeError(
                 f"Slides of {x.shape} do not fit the mean levels; (slide, time, {len(self.centre)}) was fitted."
             )
-        scores: Floats = (_levels(x) - self.centre) @ self.weight + self.bias
+        scores: AnyFloats = (_levels(x) - self.centre) @ self.weight + self.bias
         return scores
 
-    def predict(self, x: Floats) -> NDArray[np.int32]:
+    def predict(self, x: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: NDArray[np.int32] = self.classes[self.scores(x).argmax(axis=1)]
+        named: Int32s = self.classes[self.scores(x).argmax(axis=1)]
         return named
 
-    def to_tensors(self) -> dict[str, NDArray[Any]]:
+    def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
         return {"classes": self.classes, "centre": self.centre, "weight": self.weight, "bias": self.bias}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Level:
+    def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Level:
         """Return the analysis that `to_tensors` described."""
         return cls(*(tensors[name] for name in ("classes", "centre", "weight", "bias")))
 
 
-def _levels(x: Floats) -> Floats:
+def _levels(x: AnyFloats) -> AnyFloats:
     """Return the mean of each channel over the slide, (slide, channel), float64."""
-    levels: Floats = x.mean(axis=1, dtype=np.float64)
+    levels: AnyFloats = x.mean(axis=1, dtype=np.float64)
     return levels

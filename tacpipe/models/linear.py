@@ -25,15 +25,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
 
-Floats = NDArray[np.floating[Any]]
-Windows = tuple[Floats, Floats, Floats]  # past, motion and ahead
+Windows = tuple[AnyFloats, AnyFloats, AnyFloats]  # past, motion and ahead
 
 NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions")
 ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # against standardised features and sums over windows, as in scikit-learn
@@ -46,23 +44,23 @@ RIDGE_SHARE = 1e-6  # of NLinear's mean square, added to each: frames that repea
 class Map:
     """A map from features to increments of all steps and channels: bias + (features - centre) @ weight."""
 
-    centre: Floats  # (feature,)
-    weight: Floats  # (feature, step x channel), counts per unit of the feature
-    bias: Floats  # (step x channel,), counts
+    centre: AnyFloats  # (feature,)
+    weight: AnyFloats  # (feature, step x channel), counts per unit of the feature
+    bias: AnyFloats  # (step x channel,), counts
     alpha: float
 
-    def __call__(self, features: Floats) -> Floats:
+    def __call__(self, features: AnyFloats) -> AnyFloats:
         """Return increments in counts, (window, feature) to (window, step x channel)."""
-        increments: Floats = (features - self.centre) @ self.weight + self.bias
+        increments: AnyFloats = (features - self.centre) @ self.weight + self.bias
         return increments
 
-    def to_tensors(self, name: str) -> dict[str, Floats]:
+    def to_tensors(self, name: str) -> dict[str, AnyFloats]:
         """Return its parts under ``name``."""
         parts = {"centre": self.centre, "weight": self.weight, "bias": self.bias, "alpha": np.array([self.alpha])}
         return {f"{name}.{part}": values for part, values in parts.items()}
 
     @classmethod
-    def from_tensors(cls, name: str, tensors: Mapping[str, Floats]) -> Map:
+    def from_tensors(cls, name: str, tensors: Mapping[str, AnyFloats]) -> Map:
         """Return the map that `to_tensors` described."""
         centre, weight, bias, alpha = (tensors[f"{name}.{part}"] for part in ("centre", "weight", "bias", "alpha"))
         return cls(centre, weight, bias, float(alpha[0]))
@@ -72,11 +70,11 @@ class Map:
 class Baselines:
     """What was fitted; float32, as the forecasts."""
 
-    mean_count: Floats  # (channel,)
+    mean_count: AnyFloats  # (channel,)
     phi: float
     lag: int  # rows; 0 where a single past frame shows no trend
-    shared_weight: Floats  # (context - 1, horizon)
-    shared_bias: Floats  # (horizon,), counts
+    shared_weight: AnyFloats  # (context - 1, horizon)
+    shared_bias: AnyFloats  # (horizon,), counts
     ridge: Map
     ridge_actions: Map
 
@@ -123,7 +121,7 @@ class Baselines:
             "ridge_actions.alpha": self.ridge_actions.alpha,
         }
 
-    def predict(self, past: Floats, motion: Floats) -> dict[str, Floats]:
+    def predict(self, past: AnyFloats, motion: AnyFloats) -> dict[str, AnyFloats]:
         """Return each baseline's counts above rest by its name, (window, horizon, channel), float32.
 
         ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
@@ -153,9 +151,9 @@ class Baselines:
             **{name: last + one(features[:, : len(one.centre)]).reshape(shape) for name, one in maps.items()},
         }
 
-    def to_tensors(self) -> dict[str, Floats]:
+    def to_tensors(self) -> dict[str, AnyFloats]:
         """Return all that `from_tensors` needs."""
-        tensors: dict[str, Floats] = {
+        tensors: dict[str, AnyFloats] = {
             "train_mean": self.mean_count,
             "damped_trend.phi": np.array([self.phi]),
             "damped_trend.lag": np.array([float(self.lag)]),
@@ -165,7 +163,7 @@ class Baselines:
         return tensors | self.ridge.to_tensors("ridge") | self.ridge_actions.to_tensors("ridge_actions")
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Floats]) -> Baselines:
+    def from_tensors(cls, tensors: Mapping[str, AnyFloats]) -> Baselines:
         """Return the baselines that `to_tensors` described."""
         return cls(
             tensors["train_mean"],
@@ -183,11 +181,11 @@ class _Sums:
     """Sums over windows of products of features and of features with targets, both less their training means."""
 
     windows: int
-    xx: Floats  # (feature, feature)
-    xy: Floats  # (feature, step x channel)
+    xx: AnyFloats  # (feature, feature)
+    xy: AnyFloats  # (feature, step x channel)
 
     @classmethod
-    def over(cls, part: Windows, centre: Floats, bias: Floats) -> _Sums:
+    def over(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _Sums:
         past, motion, ahead = part
         xx, xy = np.zeros((centre.size, centre.size)), np.zeros((centre.size, bias.size))
         for first in range(0, len(past), CHUNK):
@@ -211,13 +209,13 @@ class _Shared:
     """The same sums for features that all channels share: over windows and channels, nothing taken off."""
 
     count: int  # windows x channels
-    x: Floats  # (context - 1,)
-    y: Floats  # (horizon,)
-    xx: Floats  # (context - 1, context - 1)
-    xy: Floats  # (context - 1, horizon)
+    x: AnyFloats  # (context - 1,)
+    y: AnyFloats  # (horizon,)
+    xx: AnyFloats  # (context - 1, context - 1)
+    xy: AnyFloats  # (context - 1, horizon)
 
     @classmethod
-    def of(cls, sums: _Sums, centre: Floats, bias: Floats, shape: tuple[int, int, int]) -> _Shared:
+    def of(cls, sums: _Sums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]) -> _Shared:
         """Return the sums of the blocks of each channel with itself; ``shape`` is context - 1, channel and horizon."""
         before, channels, horizon = shape
         changes = before * channels  # which come first among the features
@@ -244,7 +242,7 @@ class _Shared:
         phi, lag = np.unravel_index(error.argmin(), error.shape)
         return PHIS[phi], int(lags[lag])
 
-    def least_squares(self) -> tuple[Floats, Floats]:
+    def least_squares(self) -> tuple[AnyFloats, AnyFloats]:
         """Return weight (context - 1, horizon) and bias (horizon,) of the least squared error."""
         x, y = self.x / self.count, self.y / self.count
         xx, xy = self.xx - self.count * np.outer(x, x), self.xy - self.count * np.outer(x, y)
@@ -253,7 +251,7 @@ class _Shared:
         return weight, y - x @ weight
 
 
-def _ridge(sums: _Sums, evaluated: _Sums, centre: Floats, bias: Floats) -> Map:
+def _ridge(sums: _Sums, evaluated: _Sums, centre: AnyFloats, bias: AnyFloats) -> Map:
     """Return the ridge regression whose alpha has the least squared error on the windows of ``evaluated``.
 
     With the features' matrix Q diag(v) Q', the weights are Q diag(1 / (v + alpha)) Q' xy: what is costly does not
@@ -274,15 +272,15 @@ def _ridge(sums: _Sums, evaluated: _Sums, centre: Floats, bias: Floats) -> Map:
     return Map(centre.astype(np.float32), weight.astype(np.float32), bias.astype(np.float32), ALPHAS[best])
 
 
-def _features(past: Floats, motion: Floats) -> Floats:
+def _features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
     """Return changes against the last frame, the oldest first, then the motion, its plan last: (window, feature)."""
     windows = len(past)
     return np.concatenate([(past[:, :-1] - past[:, -1:]).reshape(windows, -1), motion.reshape(windows, -1)], axis=1)
 
 
-def _damping(phi: Floats, horizon: int) -> Floats:
+def _damping(phi: AnyFloats, horizon: int) -> AnyFloats:
     """Return phi + phi^2 + ... + phi^h for h from 1 to ``horizon``, (phi,) to (phi, step)."""
-    total: Floats = np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
+    total: AnyFloats = np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
     return total
 
 

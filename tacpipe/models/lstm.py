@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from tacpipe.arrays import Bytes
 
 CACHED = 2**17  # numbers of one kind that a core's cache holds beside others of their kind: half a megabyte
 State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
@@ -191,10 +192,10 @@ def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_ga
     torch.addcmul(o, hiddens, tanhs, value=-1, out=slopes)
 
 
-_free: deque[NDArray[np.uint8]] = deque(maxlen=16)  # of two layers in both directions, of this batch and the last
+_free: deque[Bytes] = deque(maxlen=16)  # of two layers in both directions, of this batch and the last
 
 
-class _Loan(NDArray[np.uint8] if TYPE_CHECKING else np.ndarray):  # type: ignore[misc]
+class _Loan(Bytes if TYPE_CHECKING else np.ndarray):  # type: ignore[misc]
     """Memory that can be lent again once no tensor uses it."""
 
     def __del__(self) -> None:

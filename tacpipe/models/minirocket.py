@@ -18,14 +18,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int32s
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.floating[Any]]
 
 LENGTH = 9  # weights of a kernel
 HEAVY = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): where its weights are 2
@@ -42,13 +39,13 @@ class Rocket:
     """The patterns and their biases. Features come dilation by dilation, then kernel by kernel, then bias by bias."""
 
     frames: int
-    dilations: NDArray[np.int32]  # (dilation,), frames
-    each: NDArray[np.int32]  # (dilation,): biases of each kernel
-    channels: NDArray[np.bool_]  # (dilation, kernel, channel): which it sums
-    biases: Floats  # (feature,), in the slides' unit
+    dilations: Int32s  # (dilation,), frames
+    each: Int32s  # (dilation,): biases of each kernel
+    channels: Bools  # (dilation, kernel, channel): which it sums
+    biases: AnyFloats  # (feature,), in the slides' unit
 
     @classmethod
-    def fit(cls, x: Floats, *, features: int = 10_000, seed: int = 0) -> Rocket:
+    def fit(cls, x: AnyFloats, *, features: int = 10_000, seed: int = 0) -> Rocket:
         """Return a transform for slides like the training slides ``x``, (slide, time, channel).
 
         ``features`` is rounded down to a multiple of 84, and channels and slides that biases are taken of follow from
@@ -75,7 +72,7 @@ class Rocket:
         biases = [np.quantile(answer, some) for answer, some in zip(answers, taken, strict=True)]
         return cls(frames, dilations, each, chosen, np.concatenate(biases).astype(np.float32))
 
-    def transform(self, x: Floats) -> Floats:
+    def transform(self, x: AnyFloats) -> AnyFloats:
         """Return the features of slides (slide, time, channel): shares from 0 to 1, (slide, feature), float32.
 
         Raises `TacpipeError` where slides are not like those that were fitted, or values are not finite.
@@ -92,7 +89,7 @@ class Rocket:
             features[first : first + size] = self._block(x[first : first + size]).T
         return features
 
-    def _block(self, x: Floats) -> Floats:
+    def _block(self, x: AnyFloats) -> AnyFloats:
         """Return the features of a few slides, (feature, slide)."""
         features, at = np.empty((len(self.biases), len(x)), np.float32), 0
         padded = _padded(x, self.dilations[-1])
@@ -107,7 +104,7 @@ class Rocket:
                 features[at - each : at] /= len(answer)
         return features
 
-    def to_tensors(self) -> dict[str, NDArray[Any]]:
+    def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
         return {
             "frames": np.array([self.frames], np.int32),
@@ -118,7 +115,7 @@ class Rocket:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Rocket:
+    def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Rocket:
         """Return the transform that `to_tensors` described. Raises `ValueError` where its parts do not fit one another."""
         names = ("dilations", "each", "channels", "biases")
         made = cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
@@ -134,7 +131,7 @@ class Rocket:
         return made
 
 
-def _dilations(frames: int, each: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _dilations(frames: int, each: int) -> tuple[Int32s, Int32s]:
     """Return the dilations and how many of a kernel's ``each`` features every one gets, both (dilation,).
 
     They are spread evenly over powers of two, up to that at which a kernel spans the slide; those that fall on the same
@@ -148,7 +145,7 @@ def _dilations(frames: int, each: int) -> tuple[NDArray[np.int32], NDArray[np.in
     return dilations, counts
 
 
-def _padded(x: Floats, dilation: int) -> Floats:
+def _padded(x: AnyFloats, dilation: int) -> AnyFloats:
     """Return slides with zeros before and after them for kernels up to ``dilation``, (channel, time, slide), float32."""
     pad = (LENGTH // 2) * int(dilation)
     padded = np.zeros((x.shape[2], x.shape[1] + 2 * pad, x.shape[0]), np.float32)
@@ -156,7 +153,7 @@ def _padded(x: Floats, dilation: int) -> Floats:
     return padded
 
 
-def _answer(padded: Floats, frames: int, index: int, kernel: int, dilation: int, channels: NDArray[np.bool_]) -> Floats:
+def _answer(padded: AnyFloats, frames: int, index: int, kernel: int, dilation: int, channels: Bools) -> AnyFloats:
     """Return what a kernel answers at each position, (time, slide)."""
     reach = (LENGTH - 1) * int(dilation)
     spare = padded.shape[1] - frames
@@ -182,15 +179,15 @@ def _answer(padded: Floats, frames: int, index: int, kernel: int, dilation: int,
     return answer
 
 
-def _counts(flags: NDArray[np.bool_]) -> NDArray[Any]:
+def _counts(flags: Bools) -> AnyArray:
     """Return how many of the flags (time, slide) are set, (slide,)."""
     byte = flags.view(np.uint8)
     parts = [np.add.reduce(byte[at : at + COUNTED], axis=0, dtype=np.uint8) for at in range(0, len(byte), COUNTED)]
-    total: Floats = np.sum(parts, axis=0, dtype=np.float32)
+    total: AnyFloats = np.sum(parts, axis=0, dtype=np.float32)
     return total
 
 
-def _check(x: Floats) -> None:
+def _check(x: AnyFloats) -> None:
     if x.ndim != 3 or not x.size or x.shape[1] < LENGTH:
         raise TacpipeError(
             f"Slides of {x.shape} cannot be transformed; they must be (slide, time, channel), with {LENGTH} frames or "

@@ -11,17 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Int32s, Ints
 from tacpipe.models.minirocket import Rocket
 from tacpipe.models.readout import Readout
 from tacpipe.models.tensors import under
-
-Floats = NDArray[np.floating[Any]]
-Labels = NDArray[np.integer[Any]]
 
 QUANTILES = (0.5, 0.75, 0.9, 1.0)  # of the channels at one moment
 SHARES = (0.0, 0.3, 1.0)  # that strength may have next to the 1 of patterns; finer steps let it in by chance
@@ -36,7 +32,7 @@ class MinirocketClassifier:
     share: float  # of strength, next to the 1 of patterns
 
     @classmethod
-    def fit(cls, x: Floats, labels: Labels, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:
+    def fit(cls, x: AnyFloats, labels: Ints, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:
         """Return the classifier of training slides (slide, time, channel) and their classes (slide,), whole numbers.
 
         ``features`` is the number of patterns; ``seed`` that of the draws among them. Raises `TacpipeError` for slides
@@ -46,17 +42,17 @@ class MinirocketClassifier:
         patterns = Rocket.fit(wide, features=features, seed=seed)
         return cls(patterns, *_read(patterns.transform(wide), _strength(wide), labels))
 
-    def relabelled(self, x: Floats, labels: Labels) -> MinirocketClassifier:
+    def relabelled(self, x: AnyFloats, labels: Ints) -> MinirocketClassifier:
         """Return a classifier with the same patterns, its readout fitted to slides ``x`` and other ``labels``."""
         wide = _wide(x)
         return MinirocketClassifier(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
 
     @property
-    def classes(self) -> NDArray[np.int32]:
+    def classes(self) -> Int32s:
         """The classes in the order of scores, (class,)."""
         return self.readout.classes
 
-    def scores(self, x: Floats) -> Floats:
+    def scores(self, x: AnyFloats) -> AnyFloats:
         """Return the scores of slides (slide, time, channel), (slide, class), float32; the highest wins.
 
         Raises `TacpipeError` where slides are not like those that were fitted, or values are not finite.
@@ -64,19 +60,19 @@ class MinirocketClassifier:
         wide = _wide(x)
         return self.readout.scores(np.concatenate([self.patterns.transform(wide), _strength(wide)], axis=1))
 
-    def predict(self, x: Floats) -> NDArray[np.int32]:
+    def predict(self, x: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: NDArray[np.int32] = self.classes[self.scores(x).argmax(axis=1)]
+        named: Int32s = self.classes[self.scores(x).argmax(axis=1)]
         return named
 
-    def to_tensors(self) -> dict[str, NDArray[Any]]:
+    def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
         parts = {"patterns": self.patterns.to_tensors(), "readout": self.readout.to_tensors()}
         tensors = {f"{name}.{key}": value for name, part in parts.items() for key, value in part.items()}
         return tensors | {"share": np.array([self.share])}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> MinirocketClassifier:
+    def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> MinirocketClassifier:
         """Return the classifier that `to_tensors` described."""
         return cls(
             Rocket.from_tensors(under("patterns.", tensors)),
@@ -85,24 +81,24 @@ class MinirocketClassifier:
         )
 
 
-def _read(patterns: Floats, strength: Floats, labels: Labels) -> tuple[Readout, float]:
+def _read(patterns: AnyFloats, strength: AnyFloats, labels: Ints) -> tuple[Readout, float]:
     """Return the readout of patterns and strength, each (slide, feature), and the weight of strength."""
     found = np.concatenate([patterns, strength], axis=1)
 
-    def shares(share: float) -> Floats:
+    def shares(share: float) -> AnyFloats:
         return np.repeat([1 / patterns.shape[1], share / strength.shape[1]], [patterns.shape[1], strength.shape[1]])
 
     best = min(SHARES, key=lambda share: Readout.fit(found, labels, shares(share)).left_out_error)
     return Readout.nearest_mean(found, labels, shares(best)), best
 
 
-def _wide(x: Floats) -> Floats:
+def _wide(x: AnyFloats) -> AnyFloats:
     """Return slides with the mean, spread and quantiles of their channels as six more channels, float32."""
     across = [x.mean(axis=2), x.std(axis=2), *np.quantile(x, QUANTILES, axis=2)]
     return np.concatenate([x, np.stack(across, axis=2)], axis=2, dtype=np.float32)
 
 
-def _strength(x: Floats) -> Floats:
+def _strength(x: AnyFloats) -> AnyFloats:
     """Return the mean, the standard deviation and the mean step of each channel's root, (slide, 3 x channel)."""
     root = np.sign(x) * np.sqrt(np.abs(x))  # a tared sensor may go below zero
     steps = np.abs(np.diff(root, axis=1)).mean(axis=1)

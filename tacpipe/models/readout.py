@@ -17,15 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Int32s, Ints
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.floating[Any]]
-Labels = NDArray[np.integer[Any]]
 
 ALPHAS = tuple(10.0 ** (power / 2) for power in range(-8, 5))  # against inner products that are 1 on the average
 SPREAD = 1e-5  # added to the covariance within classes, beside inner products that are 1 on the average
@@ -36,15 +32,15 @@ STEADY = 1e-6  # standard deviation below which a feature is constant but for ro
 class Readout:
     """What was fitted: scores are bias + (features - centre) @ weight."""
 
-    classes: NDArray[np.int32]  # (class,), sorted
-    centre: Floats  # (feature,)
-    weight: Floats  # (feature, class)
-    bias: Floats  # (class,)
+    classes: Int32s  # (class,), sorted
+    centre: AnyFloats  # (feature,)
+    weight: AnyFloats  # (feature, class)
+    bias: AnyFloats  # (class,)
     alpha: float  # of ridge regression; of the nearest mean what is added to the covariance
     left_out_error: float  # of ridge regression: mean square over slides left out one by one, targets +-1; else NaN
 
     @classmethod
-    def fit(cls, features: Floats, labels: Labels, shares: Floats | None = None) -> Readout:
+    def fit(cls, features: AnyFloats, labels: Ints, shares: AnyFloats | None = None) -> Readout:
         """Return the readout of training slides (slide, feature) and their classes (slide,).
 
         ``shares`` (feature,) says how much each feature counts beside the others once they are standardised; all alike
@@ -73,7 +69,7 @@ class Readout:
         return cls(classes, centre, weight, bias.astype(np.float32), alpha, error)
 
     @classmethod
-    def nearest_mean(cls, features: Floats, labels: Labels, shares: Floats | None = None) -> Readout:
+    def nearest_mean(cls, features: AnyFloats, labels: Ints, shares: AnyFloats | None = None) -> Readout:
         """Return the readout by the nearest class mean; arguments and errors are those of `fit`.
 
         With residuals R from class means M and their covariance R'R / n + a, the weights (R'R / n + a)^-1 M' are, up to
@@ -91,7 +87,7 @@ class Readout:
         bias = -np.einsum("cf,fc->c", means, weight) / 2
         return cls(classes.astype(np.int32), centre, gain[:, None] * weight, bias, SPREAD, float("nan"))
 
-    def scores(self, features: Floats) -> Floats:
+    def scores(self, features: AnyFloats) -> AnyFloats:
         """Return the scores of slides (slide, feature), (slide, class).
 
         Of ridge regression they are about 1 for a slide's class and -1 for others; of the nearest mean they are half the
@@ -101,15 +97,15 @@ class Readout:
             raise TacpipeError(
                 f"Features of {features.shape} do not fit the readout; (slide, {len(self.centre)}) was fitted."
             )
-        scores: Floats = (features - self.centre) @ self.weight + self.bias
+        scores: AnyFloats = (features - self.centre) @ self.weight + self.bias
         return scores
 
-    def predict(self, features: Floats) -> NDArray[np.int32]:
+    def predict(self, features: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: NDArray[np.int32] = self.classes[self.scores(features).argmax(axis=1)]
+        named: Int32s = self.classes[self.scores(features).argmax(axis=1)]
         return named
 
-    def to_tensors(self) -> dict[str, NDArray[Any]]:
+    def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
         return {
             "classes": self.classes,
@@ -120,13 +116,13 @@ class Readout:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Readout:
+    def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Readout:
         """Return the readout that `to_tensors` described."""
         alpha, error = (float(value) for value in tensors["chosen"])
         return cls(tensors["classes"], tensors["centre"], tensors["weight"], tensors["bias"], alpha, error)
 
 
-def _standard(features: Floats, shares: Floats | None) -> tuple[Floats, Floats]:
+def _standard(features: AnyFloats, shares: AnyFloats | None) -> tuple[AnyFloats, AnyFloats]:
     """Return centre and gain, (feature,), that give slides a mean square of 1, each feature as much of it as it shares."""
     centre, spread = features.mean(axis=0, dtype=np.float64), features.std(axis=0, dtype=np.float64)
     gain = np.where(spread > STEADY, 1 / np.maximum(spread, STEADY), 0)
@@ -136,7 +132,7 @@ def _standard(features: Floats, shares: Floats | None) -> tuple[Floats, Floats]:
     return centre.astype(np.float32), gain.astype(np.float32)
 
 
-def _check(features: Floats, labels: Labels, classes: int) -> None:
+def _check(features: AnyFloats, labels: Ints, classes: int) -> None:
     if features.ndim != 2 or labels.shape != features.shape[:1]:
         raise TacpipeError(
             f"Features of {features.shape} and labels of {labels.shape} do not fit one another; they must be "

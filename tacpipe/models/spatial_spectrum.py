@@ -11,14 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.floating[Any]]
 
 BANDS = 16
 PERIODS = 3.0  # of the longest wave in the way; a slower one cannot be separated from a change of pressure
@@ -54,7 +52,7 @@ class Bands:
     """The way over which spectra are taken and the bands of spatial frequency."""
 
     way_m: float
-    edges_per_m: Floats  # (band + 1,)
+    edges_per_m: AnyFloats  # (band + 1,)
 
     @classmethod
     def common(cls, sensors: Sequence[Sampling], number: int = BANDS) -> Bands:
@@ -75,7 +73,7 @@ class Bands:
             )
         return cls(way_m, np.geomspace(lowest, highest, number + 1))
 
-    def log_power(self, slides: Floats, rate_hz: float, speed_m_s: float) -> Floats:
+    def log_power(self, slides: AnyFloats, rate_hz: float, speed_m_s: float) -> AnyFloats:
         """Return the features of slides (slide, time, channel): (slide, band + 1), natural logarithms of power.
 
         The first are the power in each band less the mean of all bands; the last is that mean, as a density over spatial
@@ -98,7 +96,7 @@ class Bands:
         found[:, -1] += np.log(step_m)
         return found
 
-    def _read(self, slides: Floats, waves: NDArray[np.complex64]) -> Floats:
+    def _read(self, slides: AnyFloats, waves: NDArray[np.complex64]) -> AnyFloats:
         """Return the features of a few slides."""
         level = np.maximum(slides.mean(axis=1, dtype=np.float64), 0)  # (slide, channel)
         leading = np.argsort(-level, axis=1, kind="stable")[:, : max(1, round(LEADING * level.shape[1]))]
@@ -111,11 +109,11 @@ class Bands:
         strength = np.median(mean - 2 * np.log(level + 1), axis=1)
         return np.column_stack([shape - shape.mean(axis=1, keepdims=True), strength])
 
-    def _power(self, part: Floats, waves: NDArray[np.complex64]) -> Floats:
+    def _power(self, part: AnyFloats, waves: NDArray[np.complex64]) -> AnyFloats:
         """Return the power of a window of slides (slide, time, channel) in each band: (slide, channel, band), counts^2."""
         moved = part - part.mean(axis=1, keepdims=True)
         lines = np.square(np.abs(np.tensordot(moved, waves, axes=(1, 0))))  # (slide, channel, line)
-        power: Floats = lines.reshape(*lines.shape[:2], -1, LINES).mean(axis=3)
+        power: AnyFloats = lines.reshape(*lines.shape[:2], -1, LINES).mean(axis=3)
         return power
 
     def _waves(self, window: int, step_m: float) -> NDArray[np.complex64]:
@@ -128,7 +126,7 @@ class Bands:
         return np.asarray(waves, np.complex64)
 
 
-def _windows(slides: Floats, window: int) -> Iterator[Floats]:
+def _windows(slides: AnyFloats, window: int) -> Iterator[AnyFloats]:
     """Yield overlapping windows of slides (slide, time, channel)."""
     for first in range(0, slides.shape[1] - window + 1, max(1, round(HOP * window))):
         yield slides[:, first : first + window]

@@ -16,15 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Int32s, Ints
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.floating[Any]]
-Labels = NDArray[np.integer[Any]]
 
 SHARED = 3  # fewest classes from which the difference of two sensors is fitted
 PULL = 0.5  # of the gain of all features on that of each, as a fraction of a feature's mean sum of squares
@@ -37,18 +33,18 @@ STEADY = (
 class Labelled:
     """Labelled slides of a sensor: features (slide, feature) and classes (slide,)."""
 
-    features: Floats
-    labels: Labels
+    features: AnyFloats
+    labels: Ints
 
 
 @dataclass(frozen=True)
 class Gaussians:
     """Classes as normal distributions of features; a covariance of zeros marks one of which nothing is known."""
 
-    mean: Floats  # (class, feature)
-    covariance: Floats  # (class, feature, feature)
+    mean: AnyFloats  # (class, feature)
+    covariance: AnyFloats  # (class, feature, feature)
 
-    def scores(self, features: Floats) -> Floats:
+    def scores(self, features: AnyFloats) -> AnyFloats:
         """Return log-likelihoods of slides (slide, feature) up to what all classes share: (slide, class), float32."""
         scores = np.full((len(features), len(self.mean)), -np.inf, np.float32)
         for index, (mean, covariance) in enumerate(zip(self.mean, self.covariance, strict=True)):
@@ -64,7 +60,7 @@ class Gaussians:
 class Transfer:
     """What was fitted for one sensor: classes as it knows them, and as other sensors alone make it expect them."""
 
-    classes: NDArray[np.int32]  # (class,), sorted
+    classes: Int32s  # (class,), sorted
     known: Gaussians
     expected: Gaussians  # nothing of a class that no other sensor knows
 
@@ -94,7 +90,7 @@ class Transfer:
             covariance[index] = within + wide - trust @ wide
         return cls(classes.astype(np.int32), Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2), borrowed)
 
-    def to_tensors(self) -> dict[str, NDArray[Any]]:
+    def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
         return {
             "classes": self.classes,
@@ -105,7 +101,7 @@ class Transfer:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]]) -> Transfer:
+    def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Transfer:
         """Return the knowledge that `to_tensors` described."""
         known, expected = (
             Gaussians(tensors[f"{kind}.mean"], tensors[f"{kind}.covariance"]) for kind in ("known", "expected")
@@ -113,7 +109,7 @@ class Transfer:
         return cls(tensors["classes"], known, expected)
 
 
-def _expected(means: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
+def _expected(means: AnyFloats, others: Sequence[AnyFloats]) -> tuple[AnyFloats, AnyFloats]:
     """Return where other sensors' class means make one expect those of a sensor, and the variance of that.
 
     All are (class, feature), NaN in the rows of classes that a sensor did not learn, or that no other one knows.
@@ -138,18 +134,18 @@ def _expected(means: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
         return total / weight, np.where(weight > 0, 1 / weight, np.nan)
 
 
-def _mapped(there: Floats, here: Floats, features: Floats) -> Floats:
+def _mapped(there: AnyFloats, here: AnyFloats, features: AnyFloats) -> AnyFloats:
     """Return features of one sensor as another's, by the means (class, feature) of classes that both learned."""
     centre, target = there.mean(axis=0), here.mean(axis=0)
     squares = np.square(there - centre).sum(axis=0)
     products = ((there - centre) * (here - target)).sum(axis=0)
     pull = PULL * squares.mean() + 1e-12
     gain = (products + pull * products.sum() / (squares.sum() + 1e-12)) / (squares + pull)
-    found: Floats = target + (features - centre) * gain
+    found: AnyFloats = target + (features - centre) * gain
     return found
 
 
-def _means(slides: Labelled, classes: Labels) -> Floats:
+def _means(slides: Labelled, classes: Ints) -> AnyFloats:
     """Return the mean features of each class (class, feature), NaN where a class has no slide."""
     found = np.full((len(classes), slides.features.shape[1]), np.nan)
     for index, one in enumerate(classes):
@@ -158,7 +154,7 @@ def _means(slides: Labelled, classes: Labels) -> Floats:
     return found
 
 
-def _within(slides: Labelled) -> Floats:
+def _within(slides: Labelled) -> AnyFloats:
     """Return the covariance (feature, feature) of features within classes."""
     from sklearn.covariance import ledoit_wolf
 
@@ -167,11 +163,11 @@ def _within(slides: Labelled) -> Floats:
     spread = left.std(axis=0)
     spread = np.where(spread > 0, spread, 1.0)
     shrunk, _ = ledoit_wolf(left / spread, assume_centered=True)
-    found: Floats = shrunk * np.outer(spread, spread) * len(left) / (len(left) - len(classes))
+    found: AnyFloats = shrunk * np.outer(spread, spread) * len(left) / (len(left) - len(classes))
     return found
 
 
-def _least(within: Floats) -> float:
+def _least(within: AnyFloats) -> float:
     """Return a variance between classes that is as good as none."""
     return float(STEADY * np.trace(within) / len(within))
 

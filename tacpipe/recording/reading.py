@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Times
 from tacpipe.sensors.counting import Counted, Counting
 from tacpipe.sensors.framing import Account, Chunks, Loss, Run
 from tacpipe.sensors.sensor import Samples, Sensor
-
-Times = NDArray[np.int64]
 
 LINK = "link"  # frames that the counter misses and of which no byte came
 DEVICE = "device"  # samples that the device itself passed over
@@ -39,7 +37,7 @@ class Batch:
     """Samples of one stream in the order of their arrival, and what went wrong meanwhile."""
 
     t_ns: Times  # (sample,), arrival on the monotonic clock
-    values: tuple[NDArray[Any], ...]  # blocks (sample, channel)
+    values: tuple[AnyArray, ...]  # blocks (sample, channel)
     seq: Times | None = None  # (sample,), unrolled
     device_seq: Times | None = None  # (sample,), unrolled
     t_device_ns: Times | None = None  # (sample,)
@@ -211,7 +209,7 @@ def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[Even
     return found + [Event(int(t_ns[row]), RESET, detail="the device's second counter") for row in anew]
 
 
-def _chosen(batch: Batch, rows: NDArray[np.bool_]) -> Batch:
+def _chosen(batch: Batch, rows: Bools) -> Batch:
     def of(values: Times | None) -> Times | None:
         return None if values is None else values[rows]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import MOST_CATCH_UP_NS, parsed
@@ -78,7 +78,7 @@ class _Stalls:
         facts += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
         return Event(note.t_ns, STALLED, detail="; ".join(facts))
 
-    def uncertain_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    def uncertain_ns(self, t_ns: Times) -> Int64s:
         """Return by how much samples may have come earlier than these stamps (sample,); 0 where they are certain."""
         found = np.zeros_like(t_ns)
         for begin_ns, end_ns, empty_ns in self._windows:
@@ -181,9 +181,7 @@ def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
         yield Chunks.joined(waiting)
 
 
-def table(
-    fields: Sequence[pa.Field], batches: Sequence[Batch], t_ns: NDArray[np.int64], uncertain_ns: NDArray[np.int64]
-) -> pa.Table:
+def table(fields: Sequence[pa.Field], batches: Sequence[Batch], t_ns: Times, uncertain_ns: Times) -> pa.Table:
     """Return batches as the table of a stream with these stamps (sample,), and how uncertain they are where any is."""
     import pyarrow as pa
 
@@ -207,7 +205,7 @@ def table(
     return pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
 
 
-def _columns(fields: Sequence[pa.Field], batches: Sequence[Batch]) -> list[NDArray[Any]]:
+def _columns(fields: Sequence[pa.Field], batches: Sequence[Batch]) -> list[AnyArray]:
     """Return the values of each channel (sample,), each copied once: a recording of hours is large."""
     if not batches:
         return [np.zeros(0, dtype=kind.type.to_pandas_dtype()) for kind in fields]
@@ -219,7 +217,7 @@ def _columns(fields: Sequence[pa.Field], batches: Sequence[Batch]) -> list[NDArr
     ]
 
 
-def _joined(parts: Sequence[Any], kind: Any) -> NDArray[Any]:
+def _joined(parts: Sequence[Any], kind: Any) -> AnyArray:
     return np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.recording.rig import Stream
@@ -41,13 +41,13 @@ class Watch:
         self.stream = stream
         self.samples = 0
         self.error = ""  # what its driver could not make of what came
-        self.newest: NDArray[np.float64] | None = None  # (channel,)
+        self.newest: Floats | None = None  # (channel,)
         self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to state what speaks where no frame is found
         self.last_ns: int | None = None  # arrival of the newest sample
         self._reading = Reading(stream.sensor)
-        self._recent: deque[tuple[NDArray[np.int64], NDArray[np.int64] | None]] = deque()
-        self._rest: list[NDArray[np.float64]] = []
-        self.rest: NDArray[np.float64] | None = None  # (channel,), once it is known
+        self._recent: deque[tuple[Int64s, Int64s | None]] = deque()
+        self._rest: list[Floats] = []
+        self.rest: Floats | None = None  # (channel,), once it is known
 
     def feed(self, blocks: list[Chunks | Note]) -> None:
         """Take what came. What a driver raises is kept in ``error``: nothing that is looked at may end a recording."""

@@ -16,13 +16,9 @@ from collections.abc import Callable
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.floating[Any]]
 
 INK, FAINT = "#010203", "#010204"
 COLOURS = {"model": "#010301", "persistence": "#010302", "codec": "#010303", "other": "#010304"}

@@ -15,11 +15,11 @@ from math import isfinite
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.sensors import number_texts, options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.sensors.text_framer import LineFramer
 
@@ -100,24 +100,22 @@ class AnySkin(Sensor):
         return np.hstack([np.ascontiguousarray(numbers, dtype="<f4").view(np.uint8), tails])
 
 
-def _floats(frames: Bytes) -> NDArray[np.float32]:
-    floats: NDArray[np.float32] = (
-        np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
-    )
+def _floats(frames: Bytes) -> Float32s:
+    floats: Float32s = np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
     return floats
 
 
 @functools.lru_cache(maxsize=4)  # kept between the framer's look at them and their decoding
-def _table(lines: tuple[bytes, ...], width: int) -> NDArray[np.float64] | None:
+def _table(lines: tuple[bytes, ...], width: int) -> Floats | None:
     return number_texts.of_lines(lines, width)
 
 
-def _can_be_read(frames: Bytes) -> NDArray[np.bool_]:
+def _can_be_read(frames: Bytes) -> Bools:
     """Return which frames (frame, byte) hold numbers that the chip can give."""
     return np.asarray(_plausible(_floats(frames)).all(axis=1))
 
 
-def _plausible(numbers: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _plausible(numbers: Float32s) -> Bools:
     size = np.abs(numbers)
-    possible: NDArray[np.bool_] = ((size >= LEAST) & (size <= MOST)) | (size == 0)
+    possible: Bools = ((size >= LEAST) & (size <= MOST)) | (size == 0)
     return possible

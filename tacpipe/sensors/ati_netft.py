@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bytes, Floats
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Bytes, Framer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
@@ -88,7 +88,7 @@ class AtiNetFT(Sensor):
     def decode(self, frames: Bytes) -> Samples:
         """Return status and load, with the counters of records sent and of samples taken."""
         records = np.ascontiguousarray(frames).view(RECORD)[:, 0]
-        load: NDArray[Any] = records["counts"].astype(np.int32)  # (frame, axis)
+        load: AnyArray = records["counts"].astype(np.int32)  # (frame, axis)
         if self.counts_per_force:
             load = load / self._scale
         return Samples(
@@ -109,7 +109,7 @@ class AtiNetFT(Sensor):
         return records.view(np.uint8).reshape(len(load), RECORD.itemsize)
 
     @property
-    def _scale(self) -> NDArray[np.float64]:
+    def _scale(self) -> Floats:
         return np.repeat([self.counts_per_force, self.counts_per_torque], 3)  # (axis,)
 
     def opening(self, local: Mapping[str, Any]) -> Dialogue:

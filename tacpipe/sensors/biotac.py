@@ -18,16 +18,17 @@ sampled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Ints
 from tacpipe.channels.schema import ELECTRODES, VIBRATIONS, biotac_fields
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Samples, Sensor
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class BioTac(Sensor):
         return np.hstack([body, sum16(body).astype("<u2")[:, None].view(np.uint8)])
 
 
-def with_parity(bits: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+def with_parity(bits: Ints) -> NDArray[np.uint8]:
     """Return 7 bits each with the lowest bit that makes their parity odd, as bytes.
 
     >>> [hex(byte) for byte in with_parity(np.array([0, 1, 0x7F], dtype=np.uint16))]
@@ -118,14 +119,14 @@ def with_parity(bits: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
     return shifted | ~_is_odd(shifted)
 
 
-def _is_odd(data: Bytes) -> NDArray[np.bool_]:
+def _is_odd(data: Bytes) -> Bools:
     folded = data ^ (data >> 4)
     folded = folded ^ (folded >> 2)
-    odd: NDArray[np.bool_] = ((folded ^ (folded >> 1)) & 1).astype(bool)
+    odd: Bools = ((folded ^ (folded >> 1)) & 1).astype(bool)
     return odd
 
 
-def _is_whole(frames: Bytes) -> NDArray[np.bool_]:
+def _is_whole(frames: Bytes) -> Bools:
     summed = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
-    whole: NDArray[np.bool_] = summed & _is_odd(frames[:, HEADER:-2]).all(axis=1)
+    whole: Bools = summed & _is_odd(frames[:, HEADER:-2]).all(axis=1)
     return whole

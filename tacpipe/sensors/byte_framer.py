@@ -12,21 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacpipe.sensors.framing import (
-    CUT,
-    GARBLED,
-    NOISE,
-    START,
-    UNCONFIRMED,
-    Account,
-    Bytes,
-    Chunks,
-    Framing,
-    Loss,
-    Run,
-)
+from tacpipe.arrays import Bools, Bytes
+from tacpipe.sensors.framing import CUT, GARBLED, NOISE, START, UNCONFIRMED, Account, Chunks, Framing, Loss, Run
 from tacpipe.sensors.pending import Pending
 
 AMBIGUOUS = 64  # frames that are kept while marks repeat in more than one place
@@ -287,7 +275,7 @@ class ByteFramer:
         return Loss(self._text.arrival(stop - 1), cause, frames, stop - start)
 
 
-def _leading(good: NDArray[np.bool_]) -> int:
+def _leading(good: Bools) -> int:
     """Return how many frames are good (frame,) before the first that is not."""
     first = int(good.argmin())
     return len(good) if good[first] else first

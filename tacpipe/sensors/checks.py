@@ -8,41 +8,42 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from tacpipe.arrays import Bytes, Counts
+
 Step = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.uint32]]  # (value,), (256,) to (value,)
 
 MOST_LOOKED_UP = 1 << 18  # bytes at a time, which bounds the memory of a CRC
 
 
-def sum8(data: Bytes) -> NDArray[np.uint8]:
+def sum8(data: Bytes) -> Bytes:
     """Return the sum of the bytes of each frame modulo 256 (frame,)."""
-    total: NDArray[np.uint8] = data.sum(axis=1, dtype=np.uint8)
+    total: Bytes = data.sum(axis=1, dtype=np.uint8)
     return total
 
 
-def sum16(data: Bytes) -> NDArray[np.uint16]:
+def sum16(data: Bytes) -> Counts:
     """Return the sum of the bytes of each frame modulo 65,536 (frame,)."""
-    total: NDArray[np.uint16] = data.sum(axis=1, dtype=np.uint16)
+    total: Counts = data.sum(axis=1, dtype=np.uint16)
     return total
 
 
-def lrc(data: Bytes) -> NDArray[np.uint8]:
+def lrc(data: Bytes) -> Bytes:
     """Return the two's complement of the sum of each frame (frame,): with it, the sum is 0."""
     return (-sum8(data)).astype(np.uint8)
 
 
-def xor8(data: Bytes) -> NDArray[np.uint8]:
+def xor8(data: Bytes) -> Bytes:
     """Return the exclusive or of the bytes of each frame (frame,)."""
-    total: NDArray[np.uint8] = np.bitwise_xor.reduce(data, axis=1)
+    total: Bytes = np.bitwise_xor.reduce(data, axis=1)
     return total
 
 
-def crc8(data: Bytes, polynomial: int = 0x07) -> NDArray[np.uint8]:
+def crc8(data: Bytes, polynomial: int = 0x07) -> Bytes:
     """Return the CRC-8 of each frame (frame,): most significant bit first, from 0."""
     return _crc(data, _left, polynomial, 8, b"").astype(np.uint8)
 
 
-def crc16_modbus(data: Bytes) -> NDArray[np.uint16]:
+def crc16_modbus(data: Bytes) -> Counts:
     """Return the CRC-16/MODBUS of each frame (frame,): polynomial 0xA001 reflected, from 0xFFFF.
 
     Source: MODBUS over Serial Line, V1.02, section 6.2.2.
@@ -50,12 +51,12 @@ def crc16_modbus(data: Bytes) -> NDArray[np.uint16]:
     return _crc(data, _right, 0xA001, 16, b"\xff\xff").astype(np.uint16)
 
 
-def crc16_ccitt(data: Bytes) -> NDArray[np.uint16]:
+def crc16_ccitt(data: Bytes) -> Counts:
     """Return the CRC-16 of each frame (frame,): polynomial 0x1021, most significant bit first, from 0xFFFF."""
     return _crc(data, _left, 0x1021, 16, b"\xff\xff").astype(np.uint16)
 
 
-def crc16_wts(data: Bytes) -> NDArray[np.uint16]:
+def crc16_wts(data: Bytes) -> Counts:
     """Return the check sum of Weiss WTS frames (frame,): the table of 0x1021, but shifted to the right, from 0xFFFF."""
     return _crc(data, _mixed, 0x1021, 16, b"\xff\xff").astype(np.uint16)
 

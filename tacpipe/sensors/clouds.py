@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Float32s
 from tacpipe.clouds import pcd, ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.depth_frame import MAGIC, DepthFrame
@@ -62,7 +62,7 @@ class Clouds(Sensor):
         found = [self._points(frame) for frame in frames]
         points = [xyz for xyz, _ in found] or [np.zeros((0, 3), np.float32)]
         rows = np.repeat(np.arange(len(found)), [len(xyz) for xyz, _ in found]).astype(np.int64)
-        values: tuple[NDArray[np.float32] | NDArray[np.uint8], ...] = (np.concatenate(points),)
+        values: tuple[Float32s | Bytes, ...] = (np.concatenate(points),)
         if self.colour:
             values += (np.concatenate([rgb for _, rgb in found if rgb is not None] or [np.zeros((0, 3), np.uint8)]),)
         return Samples(values, rows=rows)
@@ -75,7 +75,7 @@ class Clouds(Sensor):
         groups = np.split(np.arange(len(samples)), edges)
         return [ply.packed(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
 
-    def _points(self, content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    def _points(self, content: bytes) -> tuple[Float32s, Bytes | None]:
         """Return the points that were seen (point, xyz), metres, and their colours (point, rgb)."""
         xyz, colours = _parsed(content)
         seen = np.isfinite(xyz).all(axis=1)
@@ -91,7 +91,7 @@ class Clouds(Sensor):
 
 
 @functools.lru_cache(maxsize=AT_HAND)
-def _parsed(content: bytes) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+def _parsed(content: bytes) -> tuple[Float32s, Bytes | None]:
     """Return points and colours as they stand in a chunk. Raises `TacpipeError` where it is not a cloud."""
     if content.startswith(MAGIC):
         return DepthFrame.of_bytes(content).points()

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bytes, Float32s, Int64s
 from tacpipe.channels.schema import AXES
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import pts
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 from tacpipe.sensors.stale import FreshFramer
 
@@ -98,7 +99,7 @@ class Contactile(Sensor):
         return FreshFramer(ByteFramer(framing), self._counters, COUNTER, round(JUMP_S * self.rate_hz))
 
     @staticmethod
-    def _counters(frames: Bytes) -> NDArray[np.int64]:
+    def _counters(frames: Bytes) -> Int64s:
         counters = np.zeros(len(frames), dtype=np.int64)
         for rows, layout in pts.layouts(frames):
             assert layout is not None  # the framer's check saw to it
@@ -111,7 +112,7 @@ class Contactile(Sensor):
         Frames without the blocks of slip, as they come before the watch began, are left out where ``slip`` is set.
         Raises `DeviceError` where the controller has other sensors than the options state.
         """
-        parts: list[tuple[NDArray[np.int64], tuple[NDArray[Any], ...], NDArray[np.uint8]]] = []
+        parts: list[tuple[Int64s, tuple[AnyArray, ...], NDArray[np.uint8]]] = []
         for rows, layout in pts.layouts(frames):
             assert layout is not None  # the framer's check saw to it
             if layout.counts != (self.pillars,) * self.sensors:
@@ -140,7 +141,7 @@ class Contactile(Sensor):
             self._values(np.zeros((0, LARGEST), dtype=np.uint8), layout), seq=none, t_device_ns=none, rows=none
         )
 
-    def _values(self, frames: Bytes, layout: pts.Layout) -> tuple[NDArray[Any], ...]:
+    def _values(self, frames: Bytes, layout: pts.Layout) -> tuple[AnyArray, ...]:
         forces = np.hstack(
             [_floats(_gathered(frames, layout.places(block), 24)) for block in (pts.PILLARS, pts.SENSORS)]
         )
@@ -216,21 +217,21 @@ def _vector(owner: str, layout: Mapping[str, str], quantity: str, unit: str) -> 
     ]
 
 
-def _gathered(frames: Bytes, places: NDArray[np.int64], size: int) -> Bytes:
+def _gathered(frames: Bytes, places: Int64s, size: int) -> Bytes:
     """Return ``size`` bytes from each place (frame, place, byte)."""
     return np.ascontiguousarray(frames[:, places[:, None] + np.arange(size)])
 
 
-def _scatter(frames: Bytes, places: NDArray[np.int64], values: Bytes) -> None:
+def _scatter(frames: Bytes, places: Int64s, values: Bytes) -> None:
     frames[:, places[:, None] + np.arange(values.shape[2])] = values
 
 
-def _floats(data: Bytes) -> NDArray[np.float32]:
+def _floats(data: Bytes) -> Float32s:
     """Return the floats of entries (frame, entry, byte) side by side (frame, float)."""
     floats = np.ascontiguousarray(data).view("<f4").astype(np.float32)
     return floats.reshape(len(data), floats.shape[1] * floats.shape[2])
 
 
-def _bytes(values: NDArray[Any], size: int) -> Bytes:
+def _bytes(values: AnyArray, size: int) -> Bytes:
     """Return values (frame, float) as entries (frame, entry, byte) of so many bytes."""
     return np.ascontiguousarray(values, "<f4").view(np.uint8).reshape(len(values), -1, size)

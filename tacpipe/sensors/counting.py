@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-Integers = NDArray[np.int64]
+from tacpipe.arrays import Bools, Int64s, Times
 
 MOST_RATE_HZ = 100_000.0  # of a device whose rate nobody gave: no program sends records faster
 RESET_TIMES = 3.0  # a gap longer than so many times what the clock allows is a device that began anew
@@ -20,13 +19,11 @@ LATE_NS = 250_000_000  # a link that reorders does so within this; a count that 
 class Counted:
     """A batch of counters made sense of; all are (sample,)."""
 
-    seq: Integers  # unrolled: grows by one a sample, a lost one leaves a gap
-    missing: Integers  # samples that were lost right before
-    duplicate: NDArray[np.bool_]  # the same sample once more
-    late: NDArray[np.bool_]  # it was passed over before, and counted as lost
-    reset: NDArray[
-        np.bool_
-    ]  # it began to count anew, or jumped beyond what time allows; ``missing`` is by the clock, or 0
+    seq: Int64s  # unrolled: grows by one a sample, a lost one leaves a gap
+    missing: Int64s  # samples that were lost right before
+    duplicate: Bools  # the same sample once more
+    late: Bools  # it was passed over before, and counted as lost
+    reset: Bools  # it began to count anew, or jumped beyond what time allows; ``missing`` is by the clock, or 0
 
 
 NAMES = tuple(field.name for field in fields(Counted))
@@ -49,7 +46,7 @@ class Counting:
         """
         self._doubted = self._last is not None
 
-    def feed(self, raw: Integers, t_ns: Integers) -> Counted:
+    def feed(self, raw: Int64s, t_ns: Times) -> Counted:
         """Return what counters (sample,) as sent state, with the arrival of each.
 
         Where the samples come further apart than half the counter's range lasts, the arrival states how often it went round.
@@ -72,9 +69,9 @@ class Counting:
             return Counted(seq, np.zeros(len(raw), dtype=np.int64), nothing, nothing, nothing)
         return self._slowly(raw, t_ns, last_raw, last_seq, last_ns, first=first)
 
-    def _signed(self, delta: Integers) -> Integers:
+    def _signed(self, delta: Int64s) -> Int64s:
         half = self.modulus // 2
-        signed: Integers = (delta + half) % self.modulus - half
+        signed: Int64s = (delta + half) % self.modulus - half
         return signed
 
     def _again(self, raw: int, at_ns: int, last_raw: int, last_seq: int, last_ns: int) -> Counted:
@@ -104,9 +101,7 @@ class Counting:
         steps, off = divmod((raw - self._before + half) % self.modulus - half, self.step)
         return steps if not off and 0 < steps <= RESET_SLACK else 0
 
-    def _slowly(
-        self, raw: Integers, t_ns: Integers, last_raw: int, last_seq: int, last_ns: int, *, first: bool
-    ) -> Counted:
+    def _slowly(self, raw: Int64s, t_ns: Times, last_raw: int, last_seq: int, last_ns: int, *, first: bool) -> Counted:
         seq, missing = np.zeros(len(raw), dtype=np.int64), np.zeros(len(raw), dtype=np.int64)
         duplicate, late, reset = (np.zeros(len(raw), dtype=bool) for _ in range(3))
         half = self.modulus // 2

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from tacpipe.arrays import Bytes
 from tacpipe.sensors import options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Line, Samples, Sensor
 
 if TYPE_CHECKING:

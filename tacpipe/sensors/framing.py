@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
-Times = NDArray[np.int64]
+from tacpipe.arrays import Bools, Bytes, Int64s, Ints, Times
 
 START = "start"  # bytes before the first frame: recording began in the middle of one
 NOISE = "noise"  # bytes between whole frames
@@ -30,7 +28,7 @@ class Chunks:
     """What a link gave: the bytes as they came, and when. For links of packets each chunk is one."""
 
     t_ns: Times  # (chunk,), arrival
-    size: NDArray[np.int64]  # (chunk,), bytes
+    size: Int64s  # (chunk,), bytes
     data: bytes
 
     @classmethod
@@ -111,9 +109,9 @@ class Framing:
     tail: bytes = b""  # that each ends with
     size: int | None = None  # of the whole frame in bytes, where all have the same
     header: int = 0  # bytes from which ``sizes`` states the size, the marker included
-    sizes: Callable[[Bytes], NDArray[np.integer[Any]]] | None = None  # (frame, header) to (frame,), whole sizes
+    sizes: Callable[[Bytes], Ints] | None = None  # (frame, header) to (frame,), whole sizes
     most: int = 4096  # largest size; a frame that states more of itself is none
-    check: Callable[[Bytes], NDArray[np.bool_]] | None = None  # (frame, byte) to (frame,)
+    check: Callable[[Bytes], Bools] | None = None  # (frame, byte) to (frame,)
     lock: int = 2  # good frames in a row that it takes to lock
     confirm: int = 0  # good frames that must follow one before it is given out
     weak: bool = (

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Float32s
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.sensors.framing import Bytes, Framer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 from tacpipe.signals import rotations
@@ -202,9 +203,9 @@ def whole(data: bytes) -> int:
     return size if len(data) >= size else 0
 
 
-def _matrices(states: NDArray[np.void]) -> NDArray[np.float32]:
+def _matrices(states: NDArray[np.void]) -> Float32s:
     """Return the pose of the end effector in the base's frame as matrices (frame, 4, 4)."""
-    poses: NDArray[np.float32] = states["O_T_EE"].reshape(-1, 4, 4).transpose(0, 2, 1)
+    poses: Float32s = states["O_T_EE"].reshape(-1, 4, 4).transpose(0, 2, 1)
     return poses
 
 
@@ -214,7 +215,7 @@ def _packed(flags: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return packed
 
 
-def _is_state(frames: Bytes) -> NDArray[np.bool_]:
+def _is_state(frames: Bytes) -> Bools:
     states = np.ascontiguousarray(frames).view(STATE)[:, 0]
     good = np.ones(len(states), dtype=bool)
     for name in READ:

@@ -22,12 +22,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Bytes, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.layout import Clock, Length, Number, Order, Place, Sequence, Sum
 from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
@@ -175,13 +175,13 @@ class Generic(Sensor):
         header = max(self._places[self.length.number].stop, len(marker) + 1)
         return ByteFramer(replace(framing, header=header, sizes=self._sizes))
 
-    def _sizes(self, heads: Bytes) -> NDArray[np.int64]:
+    def _sizes(self, heads: Bytes) -> Int64s:
         assert self.length is not None
         declared = self._places[self.length.number].take(heads)[:, 0]
-        sizes: NDArray[np.int64] = np.minimum(declared.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
+        sizes: Int64s = np.minimum(declared.astype(np.uint64), MOST + 1).astype(np.int64) + self.length.plus
         return sizes
 
-    def _is_right(self, frames: Bytes) -> NDArray[np.bool_]:
+    def _is_right(self, frames: Bytes) -> Bools:
         """Return which frames (frame, byte) of one size have their sum, and what is always the same.
 
         In a frame of another size than a sample's the sum is as far from the end, and nothing else is known.
@@ -201,7 +201,7 @@ class Generic(Sensor):
             good &= layout.SUMS[self.sum.kind][0](frames[:, span.start : stop]) == moved.take(frames)[:, 0]
         return good
 
-    def _has_marks(self, packets: Bytes) -> NDArray[np.bool_]:
+    def _has_marks(self, packets: Bytes) -> Bools:
         """Return which packets (packet, byte) have marker and tail, and are right otherwise."""
         good = self._is_right(packets)
         marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
@@ -265,7 +265,7 @@ class Generic(Sensor):
             self._put(self.sequence.number, frames, samples.seq % self.counter_modulus)
         if self.clock is not None and samples.t_device_ns is not None:
             place, unit_ns = self._places[self.clock.number], layout.UNITS_NS[self.clock.unit]
-            ticks: NDArray[Any] = samples.t_device_ns / unit_ns
+            ticks: AnyArray = samples.t_device_ns / unit_ns
             if place.kind.kind != "f":
                 ticks = (samples.t_device_ns + unit_ns // 2) // unit_ns
                 ticks = ticks % place.range if place.kind.kind == "u" and place.width < 8 else ticks
@@ -275,7 +275,7 @@ class Generic(Sensor):
             self._put(self.sum.number, frames, layout.SUMS[self.sum.kind][0](frames[:, span]))
         return frames
 
-    def _put(self, name: str, frames: Bytes, numbers: NDArray[Any]) -> None:
+    def _put(self, name: str, frames: Bytes, numbers: AnyArray) -> None:
         place = self._places[name]
         place.put(frames, numbers[:, None].astype(place.kind))
 

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from tacpipe.arrays import Bytes
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Bytes, Framer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.scans import CAN, DATA, HEAD, TAIL, ScanFramer, can_frame
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Float32s, Indices
 from tacpipe.errors import UsageError
 from tacpipe.sensors import options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Line, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class JustFloat(Sensor):
         return FULAI.get(self.model, self.channels or len(self.names))
 
     @functools.cached_property
-    def kept(self) -> NDArray[np.intp]:
+    def kept(self) -> Indices:
         """Which floats of a frame are channels (channel,)."""
         return np.setdiff1d(np.arange(self.floats), RESERVED.get(self.model, ()))
 
@@ -139,12 +139,10 @@ class _Bridge(Device):
         return replies
 
 
-def _floats(frames: Bytes) -> NDArray[np.float32]:
-    floats: NDArray[np.float32] = (
-        np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
-    )
+def _floats(frames: Bytes) -> Float32s:
+    floats: Float32s = np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
     return floats
 
 
-def _is_finite(frames: Bytes) -> NDArray[np.bool_]:
+def _is_finite(frames: Bytes) -> Bools:
     return np.asarray(np.isfinite(_floats(frames)).all(axis=1))

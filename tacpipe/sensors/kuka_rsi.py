@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, ClassVar
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Indices
 from tacpipe.errors import UsageError
 from tacpipe.sensors import number_texts
 from tacpipe.sensors.framing import Framer
@@ -29,7 +29,6 @@ from tacpipe.signals import rotations
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Floats = NDArray[np.float64]
 
 CYCLES_MS = (4, 12)  # of the controller
 FRAME, AXES = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{axis}" for axis in range(1, 7))
@@ -164,7 +163,7 @@ def _table(outputs: tuple[str, ...], packets: tuple[bytes, ...]) -> Floats | Non
 
 
 @functools.lru_cache(maxsize=BATCHES_AT_HAND)
-def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Pattern, NDArray[np.intp]] | None:
+def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Pattern, Indices] | None:
     """Return the pattern of a text in which each number represents itself, and which ones are IPOC and the outputs."""
     pattern, content = number_texts.pattern(text), _numbers(outputs, text)
     if pattern is None or content is None:

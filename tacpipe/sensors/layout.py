@@ -11,16 +11,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bytes
 from tacpipe.errors import UsageError
 from tacpipe.sensors import checks
-from tacpipe.sensors.framing import Bytes
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 Type = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f32", "f64"]
 Order = Literal["little", "big"]
-SUMS: dict[str, tuple[Callable[[Bytes], NDArray[Any]], int]] = {  # kind to function, and size in bytes
+SUMS: dict[str, tuple[Callable[[Bytes], AnyArray], int]] = {  # kind to function, and size in bytes
     "sum8": (checks.sum8, 1),
     "lrc": (checks.lrc, 1),
     "xor8": (checks.xor8, 1),
@@ -117,7 +116,7 @@ class Place:
         """How many values it can have."""
         return 1 << 8 * self.width
 
-    def take(self, frames: Bytes) -> NDArray[Any]:
+    def take(self, frames: Bytes) -> AnyArray:
         """Return the numbers (frame, number) of frames (frame, byte)."""
         data = np.ascontiguousarray(frames[:, self.at : self.stop])
         if self.width != 3:
@@ -129,7 +128,7 @@ class Place:
         wide[:, :, 1:] = triples if self.order == "little" else triples[:, :, ::-1]
         return wide.view(self.kind.newbyteorder("<"))[:, :, 0].astype(self.kind) >> 8
 
-    def put(self, frames: Bytes, numbers: NDArray[Any]) -> None:
+    def put(self, frames: Bytes, numbers: AnyArray) -> None:
         """Write numbers (frame, number) into frames (frame, byte)."""
         if self.width != 3:
             data = np.ascontiguousarray(numbers.astype(self.kind.newbyteorder(_sign(self.order)))).view(np.uint8)

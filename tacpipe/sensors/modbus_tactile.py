@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import DeviceError
 from tacpipe.sensors import options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_modbus
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -200,6 +200,6 @@ def _reply(address: int, function: int, size: int) -> Callable[[bytes], int | tu
     return until
 
 
-def _crc_is_right(frames: Bytes) -> NDArray[np.bool_]:
-    right: NDArray[np.bool_] = crc16_modbus(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+def _crc_is_right(frames: Bytes) -> Bools:
+    right: Bools = crc16_modbus(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
     return right

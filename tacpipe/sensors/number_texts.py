@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import AnyArray, Floats, Int64s
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Floats = NDArray[np.float64]
-Places = NDArray[np.int64]
 
 SPACES = b" \t\r\n"
 NEWLINE = 0x0A
@@ -51,7 +50,7 @@ class Pattern:
     """An XML text but for its numbers."""
 
     marks: int  # quotes and angle brackets in it
-    before: Places  # (number,), which of these each follows; the next one ends it
+    before: Int64s  # (number,), which of these each follows; the next one ends it
     rest: bytes  # the text without its numbers, and what parts it from the next
 
     def written(self, texts: Sequence[bytes]) -> pa.Array | None:
@@ -93,12 +92,12 @@ def pattern(text: bytes) -> Pattern | None:
     return Pattern(len(marks), np.searchsorted(marks, starts) - 1, NUMBERS.sub(b"", text) + APART)
 
 
-def _marks(text: bytes) -> Places:
+def _marks(text: bytes) -> Int64s:
     data = np.frombuffer(text, np.uint8)
     return np.flatnonzero((data == ord('"')) | (data == ord("<")) | (data == ord(">")))
 
 
-def _texts(text: bytes, edges: Places) -> pa.Array | None:
+def _texts(text: bytes, edges: Int64s) -> pa.Array | None:
     """Return the pieces of a text between ``edges``; None where it is too long to state them."""
     import pyarrow as pa
 
@@ -120,12 +119,12 @@ def floats(texts: pa.Array) -> Floats | None:
     return _cast(texts, np.dtype(np.float64))
 
 
-def wholes(texts: pa.Array) -> NDArray[np.int64] | None:
+def wholes(texts: pa.Array) -> Int64s | None:
     """Return the whole numbers (text,) of texts; None where one is none."""
     return _cast(texts, np.dtype(np.int64))
 
 
-def _cast(texts: pa.Array, kind: np.dtype[Any]) -> NDArray[Any] | None:
+def _cast(texts: pa.Array, kind: np.dtype[Any]) -> AnyArray | None:
     """Return the numbers (text,) in the buffer that holds them: pyarrow would import pandas to make an array of them."""
     import pyarrow as pa
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -136,6 +136,6 @@ def with_sum(body: bytes) -> bytes:
     return body + (sum(body) & 0xFFFF).to_bytes(2, "big")
 
 
-def _sum_is_right(frames: Bytes) -> NDArray[np.bool_]:
-    right: NDArray[np.bool_] = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view(">u2")[:, 0]
+def _sum_is_right(frames: Bytes) -> Bools:
+    right: Bools = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view(">u2")[:, 0]
     return right

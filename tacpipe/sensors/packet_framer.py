@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacpipe.sensors.framing import MALFORMED, Account, Bytes, Chunks, Loss, Run
+from tacpipe.arrays import Bools, Bytes
+from tacpipe.sensors.framing import MALFORMED, Account, Chunks, Loss, Run
 
 
 class PacketFramer:
     """Takes each packet of a link for a frame: those of a known size whose check is right."""
 
-    def __init__(self, sizes: Sequence[int], check: Callable[[Bytes], NDArray[np.bool_]] | None = None) -> None:
+    def __init__(self, sizes: Sequence[int], check: Callable[[Bytes], Bools] | None = None) -> None:
         self.sizes, self.check = frozenset(sizes), check
         self.account = Account()
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Indices
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import lrc
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.paxini_board import (
     ACTIVE,
     CALIBRATE_FUNCTION,
@@ -199,7 +199,7 @@ class Paxini(Sensor):
         return sum(6 * resultant + 3 * count * distributed for count in self.points.values())
 
     @functools.cached_property
-    def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _places(self) -> tuple[Indices, Indices]:
         """Where in a frame the numbers along x and y are, and those along z, in the order of the fields."""
         signed, unsigned, place = [], [], PUSH_HEADER
         for count in self.points.values():
@@ -294,6 +294,6 @@ def _text(data: bytes) -> str:
     return data.decode("ascii", "replace").strip("\x00 ") or "of unknown version"
 
 
-def _sum_is_right(frames: Bytes) -> NDArray[np.bool_]:
-    right: NDArray[np.bool_] = frames.sum(axis=1, dtype=np.uint8) == 0
+def _sum_is_right(frames: Bytes) -> Bools:
+    right: Bools = frames.sum(axis=1, dtype=np.uint8) == 0
     return right

@@ -6,7 +6,8 @@ from bisect import bisect_right
 
 import numpy as np
 
-from tacpipe.sensors.framing import Chunks, Times
+from tacpipe.arrays import Times
+from tacpipe.sensors.framing import Chunks
 
 
 class Pending:

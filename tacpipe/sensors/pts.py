@@ -24,10 +24,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Int64s
 from tacpipe.sensors.checks import sum16
-from tacpipe.sensors.framing import Bytes
 
 MARKER, TAIL = b"\x55\x66\x77\x88", b"\xaa\xbb\xcc\xdd"
 HUB, PILLARS, SENSORS, PILLAR_SLIP, SENSOR_SLIP = 1, 3, 4, 5, 6
@@ -36,7 +35,6 @@ SIZES = {HUB: 12, PILLARS: 24, SENSORS: 24, PILLAR_SLIP: 5, SENSOR_SLIP: 9}  # b
 NESTED = (PILLARS, PILLAR_SLIP)  # blocks with a table of pillars in each sensor
 WIDTH = 2  # of the offsets that `template` writes
 KEPT = 8  # layouts of one size that are remembered
-Places = NDArray[np.int64]
 
 
 class _NoLayoutError(ValueError):
@@ -48,7 +46,7 @@ class Layout:
     """Where the values of a frame stand, counted from its first byte, and the bytes that state it."""
 
     entries: dict[int, tuple[tuple[int, ...], ...]]  # block to the places of values: by sensor, and by pillar in it
-    fixed: Places  # (byte,), places of all bytes that are not values
+    fixed: Int64s  # (byte,), places of all bytes that are not values
     expected: Bytes  # (byte,), what stands there
 
     @property
@@ -61,17 +59,17 @@ class Layout:
         """Whether the frame has both blocks of slip."""
         return PILLAR_SLIP in self.entries and SENSOR_SLIP in self.entries
 
-    def places(self, block: int) -> Places:
+    def places(self, block: int) -> Int64s:
         """Return where the values of each entry of a block begin (entry,), sensor by sensor."""
         return np.array([place for sensor in self.entries[block] for place in sensor], dtype=np.int64)
 
-    def fits(self, frames: Bytes) -> NDArray[np.bool_]:
+    def fits(self, frames: Bytes) -> Bools:
         """Return which of ``frames`` (frame, byte) have this layout."""
-        same: NDArray[np.bool_] = (frames[:, self.fixed] == self.expected).all(axis=1)
+        same: Bools = (frames[:, self.fixed] == self.expected).all(axis=1)
         return same
 
 
-def layouts(frames: Bytes) -> Iterator[tuple[Places, Layout | None]]:
+def layouts(frames: Bytes) -> Iterator[tuple[Int64s, Layout | None]]:
     """Yield for each layout among ``frames`` (frame, byte) the rows that have it; None for rows whose tables are wrong.
 
     Tables are read once for each layout: frames are compared with those that are known of their size.
@@ -108,13 +106,13 @@ def _known(size: int) -> list[Layout]:
     return []
 
 
-def are_whole(frames: Bytes) -> NDArray[np.bool_]:
+def are_whole(frames: Bytes) -> Bools:
     """Return which of ``frames`` (frame, byte) have the right sum and tables that hold (frame,)."""
     start, stop = len(MARKER), len(TAIL)
     if frames.shape[1] < start + stop + 3:
         return np.zeros(len(frames), dtype=bool)
     body = frames[:, start:-stop]
-    whole: NDArray[np.bool_] = sum16(body[:, :-2]) == np.ascontiguousarray(body[:, -2:]).view("<u2")[:, 0]
+    whole: Bools = sum16(body[:, :-2]) == np.ascontiguousarray(body[:, -2:]).view("<u2")[:, 0]
     rows = np.flatnonzero(whole)
     if len(rows):
         for found, layout in layouts(frames if len(rows) == len(frames) else frames[rows]):

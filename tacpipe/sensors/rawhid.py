@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import Bytes, Framer
+from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Samples, Sensor
 
@@ -76,7 +76,7 @@ class RawHid(Sensor):
         return reports
 
 
-def _is_report(frames: Bytes) -> NDArray[np.bool_]:
+def _is_report(frames: Bytes) -> Bools:
     marked = (frames[:, :2] == np.frombuffer(MARKER, np.uint8)).all(axis=1)
-    zero: NDArray[np.bool_] = marked & ~frames[:, BEHIND:-2].any(axis=1)
+    zero: Bools = marked & ~frames[:, BEHIND:-2].any(axis=1)
     return zero

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Bytes, Indices, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -45,13 +45,13 @@ SIGNED = ("dynamic", "acceleration", "angular_velocity", "magnetic_field", "temp
 KNOWN = np.isin(np.arange(256), (*DATA, VERSION))  # which commands a packet from the device may have
 Key = tuple[int, int]  # kind and finger of a field
 Layout = tuple[tuple[Key, int], ...]  # the fields of a frame, with the place of the first number of each
-Columns = tuple[NDArray[np.intp], ...]  # the bytes of a frame that are the numbers of each block
+Columns = tuple[Indices, ...]  # the bytes of a frame that are the numbers of each block
 
 
 class Structure(NamedTuple):
     """What frames of one size must have in common to have the same fields."""
 
-    places: NDArray[np.intp]  # of the command and of the kinds
+    places: Indices  # of the command and of the kinds
     values: Bytes  # in these places
     layout: Layout | None  # None: such frames are not made of known fields
 
@@ -172,20 +172,20 @@ class Robotiq(Sensor):
                 groups[kind] = keys
         return groups
 
-    def _blocks(self, frames: Bytes, columns: Columns) -> list[NDArray[Any]]:
+    def _blocks(self, frames: Bytes, columns: Columns) -> list[AnyArray]:
         """Return the blocks (frame, channel) of frames whose numbers stand in these columns, one a type."""
         return [
             frames.take(places, axis=1).view(kind).astype(kind.newbyteorder("="))
             for kind, places in zip(self._groups, columns, strict=True)
         ]
 
-    def _empty(self) -> list[NDArray[Any]]:
+    def _empty(self) -> list[AnyArray]:
         """Return blocks of no sample."""
         widths = [sum(KINDS[PARTS[code]][2] for code, _ in keys) for keys in self._groups.values()]
         kinds = [kind.newbyteorder("=") for kind in self._groups]
         return [np.zeros((0, width), dtype=kind) for width, kind in zip(widths, kinds, strict=True)]
 
-    def _device_ns(self, values: tuple[NDArray[Any], ...]) -> NDArray[np.int64] | None:
+    def _device_ns(self, values: tuple[AnyArray, ...]) -> Int64s | None:
         if not self.tick_us or "timestamp" not in self.parts:
             return None
         return np.rint(values[-1][:, 0] * (self.tick_us * 1e3)).astype(np.int64)
@@ -255,9 +255,9 @@ def _fields(part: str, finger: int) -> list[pa.Field]:
     return [pa.field(f"{prefix}{part}_{axis}", pa.int16(), metadata={**metadata, "component": axis}) for axis in "xyz"]
 
 
-def _sizes(heads: Bytes) -> NDArray[np.int64]:
+def _sizes(heads: Bytes) -> Int64s:
     """Return the whole size of frames from their headers (frame, 4); 0 for a command that no packet has."""
-    sizes: NDArray[np.int64] = KNOWN.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
+    sizes: Int64s = KNOWN.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
     return sizes
 
 
@@ -276,7 +276,7 @@ def _structure(frame: bytes) -> Structure:
     return Structure(np.array(seen), values, tuple(found.items()) if whole else None)
 
 
-def _alike(frames: Bytes, rows: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.intp], Layout | None]]:
+def _alike(frames: Bytes, rows: Indices) -> Iterator[tuple[Indices, Layout | None]]:
     """Yield those ``rows`` of frames of one size that have the same fields, and their layout."""
     size = frames.shape[1]
     while len(rows):
@@ -293,7 +293,7 @@ def _alike(frames: Bytes, rows: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.i
         rows = rows[~like]
 
 
-def _is_packet(frames: Bytes) -> NDArray[np.bool_]:
+def _is_packet(frames: Bytes) -> Bools:
     """Return which frames (frame, byte) of one size, which their headers state, are made of known fields, or a version."""
     good = frames[:, 2] == VERSION
     for rows, layout in _alike(frames, np.flatnonzero(~good)):

@@ -7,9 +7,9 @@ and without a pause: where one is missing, doubled, or comes after a pause in wh
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacpipe.sensors.framing import MALFORMED, START, Account, Bytes, Chunks, Loss, Run, Times
+from tacpipe.arrays import Bools, Bytes, Int64s, Times
+from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Loss, Run
 
 TORN = "torn"  # a scan of which CAN frames are missing
 CAN = 13  # bytes of a CAN frame as a link gives it: identifier, length, 8 of data
@@ -73,7 +73,7 @@ class ScanFramer:
         self.account.framed += int((~ours).sum()) * CAN
         return frames[ours], t_ns[ours], losses
 
-    def _places(self, frames: Bytes) -> NDArray[np.int64]:
+    def _places(self, frames: Bytes) -> Int64s:
         """Return the place of each CAN frame in a scan (frame,), -1 where it is none of a scan."""
         tail = frames[:, DATA] == TAIL
         whole = np.where(tail, np.isin(frames[:, 4], TAIL_LENGTHS), frames[:, 4] == 8)
@@ -81,7 +81,7 @@ class ScanFramer:
         places = 2 * np.searchsorted(self._identifiers, _identifier(frames)) + tail
         return np.where(good, places, -1)
 
-    def _scans(self, places: NDArray[np.int64], t_ns: Times) -> tuple[NDArray[np.int64], int | None]:
+    def _scans(self, places: Int64s, t_ns: Times) -> tuple[Int64s, int | None]:
         """Return where whole scans begin, and where one begins that may become whole, if there is one."""
         starts = np.flatnonzero(places == 0)
         if not len(starts):
@@ -93,7 +93,7 @@ class ScanFramer:
         open_at = int(starts[-1]) if starts[-1] + length[-1] == len(places) and length[-1] < self.size else None
         return starts[length >= self.size], open_at
 
-    def _torn(self, left: NDArray[np.bool_], places: NDArray[np.int64], t_ns: Times, first: int) -> list[Loss]:
+    def _torn(self, left: Bools, places: Int64s, t_ns: Times, first: int) -> list[Loss]:
         """Return a loss for each stretch of CAN frames that belong to no whole scan, and count the scans they are of.
 
         Those before ``first`` are what was left of a scan when recording began.
@@ -130,5 +130,5 @@ def can_frame(identifier: int, data: bytes) -> bytes:
     return identifier.to_bytes(4, "little") + bytes([len(data)]) + data.ljust(8, b"\0")
 
 
-def _identifier(frames: Bytes) -> NDArray[np.int64]:
+def _identifier(frames: Bytes) -> Int64s:
     return np.ascontiguousarray(frames[:, :4]).view("<u4")[:, 0].astype(np.int64)

@@ -10,9 +10,7 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tacpipe.arrays import AnyArray, Int64s, Times
 from tacpipe.sensors.framing import Framer
 
 if TYPE_CHECKING:
@@ -25,13 +23,11 @@ Frames = Any  # NDArray[np.uint8] (frame, byte) of frames of one size, or list[b
 class Samples:
     """What frames state. ``values`` are blocks (sample, channel), side by side in the order of the sensor's fields."""
 
-    values: tuple[NDArray[Any], ...]
-    seq: NDArray[np.int64] | None = (
-        None  # (sample,), the counter as the frame holds it; `Sensor.counter` is its modulus
-    )
-    t_device_ns: NDArray[np.int64] | None = None  # (sample,), when the device states that the sample was taken
-    device_seq: NDArray[np.int64] | None = None  # (sample,), a second counter, of samples taken rather than sent
-    rows: NDArray[np.int64] | None = None  # (sample,), the frame that each is of; None: one a frame, in order
+    values: tuple[AnyArray, ...]
+    seq: Int64s | None = None  # (sample,), the counter as the frame holds it; `Sensor.counter` is its modulus
+    t_device_ns: Times | None = None  # (sample,), when the device states that the sample was taken
+    device_seq: Int64s | None = None  # (sample,), a second counter, of samples taken rather than sent
+    rows: Int64s | None = None  # (sample,), the frame that each is of; None: one a frame, in order
 
     def __len__(self) -> int:
         return len(self.values[0]) if self.values else 0

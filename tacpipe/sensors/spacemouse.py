@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.channels.schema import AXES
 from tacpipe.errors import UsageError
-from tacpipe.sensors.framing import MALFORMED, Account, Bytes, Chunks, Framer, Loss, Run
+from tacpipe.sensors.framing import MALFORMED, Account, Chunks, Framer, Loss, Run
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def merged(reports: Sequence[bytes], state: Bytes) -> Bytes:
     return frames[1:]
 
 
-def _carry(frames: Bytes, place: slice, reported: NDArray[np.bool_], sent: Bytes) -> None:
+def _carry(frames: Bytes, place: slice, reported: Bools, sent: Bytes) -> None:
     """Write a part of the state into ``frames``, whose first row is that before: where it was given, and on from there."""
     frames[1:, place][reported] = sent[reported]
     last = np.maximum.accumulate(np.where(reported, np.arange(1, len(reported) + 1), 0))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Int64s
 from tacpipe.sensors.framing import Account, Chunks, Framer, Loss, Run
 
 STALE = "stale"  # a frame that the device kept from its last session
 SETTLE_NS = 500_000_000  # from the first frame on in which the jump is awaited: a kept queue comes at once
-Counters = Callable[[NDArray[np.uint8]], NDArray[np.int64]]
+Counters = Callable[[Bytes], Int64s]
 
 
 class FreshFramer:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.sensors.framing import Framer
@@ -86,7 +86,7 @@ class Tap(Sensor):
         found = [one for one in found if not self.grasp or "grasp" in one[2]]
         records = [record for _, _, record in found]
         if self.grasp:
-            values: tuple[NDArray[Any], ...] = (self._grasps(records),)
+            values: tuple[AnyArray, ...] = (self._grasps(records),)
         else:
             texts = [[str(record.get("event", "")), line.decode()] for _, line, record in found]
             values = (np.array(texts, dtype=object).reshape(len(found), 2), self._numbers(records))
@@ -142,7 +142,7 @@ class Tap(Sensor):
         found = [_at(record, _path(entry)) for entry in self.numbers]
         return all(value is None or isinstance(value, float) or _is_whole(value) for value in found)
 
-    def _numbers(self, records: Sequence[Record]) -> NDArray[np.float64]:
+    def _numbers(self, records: Sequence[Record]) -> Floats:
         """Return the numbers (sample, channel) of records, NaN where there is none."""
         found = np.full((len(records), len(self.numbers)), np.nan)
         for column, entry in enumerate(self.numbers):
@@ -153,7 +153,7 @@ class Tap(Sensor):
                     found[row, column] = value
         return found
 
-    def _grasps(self, records: Sequence[Record]) -> NDArray[np.float64]:
+    def _grasps(self, records: Sequence[Record]) -> Floats:
         """Return points and wrist (sample, channel) of records, in the order of the columns."""
         rows = [[*grasp["g1"], *grasp["g2"]] for grasp in (record["grasp"] for record in records)]
         points = np.array(rows, dtype=np.float64).reshape(len(records), len(POINTS))

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc8
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -105,6 +105,6 @@ class _Evo(Device):
         return []
 
 
-def _crc_is_right(frames: Bytes) -> NDArray[np.bool_]:
-    right: NDArray[np.bool_] = crc8(frames[:, :-1]) == frames[:, -1]
+def _crc_is_right(frames: Bytes) -> Bools:
+    right: Bools = crc8(frames[:, :-1]) == frames[:, -1]
     return right

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools
 from tacpipe.sensors.framing import CUT, GARBLED, MALFORMED, START, Account, Chunks, Loss, Run
 from tacpipe.sensors.pending import Pending
 
@@ -95,7 +95,7 @@ class LineFramer:
         return [Loss(last_ns, CUT if self._begun else START, int(self._begun), count)]
 
 
-def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> NDArray[np.bool_]:
+def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> Bools:
     """Return which texts are frames (text,)."""
     if every is None or len(texts) < FEW:
         return np.fromiter(map(check, texts), bool, len(texts))
@@ -105,5 +105,5 @@ def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> NDA
     return np.concatenate([_good(texts[:half], check, every), _good(texts[half:], check, every)])
 
 
-def _kept(texts: list[bytes], good: NDArray[np.bool_]) -> list[bytes]:
+def _kept(texts: list[bytes], good: Bools) -> list[bytes]:
     return texts if good.all() else [text for text, fine in zip(texts, good.tolist(), strict=True) if fine]

@@ -26,12 +26,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum8
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -191,6 +191,6 @@ def _reply(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, in
     return until
 
 
-def _sum_is_right(frames: Bytes) -> NDArray[np.bool_]:
-    right: NDArray[np.bool_] = sum8(frames[:, :-1]) == frames[:, -1]
+def _sum_is_right(frames: Bytes) -> Bools:
+    right: Bools = sum8(frames[:, :-1]) == frames[:, -1]
     return right

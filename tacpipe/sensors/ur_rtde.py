@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Bytes, Ints
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 from tacpipe.sensors.ur_outputs import POSE, WIRE, fields_of, type_of
 from tacpipe.signals import rotations
@@ -81,7 +81,7 @@ class UrRtde(Sensor):
         """
         size = self.package.itemsize
 
-        def check(frames: Bytes) -> NDArray[np.bool_]:
+        def check(frames: Bytes) -> Bools:
             kinds = frames[:, 2]
             data = (kinds == DATA) & (frames.shape[1] == size)
             if data.any():
@@ -218,18 +218,18 @@ def _ask(kind: int, payload: bytes) -> Ask:
     return Ask(packed(kind, payload), until, what=f"the controller's reply to RTDE package {chr(kind)}")
 
 
-def _sizes(heads: Bytes) -> NDArray[np.integer[Any]]:
+def _sizes(heads: Bytes) -> Ints:
     return heads[:, 0].astype(np.int64) * 256 + heads[:, 1]
 
 
-def _native(values: NDArray[Any], name: str) -> NDArray[Any]:
+def _native(values: AnyArray, name: str) -> AnyArray:
     """Return an output's values (sample, channel) in this machine's order of bytes, a pose with its quaternion."""
     block = values[:, None] if values.ndim == 1 else values
     block = block.astype(bool if type_of(name) == "BOOL" else block.dtype.newbyteorder("="))
     return np.hstack([block[:, :3], rotations.quaternions_of_vectors(block[:, 3:])]) if name == POSE else block
 
 
-def _are_numbers(packages: NDArray[Any]) -> NDArray[np.bool_]:
+def _are_numbers(packages: AnyArray) -> Bools:
     """Return in which packages (package,) all floats are of a size that a robot's state may have."""
     good = np.ones(len(packages), dtype=bool)
     for name in packages.dtype.names or ():

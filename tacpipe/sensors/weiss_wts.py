@@ -20,13 +20,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes, Counts, Int64s
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import taxels
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
-from tacpipe.sensors.framing import Bytes, Framer, Framing
+from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
 
 if TYPE_CHECKING:
@@ -85,21 +85,21 @@ class WeissWts(Sensor):
         most = max(CELLS_AT + 2 * self.cells + 2, 256)
         return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, most=most, check=self._is_whole))
 
-    def _is_whole(self, frames: Bytes) -> NDArray[np.bool_]:
-        whole: NDArray[np.bool_] = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+    def _is_whole(self, frames: Bytes) -> Bools:
+        whole: Bools = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
         rows = np.flatnonzero(whole & (frames[:, 3] == FRAME))
         if len(rows):
             whole[rows] = self._cell_counts(frames[rows]) == self.cells
         return whole
 
-    def _cell_counts(self, frames: Bytes) -> NDArray[np.int64]:
+    def _cell_counts(self, frames: Bytes) -> Int64s:
         """Return how many cells each frame has; -1 where it is too short for any."""
         size = frames.shape[1] - CELLS_AT - 2
         if size < 2 or size % 2:
             return np.full(len(frames), -1)
         words = _words(frames)
         runs = (words >> 12).sum(axis=1, dtype=np.int64)
-        cells: NDArray[np.int64] = np.where(frames[:, HEADER + 4] & RUN_LENGTH, runs, words.shape[1])
+        cells: Int64s = np.where(frames[:, HEADER + 4] & RUN_LENGTH, runs, words.shape[1])
         return cells
 
     def decode(self, frames: Bytes) -> Samples:
@@ -215,7 +215,7 @@ def messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
         start = data.find(MARKER, start + 1)
 
 
-def run_lengths(cells: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def run_lengths(cells: Counts) -> Counts:
     """Return cells (cell,) as words of run lengths: no run is longer than 15.
 
     >>> [hex(word) for word in run_lengths(np.array([0] * 17 + [7], dtype=np.uint16))]
@@ -246,10 +246,10 @@ def _reply(number: int, *, refusable: bool = False) -> Callable[[bytes], int | t
     return until
 
 
-def _words(frames: Bytes) -> NDArray[np.uint16]:
-    words: NDArray[np.uint16] = np.ascontiguousarray(frames[:, CELLS_AT:-2]).view("<u2")
+def _words(frames: Bytes) -> Counts:
+    words: Counts = np.ascontiguousarray(frames[:, CELLS_AT:-2]).view("<u2")
     return words
 
 
-def _sizes(head: Bytes) -> NDArray[np.int64]:
+def _sizes(head: Bytes) -> Int64s:
     return np.ascontiguousarray(head[:, 4:6]).view("<u2")[:, 0].astype(np.int64) + HEADER + 2

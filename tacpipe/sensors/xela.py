@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Counts
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -88,7 +88,7 @@ class Xela(Sensor):
         key = str(self.sensor)
         rows = [row for row, text in enumerate(texts) if key in text]
         readings = [texts[row][key] for row in rows]
-        values: tuple[NDArray[Any], ...] = (_counts([reading["data"] for reading in readings], 3 * self.taxels),)
+        values: tuple[AnyArray, ...] = (_counts([reading["data"] for reading in readings], 3 * self.taxels),)
         if self.forces:
             unknown = [math.nan] * (3 * self.taxels)
             forces = [reading.get("calibrated") or unknown for reading in readings]
@@ -165,7 +165,7 @@ def _of_digits(data: str) -> bytes:
     return binascii.unhexlify(data.encode().translate(None, b","))
 
 
-def _counts(texts: Sequence[str], width: int) -> NDArray[np.uint16]:
+def _counts(texts: Sequence[str], width: int) -> Counts:
     """Return the counts (sample, channel) of lists of hexadecimal numbers; at once where all have four digits."""
     joined = ",".join(texts)
     if len(joined) == len(texts) * width * (DIGITS + 1) - 1:  # as long as it can be

@@ -24,17 +24,12 @@ Persistence forecasts no change, hence never alarms.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Indices
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.runs import latched, runs
-
-Floats = NDArray[np.floating[Any]]
-Flags = NDArray[np.bool_]
-Rows = NDArray[np.intp]
 
 ON_SD, OFF_SD = 3.0, 1.5  # of the differences, between which a change begins and ends
 ONSET_FRACTION = 0.05  # of a change, up to which it has not begun
@@ -53,7 +48,7 @@ class Anticipation:
     false_alarms_per_minute: float  # and feature, in rows free of events
 
 
-def difference_sd(truth: Floats, groups: NDArray[Any], *, horizon: int) -> Floats:
+def difference_sd(truth: AnyFloats, groups: AnyArray, *, horizon: int) -> AnyFloats:
     """Return the standard deviation of z_t - z_{t-k} of each feature (feature,), over the rows that have one; else 0."""
     _check(truth, horizon, groups=groups)
     moved = _moved(truth.astype(np.float64), _stretches(groups), horizon)
@@ -61,11 +56,11 @@ def difference_sd(truth: Floats, groups: NDArray[Any], *, horizon: int) -> Float
     count = np.maximum(known.sum(axis=0), 1)
     moved = np.where(known, moved, 0)
     mean = moved.sum(axis=0) / count
-    found: Floats = np.sqrt(np.square(np.where(known, moved - mean, 0)).sum(axis=0) / count)
+    found: AnyFloats = np.sqrt(np.square(np.where(known, moved - mean, 0)).sum(axis=0) / count)
     return found
 
 
-def changes(truth: Floats, groups: NDArray[Any], *, horizon: int, sd: Floats) -> list[NDArray[np.intp]]:
+def changes(truth: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats) -> list[Indices]:
     """Return the onset and the end, exclusive, of the changes of each feature, each (change, 2).
 
     ``sd`` (feature,) is that of `difference_sd`; a feature whose is 0 never changes.
@@ -81,8 +76,8 @@ def changes(truth: Floats, groups: NDArray[Any], *, horizon: int, sd: Floats) ->
 
 
 def calibrate(
-    truth: Floats, ahead: Floats, groups: NDArray[Any], *, horizon: int, sd: Floats, rate_hz: float
-) -> Floats:
+    truth: AnyFloats, ahead: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats, rate_hz: float
+) -> AnyFloats:
     """Return theta (feature,): the least that gives no more than one false alarm a minute in this data.
 
     ``rate_hz`` is the rate of rows. Infinite for a feature without a row that is free of events: no alarm is known to be
@@ -111,15 +106,15 @@ def calibrate(
 
 
 def score(
-    truth: Floats,
-    ahead: Floats,
-    groups: NDArray[Any],
+    truth: AnyFloats,
+    ahead: AnyFloats,
+    groups: AnyArray,
     *,
     horizon: int,
-    sd: Floats,
-    theta: Floats,
+    sd: AnyFloats,
+    theta: AnyFloats,
     rate_hz: float,
-    held: Flags | None = None,
+    held: Bools | None = None,
 ) -> Anticipation:
     """Return how well ``ahead`` predicts the changes of ``truth`` with alarms beyond ``theta`` (feature,).
 
@@ -155,19 +150,19 @@ def score(
     )
 
 
-def _stretches(groups: NDArray[Any]) -> Rows:
+def _stretches(groups: AnyArray) -> Indices:
     """Return the number of the group of each row (time,), so that no number comes twice."""
     begins = np.ones(len(groups), dtype=bool)
     begins[1:] = groups[1:] != groups[:-1]
     return np.cumsum(begins)
 
 
-def _spaced(stretches: Rows, horizon: int) -> Rows:
+def _spaced(stretches: Indices, horizon: int) -> Indices:
     """Return row numbers (time,) between which groups lie so far apart that nothing of one is near another."""
     return np.arange(len(stretches)) + stretches * 2 * horizon
 
 
-def _moved(truth: Floats, stretches: Rows, horizon: int) -> Floats:
+def _moved(truth: AnyFloats, stretches: Indices, horizon: int) -> AnyFloats:
     """Return z_t - z_{t-k} (time, feature), NaN in the first k rows of each group."""
     moved = np.full(truth.shape, np.nan)
     within = stretches[horizon:] == stretches[:-horizon]
@@ -175,7 +170,7 @@ def _moved(truth: Floats, stretches: Rows, horizon: int) -> Floats:
     return moved
 
 
-def _changes_of(truth: Floats, moved: Floats, spaced: Rows, horizon: int, sd: float) -> Rows:
+def _changes_of(truth: AnyFloats, moved: AnyFloats, spaced: Indices, horizon: int, sd: float) -> Indices:
     """Return onset and end of the changes (change, 2) of one feature, ``truth`` and ``moved`` each (time,)."""
     size = np.abs(moved)
     on = (size > ON_SD * sd) & (sd > 0)
@@ -190,9 +185,9 @@ def _changes_of(truth: Floats, moved: Floats, spaced: Rows, horizon: int, sd: fl
     return np.stack([starts - lasts, stops], axis=1)
 
 
-def _free(deviation: Floats, those: Rows, stretches: Rows, horizon: int) -> Flags:
+def _free(deviation: AnyFloats, those: Indices, stretches: Indices, horizon: int) -> Bools:
     """Return which rows (time,) have a forecast that its group holds and are not near a change of ``those``."""
-    free: Flags = np.isfinite(deviation)
+    free: Bools = np.isfinite(deviation)
     free[max(len(free) - horizon, 0) :] = False
     free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
     early = horizon + round(EARLY_FRACTION * horizon)
@@ -202,7 +197,7 @@ def _free(deviation: Floats, those: Rows, stretches: Rows, horizon: int) -> Flag
     return free
 
 
-def _count(alarms: Rows, horizon: int, enough: float = np.inf) -> int:
+def _count(alarms: Indices, horizon: int, enough: float = np.inf) -> int:
     """Return how many alarms the rows ``alarms`` are, sorted: each represents the k rows after it, too.
 
     No choice of rows more than k apart is larger, so that more rows never make fewer alarms. Counts no further than one
@@ -215,11 +210,11 @@ def _count(alarms: Rows, horizon: int, enough: float = np.inf) -> int:
     return count
 
 
-def _minutes(rows: Flags, rate_hz: float) -> float:
+def _minutes(rows: Bools, rate_hz: float) -> float:
     return float(rows.sum()) / rate_hz / 60
 
 
-def _check(truth: Floats, horizon: int, *, groups: NDArray[Any], **others: Floats) -> None:
+def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **others: AnyFloats) -> None:
     """Refuse what cannot be evaluated."""
     if horizon < 1:
         raise TacpipeError(f"A forecast of {horizon} rows predicts nothing; the horizon must be 1 or more.")

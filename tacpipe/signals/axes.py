@@ -7,15 +7,14 @@ untrusted sources.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import AnyArray
 
 LEAST = 0.5  # lag-1 autocorrelation that time must have
 
 
-def lag_one(values: NDArray[Any], axis: int) -> float:
+def lag_one(values: AnyArray, axis: int) -> float:
     """Return the lag-1 autocorrelation of ``values`` along ``axis``: the correlation of all pairs of neighbours along it.
 
     NaN where there are no neighbours or they do not vary.
@@ -32,7 +31,7 @@ def lag_one(values: NDArray[Any], axis: int) -> float:
     return float(before @ after) / spread if spread > 0 else float("nan")
 
 
-def is_time(values: NDArray[Any], axis: int, least: float = LEAST) -> bool:
+def is_time(values: AnyArray, axis: int, least: float = LEAST) -> bool:
     """Return whether ``axis`` of ``values`` can be time: its lag-1 autocorrelation is ``least`` or more, and the largest.
 
     False where nothing varies along it: such an array states nothing about its axes.

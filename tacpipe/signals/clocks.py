@@ -15,15 +15,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Floats, Int64s, Times
 from tacpipe.errors import TacpipeError
-
-Times = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 STEP_NS = 20_000_000  # smaller steps are latency: no device restarts within 20 ms
@@ -83,7 +79,7 @@ class ClockFit:
         return self.longest.drift * 1e6
 
 
-def fit_clock(device_ns: Times, arrival_ns: Times, certain: NDArray[np.bool_] | None = None) -> ClockFit:
+def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None) -> ClockFit:
     """Return the fit of a device's clock (time,) against the arrival of its samples (time,), in row order.
 
     Where ``certain`` (time,) is given, the other rows have arrivals that state nothing, as of a host that was held up,
@@ -123,7 +119,7 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: NDArray[np.bool_] | 
     return ClockFit(segments, quantiles, float(np.median(np.abs(late_ns))))
 
 
-def _spread(fit: ClockFit, rows: NDArray[np.int64], count: int) -> ClockFit:
+def _spread(fit: ClockFit, rows: Int64s, count: int) -> ClockFit:
     """Return a fit of some ``rows`` as one of all ``count``: a row that was left out belongs to the segment before it."""
     edges = [0, *(int(rows[one.start]) for one in fit.segments[1:]), count]
     spans = zip(fit.segments, edges[:-1], edges[1:], strict=True)
@@ -169,12 +165,12 @@ def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
     return sorted(steps[2:])
 
 
-def _some(values: NDArray[Any]) -> NDArray[Any]:
+def _some(values: AnyArray) -> AnyArray:
     """Return evenly spaced ones of ``values``; the step is odd, so that it keeps time with no link's batches."""
     return values[:: len(values) // ENOUGH_ROWS | 1]
 
 
-def _earliest(late_ns: NDArray[Any]) -> float:
+def _earliest(late_ns: AnyArray) -> float:
     """Return the lateness below which a sample came impossibly early: its stamp is wrong."""
     low, middle = np.quantile(_some(late_ns), (ROUGH_LOW, 0.5))
     return float(low - max(middle - low, EARLY_NS))

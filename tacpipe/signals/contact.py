@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Floats, Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.holds import held
 from tacpipe.signals.runs import latched, runs
-
-Times = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 NOISE_FEWEST, NOISE_USUAL = 10.0, 40.0  # times the noise at rest: least, and usual, load at which contact starts
 PEAK_LEAST, PEAK_MOST = 0.05, 0.25  # of the largest load: least, and most, where the noise would ask for more
@@ -27,7 +24,7 @@ class Thresholds(NamedTuple):
     off: float  # and ends where it falls below this
 
 
-def rest_level(values: NDArray[Any], t_ns: Times, rest_s: float) -> Floats:
+def rest_level(values: AnyArray, t_ns: Times, rest_s: float) -> Floats:
     """Return the median of each channel of ``values`` (time, channel) over the first ``rest_s`` seconds (channel,).
 
     A median, because one bad frame must not shift a whole recording. The first row always counts.
@@ -40,7 +37,7 @@ def rest_level(values: NDArray[Any], t_ns: Times, rest_s: float) -> Floats:
     return level
 
 
-def axis_mean_level(values: NDArray[Any], axes: int = 3) -> Floats:
+def axis_mean_level(values: AnyArray, axes: int = 3) -> Floats:
     """Return what to take off each channel of ``values`` (time, channel) so that all taxels of an axis begin alike.
 
     In the first row they then have the whole part of that axis' mean over the taxels, not 0, as in the authors'
@@ -57,7 +54,7 @@ def axis_mean_level(values: NDArray[Any], axes: int = 3) -> Floats:
     return level
 
 
-def load(values: NDArray[Any], rest: Floats, axes: int = 3) -> Floats:
+def load(values: AnyArray, rest: Floats, axes: int = 3) -> Floats:
     """Return how far the taxels are from ``rest`` on average (time,), in the unit of ``values``.
 
     The channels of ``values`` (time, channel) go taxel by taxel, ``axes`` to a taxel; a taxel's distance is the length
@@ -73,7 +70,7 @@ def load(values: NDArray[Any], rest: Floats, axes: int = 3) -> Floats:
     return distance
 
 
-def noise_thresholds(values: NDArray[Any], load: Floats, t_ns: Times, rest_s: float) -> Thresholds:
+def noise_thresholds(values: AnyArray, load: Floats, t_ns: Times, rest_s: float) -> Thresholds:
     """Return thresholds for a sensor of any unit, from its noise at rest.
 
     The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds; samples that repeat the one
@@ -101,7 +98,7 @@ def contact_intervals(
     min_s: float,
     merge_s: float,
     pad_s: float,
-) -> NDArray[np.int64]:
+) -> Int64s:
     """Return the row ranges (contact, 2) in which there is contact, stop exclusive, sorted and without overlap.
 
     Contact starts where ``load`` (time,) reaches ``on`` and ends where it falls below ``off``. Of several sensors ``load``
@@ -113,8 +110,8 @@ def contact_intervals(
     loads, ons, offs = np.atleast_2d(load), np.reshape(on, (-1, 1)), np.reshape(off, (-1, 1))  # (sensor, time or 1)
     if not ((offs >= 0) & (offs <= ons)).all():
         raise TacpipeError(f"Contact that starts at {on} and ends below {off} flickers; off must lie between 0 and on.")
-    starting: NDArray[np.bool_] = np.any(loads >= ons, axis=0) & ~np.isnan(loads).any(axis=0)  # (time,)
-    ending: NDArray[np.bool_] = np.all(loads < offs, axis=0)  # (time,)
+    starting: Bools = np.any(loads >= ons, axis=0) & ~np.isnan(loads).any(axis=0)  # (time,)
+    ending: Bools = np.all(loads < offs, axis=0)  # (time,)
     starts, stops = runs(latched(starting, ending))
     if not len(starts):
         return np.zeros((0, 2), dtype=np.int64)
@@ -131,7 +128,7 @@ def contact_intervals(
     return np.stack([first, last], axis=1).astype(np.int64)
 
 
-def _require_taxels(values: NDArray[Any], axes: int) -> None:
+def _require_taxels(values: AnyArray, axes: int) -> None:
     channels = values.shape[1]
     if not channels or channels % axes:
         raise TacpipeError(f"{channels} tactile channels are not whole taxels of {axes} axes; check the columns.")

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.contact import rest_level
 from tacpipe.signals.runs import in_long_runs, runs
-
-Times = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 NOISES = 3.0  # standard deviations of a finger's pressure at rest, beyond which it is touched
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.float64]
 
 PAD_ROWS = 9  # scipy.signal.filtfilt's default for a filter of second order: three times its three coefficients
 
@@ -22,7 +19,7 @@ class Biquad:
     b: tuple[float, float, float]
     a: tuple[float, float]  # a1 and a2; a0 is 1
 
-    def causal(self, values: NDArray[Any]) -> Floats:
+    def causal(self, values: AnyArray) -> Floats:
         """Return ``values`` (time,) filtered with what came so far, as if the first value had always been there.
 
         The recursion is the transposed direct form II, its state at first that of a constant input.
@@ -40,7 +37,7 @@ class Biquad:
             found.append(smooth)
         return np.array(found, dtype=np.float64)
 
-    def both_ways(self, values: NDArray[Any]) -> Floats:
+    def both_ways(self, values: AnyArray) -> Floats:
         """Return ``values`` (time,) filtered forwards and backwards, which shifts nothing in time.
 
         Both ends are continued by the values before them, turned about the end (odd padding, as scipy.signal.filtfilt).
@@ -73,7 +70,7 @@ def butterworth(cutoff_hz: float, rate_hz: float) -> Biquad:
     return Biquad((b0, 2 * b0, b0), (float(a1), float(a2)))
 
 
-def median(values: NDArray[Any], rows: int) -> Floats:
+def median(values: AnyArray, rows: int) -> Floats:
     """Return the median of the ``rows`` (odd) around each row of ``values`` (time,); end values continue beyond the ends.
 
     >>> median(np.array([1, 9, 1, 1, 2]), 3).tolist()
@@ -82,7 +79,7 @@ def median(values: NDArray[Any], rows: int) -> Floats:
     return _medians(values, rows // 2, rows // 2)
 
 
-def median_so_far(values: NDArray[Any], rows: int) -> Floats:
+def median_so_far(values: AnyArray, rows: int) -> Floats:
     """Return the median of each row of ``values`` (time,) and the ``rows - 1`` before it.
 
     >>> median_so_far(np.array([1, 9, 1, 2, 2]), 3).tolist()
@@ -91,7 +88,7 @@ def median_so_far(values: NDArray[Any], rows: int) -> Floats:
     return _medians(values, rows - 1, 0)
 
 
-def _medians(values: NDArray[Any], before: int, after: int) -> Floats:
+def _medians(values: AnyArray, before: int, after: int) -> Floats:
     if not len(values):
         return np.zeros(0)
     padded = np.pad(values.astype(np.float64), (before, after), mode="edge")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import AnyArray, Bools, Times
 
 
-def held(values: NDArray[Any]) -> NDArray[np.bool_]:
+def held(values: AnyArray) -> Bools:
     """Return where every channel of ``values`` (time, channel) equals the frame before (time,); the first never does.
 
     >>> held(np.array([[1, 2], [1, 2], [1, 3]])).tolist()
@@ -18,7 +18,7 @@ def held(values: NDArray[Any]) -> NDArray[np.bool_]:
     return held_columns(list(values.T))
 
 
-def held_columns(columns: Iterable[NDArray[Any]]) -> NDArray[np.bool_]:
+def held_columns(columns: Iterable[AnyArray]) -> Bools:
     """Return the same as `held` for channels that lie apart, each (time,); stops at the first that leaves none held."""
     repeated = np.zeros(0, dtype=bool)
     for number, column in enumerate(columns):
@@ -31,12 +31,12 @@ def held_columns(columns: Iterable[NDArray[Any]]) -> NDArray[np.bool_]:
     return repeated
 
 
-def mean_rate_hz(t_ns: NDArray[np.int64]) -> float:
+def mean_rate_hz(t_ns: Times) -> float:
     """Return how many samples came a second; 0 for fewer than two samples or for stamps that are all equal."""
     return fresh_rate_hz(t_ns, np.zeros(len(t_ns), dtype=bool))
 
 
-def fresh_rate_hz(t_ns: NDArray[np.int64], held: NDArray[np.bool_]) -> float:
+def fresh_rate_hz(t_ns: Times, held: Bools) -> float:
     """Return how many new frames came a second: those after the first that are not held, over the time they span.
 
     0 for fewer than two samples or for stamps that are all equal.

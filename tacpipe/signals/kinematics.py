@@ -8,12 +8,10 @@ columns of the geometric Jacobian (Siciliano et al., Robotics, 2009, section 3.1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
+from tacpipe.arrays import AnyFloats, Times
 
 TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
 
@@ -40,7 +38,7 @@ IIWA14 = Chain(  # KUKA LBR iiwa 14 R820, data sheet: 0.36, 0.42, 0.40 m between
 )
 
 
-def joint_frames(chain: Chain, joint_rad: Floats) -> Floats:
+def joint_frames(chain: Chain, joint_rad: AnyFloats) -> AnyFloats:
     """Return the pose of each joint's frame in the base's, (time, joint, 4, 4), at angles ``joint_rad`` (time, joint)."""
     frames = np.empty((*joint_rad.shape, 4, 4))
     reached = np.broadcast_to(np.eye(4), (len(joint_rad), 4, 4))
@@ -67,7 +65,7 @@ def joint_frames(chain: Chain, joint_rad: Floats) -> Floats:
     return frames
 
 
-def carries(chain: Chain, joint_rad: Floats, hand_m: Floats) -> bool:
+def carries(chain: Chain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
     """Return whether a hand at ``hand_m`` (time, 3) hangs rigidly on the chain's last link: whether it is this arm.
 
     Rows that are not finite do not state.
@@ -78,7 +76,7 @@ def carries(chain: Chain, joint_rad: Floats, hand_m: Floats) -> bool:
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
 
-def hand_velocity(chain: Chain, joint_rad: Floats, joint_rad_s: Floats, hand_m: Floats) -> Floats:
+def hand_velocity(chain: Chain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
     """Return linear (m/s) and angular (rad/s) velocity of the hand in the base's frame, (time, 6).
 
     ``joint_rad`` and ``joint_rad_s`` are (time, joint), ``hand_m`` (time, 3).
@@ -90,7 +88,7 @@ def hand_velocity(chain: Chain, joint_rad: Floats, joint_rad_s: Floats, hand_m: 
     return np.hstack([linear, angular])
 
 
-def differences(t_ns: NDArray[np.int64], position_m: Floats, quaternions: Floats) -> Floats:
+def differences(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloats) -> AnyFloats:
     """Return linear (m/s) and angular (rad/s) velocity from each row and the one before, (time, 6); 0 in the first.
 
     ``quaternions`` (time, 4) are x, y, z, w, of unit length and continuous sign. Between neighbours the rotation is

@@ -7,16 +7,11 @@ last of them counts. Beyond the first and the last sample a signal keeps its end
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.rotations import continuous
-
-Times = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 PARALLEL = 1e-6  # rad; below this angle the sine weights of slerp divide by zero and linear ones are exact to 1e-13
 
@@ -37,7 +32,7 @@ def uniform_grid(first_ns: int, last_ns: int, rate_hz: float) -> Times:
     return np.int64(first_ns) + offsets_ns[offsets_ns <= span_ns]
 
 
-def linear(t_ns: Times, values: NDArray[Any], grid_ns: Times) -> Floats:
+def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
     """Return ``values`` (time, channel) at the times ``grid_ns``, interpolated linearly, as float64 (grid, channel).
 
     A NaN spreads to the points between it and its neighbours and no further.
@@ -69,7 +64,7 @@ def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
     return turned
 
 
-def median_around(t_ns: Times, values: NDArray[Any], grid_ns: Times, half_ns: int) -> Floats:
+def median_around(t_ns: Times, values: AnyArray, grid_ns: Times, half_ns: int) -> Floats:
     """Return the median of the samples at most ``half_ns`` from each grid point, float64 (grid, channel).
 
     ``values`` are (time, channel). Where no sample is that near, the value is that of `linear`.
@@ -84,7 +79,7 @@ def median_around(t_ns: Times, values: NDArray[Any], grid_ns: Times, half_ns: in
     return found
 
 
-def bracketing_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
+def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
     """Return, sorted, the rows that `linear` and `slerp` look at: with those alone they give the same.
 
     A stream of 1 kHz on a grid of 50 Hz is gathered from a tenth of its rows.
@@ -95,7 +90,7 @@ def bracketing_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
     return np.flatnonzero(wanted)
 
 
-def nearest_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
+def nearest_rows(t_ns: Times, grid_ns: Times) -> Indices:
     """Return for each grid point the row of the nearest sample (grid,); the earlier one where two are as near."""
     _require_samples(t_ns)
     after = np.clip(np.searchsorted(t_ns, grid_ns, side="right"), 1, max(len(t_ns) - 1, 1))
@@ -104,7 +99,7 @@ def nearest_rows(t_ns: Times, grid_ns: Times) -> NDArray[np.intp]:
     return np.where(t_ns[after] - grid_ns < grid_ns - t_ns[before], after, before)
 
 
-def nearest(t_ns: Times, values: NDArray[Any], grid_ns: Times) -> NDArray[Any]:
+def nearest(t_ns: Times, values: AnyArray, grid_ns: Times) -> AnyArray:
     """Return the nearest sample of ``values`` (time, …) at each grid point (grid, …), its type kept."""
     return values[nearest_rows(t_ns, grid_ns)]
 
@@ -115,18 +110,18 @@ def nearest_distance_ns(t_ns: Times, grid_ns: Times) -> Times:
     return distance_ns
 
 
-def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> NDArray[np.bool_]:
+def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
     """Return where a grid point has no trustworthy value (grid,).
 
     That is strictly between two samples further apart than ``gap_ns``, or outside the range of the samples.
     """
     lower, upper, _ = _neighbours(t_ns, grid_ns)
     outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
-    found: NDArray[np.bool_] = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
+    found: Bools = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
     return found
 
 
-def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:
     """Return the sample rows before and after each grid point and the weight of the latter, each (grid,).
 
     At a sample both rows are that sample, so that what lies behind it has no state.

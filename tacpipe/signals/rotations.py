@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import Floats
 
 UPRIGHT = 1e-12  # by which the sine of a right angle may miss 1
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Flags = NDArray[np.bool_]
+from tacpipe.arrays import Bools, Indices
 
 
-def runs(state: Flags) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def runs(state: Bools) -> tuple[Indices, Indices]:
     """Return the first rows and the stops, exclusive, of the runs of True, each (run,).
 
     >>> [edge.tolist() for edge in runs(np.array([True, False, True, True]))]
@@ -18,18 +17,18 @@ def runs(state: Flags) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
-def latched(on: Flags, off: Flags) -> Flags:
+def latched(on: Bools, off: Bools) -> Bools:
     """Return a state (time,) that a row of ``on`` switches on and a row of ``off`` off; ``on`` wins, off at first.
 
     >>> latched(np.array([False, True, False, False]), np.array([False, False, False, True])).tolist()
     [False, True, True, False]
     """
     decided = np.maximum.accumulate(np.where(on | off, np.arange(len(on)), -1))
-    state: Flags = (decided >= 0) & on[decided]
+    state: Bools = (decided >= 0) & on[decided]
     return state
 
 
-def in_long_runs(state: Flags, rows: int) -> Flags:
+def in_long_runs(state: Bools, rows: int) -> Bools:
     """Return which rows of ``state`` (time,) belong to a run of ``rows`` or more; known once the run has lasted."""
     starts, stops = runs(state)
     long = stops - starts >= rows
@@ -39,9 +38,9 @@ def in_long_runs(state: Flags, rows: int) -> Flags:
     return np.cumsum(edges[:-1]).astype(bool)
 
 
-def lasting(state: Flags, rows: int) -> Flags:
+def lasting(state: Bools, rows: int) -> Bools:
     """Return in which rows ``state`` (time,) has held for ``rows`` rows, this one included: the same, stated causally."""
     count = np.arange(1, len(state) + 1)
     last_off = np.maximum.accumulate(np.where(state, 0, count))  # rows up to the last that was off
-    found: Flags = state & (count - last_off >= rows)
+    found: Bools = state & (count - last_off >= rows)
     return found

@@ -7,13 +7,12 @@ T frames and 6 triangles, where U is the slide as it was measured. Values change
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import AnyArray
 
 
-def scramble(slides: NDArray[Any]) -> NDArray[Any]:
+def scramble(slides: AnyArray) -> AnyArray:
     """Return ``slides`` (…, triangle, taxel, time) in the published arrangement, of the same shape.
 
     >>> felt = np.array([[[0, 1, 2, 3]], [[10, 11, 12, 13]]])  # (triangle, taxel, time)
@@ -26,7 +25,7 @@ def scramble(slides: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(np.swapaxes(rows, -3, -2))
 
 
-def unscramble(published: NDArray[Any]) -> NDArray[Any]:
+def unscramble(published: AnyArray) -> AnyArray:
     """Return slides as they were measured, (…, triangle, taxel, time), from the published arrangement; undoes `scramble`.
 
     >>> unscramble(np.array([[[0, 10, 1, 11]], [[2, 12, 3, 13]]])).tolist()

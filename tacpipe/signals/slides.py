@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.runs import in_long_runs
 
-Floats = NDArray[np.float64]
 Rows = tuple[int, int]  # the first, and the one behind the last
 
 CROPS = ("middle", "offset", "none")
@@ -29,7 +29,7 @@ class Protocol:
     pressure_high: float
 
 
-def trigger_row(pressure: NDArray[Any], threshold: float) -> int:
+def trigger_row(pressure: AnyArray, threshold: float) -> int:
     """Return the first row of ``pressure`` (time,) that reaches ``threshold``. Raises `TacpipeError` if none does.
 
     >>> trigger_row(np.array([12, 39, 40, 17, 80]), 40.0)
@@ -92,7 +92,7 @@ def phases(rows: int, slide: Rows) -> NDArray[np.int8]:
     return (place >= slide[1]).astype(np.int8) - (place < slide[0]).astype(np.int8)
 
 
-def measured(pressure: NDArray[Any], profile: Mapping[str, Floats]) -> dict[str, float]:
+def measured(pressure: AnyArray, profile: Mapping[str, Floats]) -> dict[str, float]:
     """Return what the kept rows of a slide were like: the means of pressure and force, the median of the speed.
 
     All are (time,). Speed and force are left out where they are not known in all rows.

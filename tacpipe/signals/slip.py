@@ -20,17 +20,13 @@ Readings and rates are in counts and counts a second.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.filters import butterworth, median, median_so_far
 from tacpipe.signals.runs import in_long_runs, lasting, latched, runs
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MEDIAN_ROWS = 5
 LEVEL_ROWS = 10  # before and after a slip, whose median is the level there
@@ -62,7 +58,7 @@ class Limits:
             )
 
 
-def filled(readings: NDArray[Any]) -> Floats:
+def filled(readings: AnyArray) -> Floats:
     """Return ``readings`` (time,) with NaN replaced by the last number before it, at the start by the first one.
 
     So no row is filled from its future but those before the first reading, where nothing can be determined anyway.
@@ -91,7 +87,7 @@ def rate_so_far(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
     return np.diff(smooth, prepend=smooth[:1]) * rate_hz
 
 
-def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Flags:
+def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Bools:
     """Return where the object slips (time,), stated with the whole of ``readings`` (time,) since the grasp at hand.
 
     In the first ``still`` rows it is taken to rest; their rate sets the threshold.
@@ -105,7 +101,7 @@ def slip_offline(readings: Floats, rate_hz: float, cutoff_hz: float, still: int,
     return _trimmed(latched(on, off) & ~_resting(smooth, limits.off_rows, level), smooth, level)
 
 
-def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Flags:
+def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, limits: Limits) -> Bools:
     """Return where slip is known of (time,) from each row and those before it; never in the first ``still``."""
     speed = np.abs(rate_so_far(readings, rate_hz, cutoff_hz))
     noise = _noise(speed[:still], limits)
@@ -114,7 +110,7 @@ def slip_online(readings: Floats, rate_hz: float, cutoff_hz: float, still: int, 
     return latched(on, lasting(speed < limits.off_sigma * noise, limits.off_rows))
 
 
-def dropped(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Flags:
+def dropped(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Bools:
     """Return from where on (time,) the object is lost, stated with the whole of ``readings`` (time,) since the grasp.
 
     That is after the first ``still`` rows, once the readings, smoothed by a median, are more than ``patch_count`` from the
@@ -123,12 +119,12 @@ def dropped(readings: Floats, still: int, patch_count: float, saturated_count: f
     return _lost(median(readings, MEDIAN_ROWS), readings[:still], patch_count, saturated_count)
 
 
-def dropped_online(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Flags:
+def dropped_online(readings: Floats, still: int, patch_count: float, saturated_count: float) -> Bools:
     """Return where the same is known of (time,) from each row and those before it."""
     return _lost(median_so_far(readings, MEDIAN_ROWS), readings[:still], patch_count, saturated_count)
 
 
-def _lost(smooth: Floats, rest: Floats, patch_count: float, saturated_count: float) -> Flags:
+def _lost(smooth: Floats, rest: Floats, patch_count: float, saturated_count: float) -> Bools:
     if not len(rest):
         return np.zeros(len(smooth), dtype=bool)
     lost = (np.abs(smooth - np.median(rest)) > patch_count) | (smooth <= saturated_count)
@@ -140,7 +136,7 @@ def _noise(speed: Floats, limits: Limits) -> float:
     return max(float(np.sqrt(np.mean(speed**2))) if len(speed) else 0.0, limits.noise_floor)
 
 
-def _resting(smooth: Floats, rows: int, level_count: float) -> Flags:
+def _resting(smooth: Floats, rows: int, level_count: float) -> Bools:
     """Return which rows (time,) lie in ``rows`` or more in which ``smooth`` (time,) stays within ``level_count``.
 
     Between two slips that follow at once the filtered rate does not come down; the readings state that there are two.
@@ -154,7 +150,7 @@ def _resting(smooth: Floats, rows: int, level_count: float) -> Flags:
     return found
 
 
-def _trimmed(slip: Flags, smooth: Floats, level_count: float) -> Flags:
+def _trimmed(slip: Bools, smooth: Floats, level_count: float) -> Bools:
     """Return ``slip`` (time,) with the ends of each run moved to where ``smooth`` (time,) leaves the levels around it.
 
     A run that leaves its level nowhere goes: what has not moved has not slipped.

@@ -7,15 +7,14 @@ counts those are 0 and every step of one count would be a spike, so there is a l
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import AnyArray, Bools
 
 TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in its median absolute deviations
 
 
-def hampel(values: NDArray[Any], rows: int, deviations: float, floor: float) -> tuple[NDArray[np.bool_], NDArray[Any]]:
+def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tuple[Bools, AnyArray]:
     """Return which of ``values`` (time, channel) are spikes (time, channel), and the values with these repaired.
 
     A spike is further than ``deviations`` scaled median absolute deviations, and than ``floor``, from the median of the

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from tacpipe.arrays import AnyArray
 
 
-def unwrapped(values: NDArray[Any]) -> NDArray[Any]:
+def unwrapped(values: AnyArray) -> AnyArray:
     """Return ``values`` (time,), integers of 16 bits, with wrap-around undone, as int32; as they are where there is none.
 
     A jump of more than half the range between consecutive samples is one, the other way round the range: no signal that

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Int64s, Times
 from tacpipe.errors import TacpipeError
 
 GAP = 1.5  # times the median step of time, above which rows do not follow one another
 
 
-def breaks(t_ns: NDArray[np.int64], gap: float = GAP) -> NDArray[np.bool_]:
+def breaks(t_ns: Times, gap: float = GAP) -> Bools:
     """Return for each row (time,) whether an unbroken run begins there: after more than ``gap`` times the median step.
 
     >>> breaks(np.array([0, 20, 40, 100, 120])).tolist()
@@ -26,9 +24,7 @@ def breaks(t_ns: NDArray[np.int64], gap: float = GAP) -> NDArray[np.bool_]:
     return begins
 
 
-def window_starts(
-    groups: NDArray[Any], usable: NDArray[np.bool_], context: int, horizon: int, stride: int = 1
-) -> NDArray[np.int64]:
+def window_starts(groups: AnyArray, usable: Bools, context: int, horizon: int, stride: int = 1) -> Int64s:
     """Return the first rows (window,) of all windows of ``context + horizon`` rows.
 
     A window lies within one group (``groups`` (time,) numbers recordings or contacts; equal neighbours belong together)
@@ -52,5 +48,5 @@ def window_starts(
     starts = np.arange(rows - length + 1)
     run_start = np.maximum.accumulate(np.where(broken, np.arange(rows), 0))[starts]
     whole = usable[starts] & (breaks[starts + length - 1] == breaks[starts]) & ((starts - run_start) % stride == 0)
-    found: NDArray[np.int64] = starts[whole].astype(np.int64)
+    found: Int64s = starts[whole].astype(np.int64)
     return found

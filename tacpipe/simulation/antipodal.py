@@ -8,12 +8,10 @@ within a cone of friction about the normals.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Floats
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation.depth_camera import Placed
-
-Floats = NDArray[np.float64]
 
 OPENING_M = (0.02, 0.12)  # between the fingers
 CONE_RAD = np.deg2rad(15.0)  # largest angle between closing and a normal
@@ -82,7 +80,7 @@ def _level(up: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(ways * np.where(ways[:, :1] < 0, -1.0, 1.0))
 
 
-def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> NDArray[np.bool_]:
+def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
     """Return which pairs of contacts (pair, xyz) fingers of the hand can hold (pair,)."""
     with np.errstate(invalid="ignore"):
         gap = second_m - first_m

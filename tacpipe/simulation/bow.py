@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.simulation.primitives import DOWN_Z, Rest
-
-Floats = NDArray[np.float64]
 
 CLOSE_M = 1e-8  # distance at which a ray has met the surface
 STEPS = 200  # after which a ray that grazes has missed

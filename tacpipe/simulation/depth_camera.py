@@ -10,12 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Float32s, Floats
 from tacpipe.simulation.primitives import Rest, Shape
-
-Floats = NDArray[np.float64]
-Colours = NDArray[np.uint8]
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 615.0  # pixels
 DEPTH_NOISE_M = 0.0015  # standard deviation at 1 m
@@ -99,13 +96,13 @@ def depths(placed: Placed) -> tuple[Floats, Floats]:
     return through[met], deep[met]
 
 
-def measured(direction: Floats, depth_m: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def measured(direction: Floats, depth_m: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
     """Return the points that the camera gives (point, xyz), metres: true ones, shifted along their rays by noise."""
     noise = noise_scale * DEPTH_NOISE_M * depth_m**2 * rng.normal(size=len(depth_m))
     return (direction * (depth_m + noise)[:, None]).astype(np.float32)
 
 
-def painted(own_m: Floats, rng: np.random.Generator) -> Colours:
+def painted(own_m: Floats, rng: np.random.Generator) -> Bytes:
     """Return colours (point, rgb) of points in a body's own frame: a random colour, random waves of others, and noise."""
     found = np.tile(rng.uniform(50, 205, 3), (len(own_m), 1))
     for _ in range(RIPPLES):

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Times = NDArray[np.int64]
+from tacpipe.arrays import AnyArray, Bools, Times
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def arrivals(true_ns: Times, delay_ns: float, rng: np.random.Generator) -> Times
     return np.maximum.accumulate(true_ns + late_ns) if len(true_ns) else true_ns
 
 
-def hold(values: NDArray[Any], probability: float, rng: np.random.Generator) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def hold(values: AnyArray, probability: float, rng: np.random.Generator) -> tuple[AnyArray, Bools]:
     """Return ``values`` (time, channel) with each frame replaced by the logged one before with ``probability``.
 
     And where that happened (time,): never in the first frame.

@@ -12,12 +12,9 @@ The host takes the readings of the trial's start off and keeps the absolute valu
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Counts, Floats
 from tacpipe.channels import schema
-
-Floats = NDArray[np.float64]
-Counts = NDArray[np.uint16]
 
 PLACES_M = 0.001 * np.array(  # (electrode, axis); x along the finger to its tip, z from the pad into the finger
     [

@@ -11,11 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import biotac_sp
-
-Floats = NDArray[np.float64]
 
 CHANNELS = biotac_sp.ELECTRODES + 1  # of a finger by which touch is measured: the electrodes, then the fluid's pressure
 GAIN_COUNT = 2600.0  # by which an electrode falls under a contact that squeezes all fluid out
@@ -77,7 +75,7 @@ def signal(made: Sensors, force_n: Floats, contact_m: Floats, skin_m: Floats, ce
     return np.asarray(made.rest + np.concatenate([pressed(contact_m, skin_m, centre_m), pressure], axis=-1))
 
 
-def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | NDArray[np.int64] = 0) -> Floats:
+def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | Times = 0) -> Floats:
     """Return by how many counts channels have drifted at ``t_ns``, of phases (..., period, finger, channel).
 
     Each drifts by ``rate_count_day`` counts a day on root-mean-square average, as the sum of three slow waves.
@@ -88,13 +86,13 @@ def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | NDArray[np.int6
     return np.asarray((size * np.sin(rate * days + phases_rad)).sum(axis=-3))
 
 
-def counted(counts: Floats) -> NDArray[np.uint16]:
+def counted(counts: Floats) -> Counts:
     """Return channels (..., channel) as they are logged: whole and within `FULL_COUNT`."""
     low, high = np.array([FULL_COUNT["electrode"]] * biotac_sp.ELECTRODES + [FULL_COUNT["pdc"]]).T
     return np.rint(counts).clip(low, high).astype(np.uint16)
 
 
-def rows(counts: NDArray[np.uint16], speed_n_s: Floats, noise_scale: float, rng: np.random.Generator) -> list[Floats]:
+def rows(counts: Counts, speed_n_s: Floats, noise_scale: float, rng: np.random.Generator) -> list[Floats]:
     """Return the 58 columns of `biotac_sp.fields` (time,), of channels (time, finger, channel).
 
     ``speed_n_s`` is how fast the force changes (time, finger): it shows on the quick readings of the pressure.

@@ -11,11 +11,9 @@ points the other way; in each, taxels in rows of 4, 3, 2 and 1, the fourth being
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Floats
 from tacpipe.channels import schema
-
-Floats = NDArray[np.float64]
 
 TAXELS = schema.TRIANGLES * schema.TRIANGLE_TAXELS
 PITCH_M = 0.0067  # of the taxels of a triangle
@@ -65,9 +63,9 @@ def leans(patch_m: Floats) -> Floats:
     return lean
 
 
-def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
     """Return the taxels (time, taxel) as they are logged: with noise and drift, without the dead zone, clipped."""
     steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
     noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
-    counts: NDArray[np.float32] = (signal + noise_scale * noise - DEAD_COUNT).clip(0, LARGEST_COUNT).astype(np.float32)
+    counts: Float32s = (signal + noise_scale * noise - DEAD_COUNT).clip(0, LARGEST_COUNT).astype(np.float32)
     return counts

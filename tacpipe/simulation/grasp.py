@@ -14,15 +14,13 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp, schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import fingertip_sp, grasp_truth, pinch, pinch_course, tabletop
 from tacpipe.simulation.grasp_scene import Readings, Rig, Scene, families, perform, read_sensors, sensors, thing
-
-Floats = NDArray[np.float64]
 
 START_NS = 1_620_000_000_000_000_000  # UTC stamp of the first grasp
 GRASP_NS = 180_000_000_000  # from one grasp of a session to the next
@@ -99,7 +97,7 @@ def _readings_over_time(
 
 
 def _logged(
-    t_ns: NDArray[np.int64],
+    t_ns: Times,
     made: fingertip_sp.Sensors,
     shown: Floats,
     speed_n_s: Floats,

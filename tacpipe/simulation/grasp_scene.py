@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
@@ -18,8 +18,6 @@ from tacpipe.simulation import antipodal, depth_camera, fingertip_sp, household,
 from tacpipe.simulation.depth_camera import Placed
 from tacpipe.simulation.household import Thing
 from tacpipe.simulation.primitives import Ellipsoid
-
-Floats = NDArray[np.float64]
 
 CAMERA_M = (0.9, 1.2)  # height above the table
 TILT_RAD = np.deg2rad(8.0)  # at most, of the camera

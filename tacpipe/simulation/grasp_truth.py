@@ -6,13 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp, schema
 from tacpipe.simulation import fingertip_sp, touch_bound
 from tacpipe.simulation.grasp_scene import Readings, Rig, Scene
-
-Floats = NDArray[np.float64]
 
 
 def bound(made: fingertip_sp.Sensors, scene: Scene, rig: Rig, rng: np.random.Generator) -> tuple[Floats, Floats]:

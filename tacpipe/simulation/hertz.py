@@ -7,9 +7,9 @@ together; forces are in newton, lengths in metres, curvatures in 1/m, moduli in 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import Floats
 
 
 def effective_radius_m(tip_m: float, curvatures_1_m: ArrayLike) -> Floats:

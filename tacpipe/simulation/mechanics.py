@@ -26,10 +26,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from tacpipe.arrays import Bools, Floats
 
 GRAVITY_M_S2 = 9.81
 UPWARDS_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])  # what the table or the hand does to an object at rest
@@ -75,8 +73,8 @@ class Contact:
     normal_n: Floats  # (time, finger)
     displacement_m: Floats  # (time, 2) of the object against the fingers, along x and z
     velocity_m_s: Floats  # (time, 2), likewise
-    slip: Flags  # (time,), held and slipping
-    dropped: Flags  # (time,)
+    slip: Bools  # (time,), held and slipping
+    dropped: Bools  # (time,)
     torque_nm: Floats  # (time,) about y, of both fingers together
     rotation_rad: Floats  # (time,) about y, of the object against the fingers
 
@@ -198,7 +196,7 @@ def _fall(
     return np.column_stack([displacement, velocity])
 
 
-def _twist(grasp: Grasp, force_n: Floats, held: Flags, step_s: float) -> tuple[Floats, Floats]:
+def _twist(grasp: Grasp, force_n: Floats, held: Bools, step_s: float) -> tuple[Floats, Floats]:
     """Return torque about y and rotation of the object against the fingers (time,).
 
     The centre of mass hangs ``lever_m`` next to the grasp at angle 0 and swings down as the object turns; friction holds

@@ -22,13 +22,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, mechanics, proximity, taxels, trajectory
-
-Floats = NDArray[np.float64]
 
 START_NS = 1_600_000_000_000_000_000  # UTC stamp of the first trial's start; the next ones follow minutes later
 TRIAL_NS = 120_000_000_000
@@ -145,7 +143,7 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     return Scene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
 
 
-def touch(scene: Scene, finger: int, true_ns: NDArray[np.int64], *, creep: float = taxels.CREEP) -> Floats:
+def touch(scene: Scene, finger: int, true_ns: Times, *, creep: float = taxels.CREEP) -> Floats:
     """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis)."""
     contact = scene.contact
     rows = np.minimum(np.searchsorted(scene.path.t_ns, true_ns), len(scene.path.t_ns) - 1)
@@ -165,8 +163,8 @@ def touch(scene: Scene, finger: int, true_ns: NDArray[np.int64], *, creep: float
 
 
 def _measured(
-    name: str, scene: Scene, true_ns: NDArray[np.int64], rig: Rig, rng: np.random.Generator
-) -> tuple[NDArray[Any], list[Any]]:
+    name: str, scene: Scene, true_ns: Times, rig: Rig, rng: np.random.Generator
+) -> tuple[AnyArray, list[Any]]:
     """Return what a device logs of samples taken at ``true_ns`` (time, channel), and its fields."""
     if name == "robot":
         return arm(scene, true_ns), [schema.float_field("finger_m", "m", "finger_width"), *schema.pose_fields()]
@@ -214,7 +212,7 @@ def _loss_row(load_n: Floats, grasp: mechanics.Grasp, rise_m: Floats, loss: floa
     return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
 
 
-def interpolation(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
+def interpolation(scene: Scene, true_ns: Times) -> Any:
     """Return a function that interpolates values at 1 kHz (time,) or (time, axis) to ``true_ns``."""
     rows = np.clip(np.searchsorted(scene.path.t_ns, true_ns, side="right"), 1, len(scene.path.t_ns) - 1)
     before_ns = scene.path.t_ns[rows - 1]
@@ -228,7 +226,7 @@ def interpolation(scene: Scene, true_ns: NDArray[np.int64]) -> Any:
     return at
 
 
-def arm(scene: Scene, true_ns: NDArray[np.int64]) -> Floats:
+def arm(scene: Scene, true_ns: Times) -> Floats:
     """Return finger width, position and quaternion (time, 8) at ``true_ns``: the gripper points down and yaws."""
     at = interpolation(scene, true_ns)
     half = at(scene.path.yaw_rad) / 2

@@ -12,14 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation import hertz
 from tacpipe.simulation.depth_camera import Placed
 from tacpipe.simulation.primitives import principal_curvatures
-
-Floats = NDArray[np.float64]
 
 TIP_M = 0.0067  # radius of a fingertip, an assumption
 SKIN_PA = 1.0e6  # modulus of its skin, an assumption

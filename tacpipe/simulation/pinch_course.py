@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.simulation import faults
 
 RATE_HZ = 100.0  # of readings
@@ -18,8 +18,8 @@ JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the h
 class Course:
     """When readings arrive (time,), and which fraction of the full force fingers press with then (time,)."""
 
-    t_ns: NDArray[np.int64]
-    fraction: NDArray[np.float64]
+    t_ns: Times
+    fraction: Floats
     moments_ns: dict[str, int]  # contact: first touch; hold: the force is reached; release: it begins to fall
 
 

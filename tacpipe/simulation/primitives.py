@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import Bools, Floats
 
 DOWN_Z = np.array([0.0, 0.0, -1.0])
 STABLE = 2.5  # largest height over width of what is stood on its end
@@ -215,7 +214,7 @@ class Frustum:
         outward = np.array([1.0, 0.0, -self.slope]) / np.hypot(1, self.slope)
         return [*standing, Rest(-outward, float(self.middle_m / np.hypot(1, self.slope)))]
 
-    def _on_side(self, at_m: Floats) -> NDArray[np.bool_]:
+    def _on_side(self, at_m: Floats) -> Bools:
         off = np.hypot(at_m[:, 0], at_m[:, 1])
         from_side = np.abs(off - self.middle_m - self.slope * at_m[:, 2])
         return np.asarray(from_side <= np.abs(self.half_m - np.abs(at_m[:, 2])))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import Floats
 
 RATE_HZ = 400.0
 REST_COUNT = 740.0

@@ -24,12 +24,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, fingertip, forearm, texture
-
-Floats = NDArray[np.float64]
 
 SENSORS = ("biotac", "roboskin")
 SPECTRA = ("shared", "independent")
@@ -95,14 +94,14 @@ class Scene:
     place: Place
     of: texture.Material
     surface: texture.Waves
-    true_ns: NDArray[np.int64]  # since the start of the trial
+    true_ns: Times  # since the start of the trial
     position_m: Floats  # of the slide
     speed_m_s: Floats
     force_n: Floats
     contact: Floats  # 0: nothing is touched, 1: pressed as in the slide
     phase: NDArray[np.int8]  # -1 before the slide, 0 in it, 1 after
     patch_m: Floats  # (time, axis): centre of what is pressed, along the skin and across it
-    pressure_count: fingertip.Counts  # of the finger's fluid, as it is logged; empty for RoboSkin
+    pressure_count: Counts  # of the finger's fluid, as it is logged; empty for RoboSkin
 
 
 def place(index: int, rig: Rig) -> Place:

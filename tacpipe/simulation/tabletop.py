@@ -8,13 +8,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import schema
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.simulation import depth_camera
 from tacpipe.simulation.depth_camera import Placed
 from tacpipe.simulation.primitives import Shape
-
-Floats = NDArray[np.float64]
 
 TABLE, OBJECT, CLUTTER = 0, 1, 2
 GAP_M = (0.04, 0.10)  # between the spheres that hold the two bodies

@@ -17,11 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Counts, Floats
 from tacpipe.channels import schema
-
-Floats = NDArray[np.float64]
 
 PITCH_M = 0.0047  # of the taxels; an assumption
 PAD_M = 2 * PITCH_M  # half the width of a pad: the centre of what presses on it stays within
@@ -147,7 +145,7 @@ def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.
     return off
 
 
-def digitised(counts: Floats) -> NDArray[np.uint16]:
+def digitised(counts: Floats) -> Counts:
     """Return counts (time, taxel, axis) as the device sends them (time, channel): rounded, within 16 bits."""
-    whole: NDArray[np.uint16] = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
+    whole: Counts = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
     return whole

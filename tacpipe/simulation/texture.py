@@ -14,9 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tacpipe.arrays import Floats
 
 GRATINGS = 3
 WAVELENGTH_M = (0.0025, 0.014)

@@ -10,11 +10,9 @@ others and may fall below this error. To hold a model against it, let nothing dr
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Counts, Floats
 from tacpipe.simulation import fingertip_sp, pinch
-
-Floats = NDArray[np.float64]
 
 DRAWS = 256
 
@@ -28,7 +26,7 @@ def readings(
     effort_spread: float = 0.15,
     noise_scale: float = 1.0,
     drift_count_day: float = 30.0,
-) -> NDArray[np.uint16]:
+) -> Counts:
     """Return what the sensors may read of one situation (draw, finger, channel), whatever is unseen drawn anew each time.
 
     Channels are the electrodes, then the pressure; times of drift are drawn too.
@@ -40,7 +38,7 @@ def readings(
     return fingertip_sp.counted(shown + off)
 
 
-def known(possible: NDArray[np.uint16]) -> tuple[Floats, Floats]:
+def known(possible: Counts) -> tuple[Floats, Floats]:
     """Return mean and variance of readings (draw, finger, channel), each (finger, channel), counts and counts squared."""
     return possible.mean(axis=0), possible.var(axis=0, ddof=1)
 

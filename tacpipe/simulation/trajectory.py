@@ -16,11 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Int64s, Times
 from tacpipe.errors import TacpipeError
-
-Floats = NDArray[np.float64]
 
 RATE_HZ = 1000  # of a Franka Emika Panda's states
 PROTOCOLS = ("controlled", "kinaesthetic")
@@ -45,7 +43,7 @@ TREMOR_M = (0.0002, 0.0008)  # amplitude along each axis: up to 0.5 m/s²
 class Trajectory:
     """Where the hand is at `RATE_HZ` from 0; arrays are (time,) or (time, axis), in the world."""
 
-    t_ns: NDArray[np.int64]
+    t_ns: Times
     position_m: Floats  # (time, axis)
     yaw_rad: Floats  # (time,)
 
@@ -163,5 +161,5 @@ def _times_s(rows: int) -> Floats:
     return np.arange(rows) / RATE_HZ
 
 
-def _stamps(rows: int) -> NDArray[np.int64]:
+def _stamps(rows: int) -> Int64s:
     return np.arange(rows, dtype=np.int64) * (1_000_000_000 // RATE_HZ)

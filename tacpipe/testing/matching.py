@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray
 from tacpipe.sensors.sensor import Samples
 
 if TYPE_CHECKING:
@@ -22,18 +22,18 @@ STAMPS = (
 )  # columns of a recorded stream that are no channels
 
 
-def sent_columns(samples: Samples) -> list[NDArray[Any]]:
+def sent_columns(samples: Samples) -> list[AnyArray]:
     """Return the values of each channel (sample,)."""
     return [column for block in samples.values for column in block.T]
 
 
-def recorded_columns(table: pa.Table) -> list[NDArray[Any]]:
+def recorded_columns(table: pa.Table) -> list[AnyArray]:
     """Return the values of each channel of a recorded stream (sample,), without stamps and counters."""
     names = [name for name in table.column_names if name not in STAMPS]
     return [table.column(name).to_numpy(zero_copy_only=False) for name in names]
 
 
-def keys(columns: Sequence[NDArray[Any]]) -> list[bytes]:
+def keys(columns: Sequence[AnyArray]) -> list[bytes]:
     """Return all that each sample says as bytes (sample,); of texts their hash, good within one process."""
     texts = [column for column in columns if column.dtype.kind == "O"]
     parts = [column for column in columns if column.dtype.kind != "O"]

@@ -18,11 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Int32s
 from tacpipe.simulation import fingertip, forearm, slide, texture
-
-Floats = NDArray[np.float64]
 
 FRAMES = 400  # from the middle of a BioTac's slide, as classifiers are given them
 STEP_M = 0.0005  # of a track
@@ -49,7 +47,7 @@ def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.Rig) -> fl
     return float(np.mean(likelihood_materials(seed, indices, rig) == np.array(wanted)))
 
 
-def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.Rig) -> NDArray[np.int32]:
+def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.Rig) -> Int32s:
     """Return the material that each of trials ``indices`` of the rig most likely is of (trial,), 1 to ``rig.materials``."""
     return np.array([log_likelihoods(seed, index, rig).argmax() + 1 for index in indices], np.int32)
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Floats
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.clouds.segmentation import Limits
 
-Floats = NDArray[np.float64]
 STEP = 0.003  # between rays, as tangents: 3.3 mm on the table
 DEPTH_M = 1.1  # of the table's middle
 LIMITS = Limits(
@@ -32,8 +31,8 @@ class Scene:
     """What the camera sees, which of its points are what, and the grasp of the ball."""
 
     cloud: Cloud
-    ball: NDArray[np.bool_]  # (point,)
-    box: NDArray[np.bool_]  # (point,)
+    ball: Bools  # (point,)
+    box: Bools  # (point,)
     grasp: Grasp
     normal: Floats  # of the table (xyz), to the camera's side
 

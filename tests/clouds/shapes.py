@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds.cloud import Cloud
 
-Floats = NDArray[np.float64]
 PLACE_M = np.array([0.05, -0.1, 1.2])  # in front of the camera
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tacpipe.arrays import Floats
 from tacpipe.clouds.candidates import MOST, Candidate, candidates
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
@@ -19,7 +19,7 @@ from tests.conftest import sample_data
 PUBLISHED = sample_data() / "vision2tactile"
 
 
-def ends(found: list[Candidate]) -> NDArray[np.float64]:
+def ends(found: list[Candidate]) -> Floats:
     """All grasp points (candidate, finger, xyz)."""
     return np.array([[candidate.grasp.g1_m, candidate.grasp.g2_m] for candidate in found])
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bytes, Int64s
 from tacpipe.sensors.framing import Chunks, Framer, Loss, Run
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.sensors.text_framer import LineFramer
 
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, AnyArray]
 Limits = dict[str, tuple[int, int]]
 
 
@@ -37,7 +37,7 @@ def samples(kind: str, sensor: Sensor, count: int, seed: int = 0) -> Samples:
     )
 
 
-def blocks(kind: str, sensor: Sensor, columns: Columns) -> tuple[NDArray[Any], ...]:
+def blocks(kind: str, sensor: Sensor, columns: Columns) -> tuple[AnyArray, ...]:
     """Return the columns as blocks (sample, channel), one for each stretch of fields of one type.
 
     Sensors whose outputs are chosen in the rig file have a block an output instead.
@@ -58,7 +58,7 @@ def blocks(kind: str, sensor: Sensor, columns: Columns) -> tuple[NDArray[Any], .
 def taken(samples: Samples, rows: Any) -> Samples:
     """Return some of the samples."""
 
-    def of(values: NDArray[Any] | None) -> NDArray[Any] | None:
+    def of(values: AnyArray | None) -> AnyArray | None:
         return None if values is None else values[rows]
 
     values = tuple(block[rows] for block in samples.values)
@@ -136,14 +136,14 @@ def rows(samples: Samples) -> list[bytes]:
     return [row.tobytes() for row in np.hstack(parts)]
 
 
-def _bits(values: Sequence[NDArray[Any]]) -> NDArray[np.uint8]:
+def _bits(values: Sequence[AnyArray]) -> Bytes:
     if not len(values[0]):
         return np.zeros((0, 0), dtype=np.uint8)
     values = [block.astype("U64") if block.dtype.kind == "O" else block for block in values]
     return np.hstack([np.ascontiguousarray(block).view(np.uint8).reshape(len(block), -1) for block in values])
 
 
-def _counted(modulus: int | None, step: int, count: int) -> NDArray[np.int64] | None:
+def _counted(modulus: int | None, step: int, count: int) -> Int64s | None:
     """Return a counter that goes round once within the samples, where that is not too far off."""
     if modulus is None:
         return None
@@ -151,7 +151,7 @@ def _counted(modulus: int | None, step: int, count: int) -> NDArray[np.int64] | 
     return np.asarray((first + step * np.arange(count)) % modulus, dtype=np.int64)
 
 
-def _column(field: Any, count: int, rng: np.random.Generator, limits: Limits) -> NDArray[Any]:
+def _column(field: Any, count: int, rng: np.random.Generator, limits: Limits) -> AnyArray:
     kind = np.dtype(field.type.to_pandas_dtype())
     if kind.kind == "O":
         return np.array([f"{TEXT}{number}" for number in range(count)], dtype=object)

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray
 from tacpipe.sensors.framing import Chunks, Loss
 from tacpipe.sensors.sensor import Device, Dialogue, Samples, Sensor
 
@@ -32,7 +32,7 @@ def read(sensor: Sensor, data: bytes, sizes: Sequence[int] = (50,)) -> tuple[lis
     return samples + [sensor.decode(run.frames) for run in runs], losses + lost
 
 
-def values(samples: Sequence[Samples]) -> list[NDArray[Any]]:
+def values(samples: Sequence[Samples]) -> list[AnyArray]:
     """Return the blocks of samples one after the other, each (sample, channel)."""
     there = [each for each in samples if len(each)]
     return [np.concatenate(blocks) for blocks in zip(*(each.values for each in there), strict=True)]

@@ -10,8 +10,8 @@ import pytest
 from anyskin.sensor import AnySkinBase
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.sensors.anyskin import AnySkin
 from tacpipe.sensors.sensor import Samples
@@ -44,7 +44,7 @@ class Client(AnySkinBase):  # type: ignore[misc]
     def __del__(self) -> None: ...
 
 
-def made(count: int, seed: int, magnetometers: int = 5) -> NDArray[np.float32]:
+def made(count: int, seed: int, magnetometers: int = 5) -> Float32s:
     rng = np.random.default_rng(seed)
     flux = rng.normal(0, 500, (count, magnetometers, 4))
     flux[:, :, 0] = 25 + flux[:, :, 0] / 1000

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes
 from tacpipe.sensors import checks
 
 FRAMES = arrays.arrays(np.uint8, st.tuples(st.integers(1, 6), st.integers(0, 70)))
@@ -39,7 +39,7 @@ def test_the_published_check_values_come_out(crc: object, value: int) -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(FRAMES)
-def test_crcs_are_those_of_the_standard_library(frames: NDArray[np.uint8]) -> None:
+def test_crcs_are_those_of_the_standard_library(frames: Bytes) -> None:
     assert checks.crc32(frames).tolist() == [zlib.crc32(frame.tobytes()) for frame in frames]
     assert checks.crc16_ccitt(frames).tolist() == [binascii.crc_hqx(frame.tobytes(), 0xFFFF) for frame in frames]
     assert checks.xor8(frames).tolist() == [functools.reduce(operator.xor, frame.tobytes(), 0) for frame in frames]
@@ -47,7 +47,7 @@ def test_crcs_are_those_of_the_standard_library(frames: NDArray[np.uint8]) -> No
 
 @settings(deadline=None, max_examples=50)
 @given(FRAMES)
-def test_the_sum_of_wts_is_that_of_its_step_byte_by_byte(frames: NDArray[np.uint8]) -> None:
+def test_the_sum_of_wts_is_that_of_its_step_byte_by_byte(frames: Bytes) -> None:
     for frame, found in zip(frames, checks.crc16_wts(frames).tolist(), strict=True):
         crc = 0xFFFF
         for byte in frame.tobytes():

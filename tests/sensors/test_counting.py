@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Int64s
 from tacpipe.sensors.counting import Counted, Counting
 
 WRAP = 1 << 16
@@ -17,7 +17,7 @@ PERIOD_NS = 1_000_000
 
 def counted(counting: Counting, first: int, count: int, at_s: float) -> Counted:
     """Feed counters from ``first`` on, one a period from ``at_s`` on, as a device sends them that wraps."""
-    rows: NDArray[np.int64] = np.arange(count, dtype=np.int64)
+    rows: Int64s = np.arange(count, dtype=np.int64)
     return counting.feed((first + rows) * counting.step % counting.modulus, round(at_s * 1e9) + rows * PERIOD_NS)
 
 

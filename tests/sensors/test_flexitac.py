@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes
 from tacpipe.errors import UsageError
 from tacpipe.sensors.flexitac import FlexiTac
 from tacpipe.sensors.sensor import Samples
@@ -17,7 +17,7 @@ from tests.sensors.serial_lab import FakeSerial, read, rows_of, served, stream
 SMALL = FlexiTac(rows=4, columns=5)
 
 
-def made(sensor: FlexiTac, count: int, seed: int) -> NDArray[np.uint8]:
+def made(sensor: FlexiTac, count: int, seed: int) -> Bytes:
     return np.random.default_rng(seed).integers(0, 256, (count, sensor.rows * sensor.columns), dtype=np.uint8)
 
 

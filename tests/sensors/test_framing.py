@@ -8,26 +8,24 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Bytes
 from tacpipe.sensors import checks, framing
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Chunks, Framing, Loss, Run
 from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.text_framer import LineFramer
 
-Right = NDArray[np.bool_]
 
-
-def sum_is_right(frames: framing.Bytes) -> Right:
+def sum_is_right(frames: Bytes) -> Bools:
     return np.asarray(checks.sum8(frames[:, :-1]) == frames[:, -1])
 
 
-def sum16_is_right(frames: framing.Bytes) -> Right:
+def sum16_is_right(frames: Bytes) -> Bools:
     return np.asarray(checks.sum16(frames[:, :-2]) == frames[:, -2] + 256 * frames[:, -1].astype(int))
 
 
-def inner_sum_is_right(frames: framing.Bytes) -> Right:
+def inner_sum_is_right(frames: Bytes) -> Bools:
     body = frames[:, 4:-4]
     if body.shape[1] < 3:
         return np.zeros(len(frames), dtype=bool)

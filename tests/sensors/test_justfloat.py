@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.sensors.justfloat import JustFloat
 from tacpipe.sensors.sensor import Samples
@@ -36,7 +36,7 @@ def test_a_frame_by_hand_is_read() -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(FLOATS)
-def test_decode_undoes_encode(floats: NDArray[np.float32]) -> None:
+def test_decode_undoes_encode(floats: Float32s) -> None:
     assert np.array_equal(ANY.decode(ANY.encode(Samples((floats,)))).values[0], floats)
 
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from numpy.typing import NDArray
 from tactile_sdk import TactilePressureSDK
 from tactile_sdk.protocol.crc16 import calculate_crc16
 from tactile_sdk.protocol.modbus_rtu import ModbusRTU
 
+from tacpipe.arrays import Counts
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.modbus_tactile import ModbusTactile, with_crc
 from tacpipe.sensors.sensor import Samples
@@ -27,7 +27,7 @@ class Transport(FakeSerial):
     is_open, timeout = True, 0.1
 
 
-def made(count: int, seed: int) -> NDArray[np.uint16]:
+def made(count: int, seed: int) -> Counts:
     return np.random.default_rng(seed).integers(0, 1 << 16, (count, 60), dtype=np.uint16)
 
 
@@ -48,7 +48,7 @@ def test_it_is_asked_with_the_vendors_request() -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(TAXELS, st.lists(st.integers(20, 300), min_size=1, max_size=4))
-def test_what_was_encoded_is_decoded_however_it_is_cut(taxels: NDArray[np.uint16], sizes: list[int]) -> None:
+def test_what_was_encoded_is_decoded_however_it_is_cut(taxels: Counts, sizes: list[int]) -> None:
     found, losses = read(SENSOR, stream(SENSOR.encode(Samples((taxels,)))), sizes)
     assert rows_of(found) == [row.tobytes() for row in taxels] and not losses
 

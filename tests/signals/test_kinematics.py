@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import IIWA14, PANDA, Chain
-
-Floats = NDArray[np.floating[Any]]
 
 TOOL = np.array([0.01, -0.02, 0.2])  # of the hand in the last link's frame, m
 STEP_S = 1e-4
 
 
-def joints(rows: int = 200) -> tuple[Floats, Floats]:
+def joints(rows: int = 200) -> tuple[AnyFloats, AnyFloats]:
     """A smooth path: angles and speeds, (time, joint)."""
     time_s = np.arange(rows)[:, None] * STEP_S
     size, rate, phase = np.linspace(0.3, 0.9, 7), np.linspace(4, 11, 7), np.linspace(0, 5, 7)
     return size * np.sin(rate * time_s + phase), size * rate * np.cos(rate * time_s + phase)
 
 
-def elementary(joint_rad: Floats, chain: Chain = PANDA) -> list[Floats]:
+def elementary(joint_rad: AnyFloats, chain: Chain = PANDA) -> list[AnyFloats]:
     """The frames of one row as Craig has them: turn and shift along x, then turn and shift along z."""
-    reached: Floats = np.eye(4)
-    found: list[Floats] = []
+    reached: AnyFloats = np.eye(4)
+    found: list[AnyFloats] = []
     for angle, length, offset, twist in zip(joint_rad, chain.length_m, chain.offset_m, chain.twist_rad, strict=True):
         for axis, turn, shift in (("x", twist, [length, 0, 0]), ("z", angle, [0, 0, offset])):
             step = np.eye(4)
@@ -38,9 +34,9 @@ def elementary(joint_rad: Floats, chain: Chain = PANDA) -> list[Floats]:
     return found
 
 
-def hand(joint_rad: Floats) -> Floats:
+def hand(joint_rad: AnyFloats) -> AnyFloats:
     last = kinematics.joint_frames(PANDA, joint_rad)[:, -1]
-    found: Floats = last[:, :3, :3] @ TOOL + last[:, :3, 3]
+    found: AnyFloats = last[:, :3, :3] @ TOOL + last[:, :3, 3]
     return found
 
 
@@ -98,7 +94,7 @@ def test_rows_that_are_not_finite_do_not_make_it_another_arm() -> None:
 
 
 @pytest.mark.parametrize("steps_ms", [np.full(49, 20), np.tile([10, 20, 30, 15, 25, 20, 20], 7)])
-def test_differences_of_steady_motion_are_its_velocity(steps_ms: NDArray[Any]) -> None:
+def test_differences_of_steady_motion_are_its_velocity(steps_ms: AnyArray) -> None:
     t_ns = np.concatenate([[0], np.cumsum(steps_ms)]) * 1_000_000
     time_s = t_ns[:, None] / 1e9
     velocity, turning = np.array([0.1, -0.2, 0.05]), np.array([0.3, 0.6, -0.9])

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.io.hashing import digest
 from tacpipe.simulation.grasp import simulate_trial
@@ -36,7 +36,7 @@ def grasps(rig: Rig, indices: Iterable[int], *, seed: int = SEED) -> Any:
     return FakeDataset(shards, {})
 
 
-def readings(made: Any, target: str, stream: str = "reading", prefix: str = "") -> NDArray[np.float64]:
+def readings(made: Any, target: str, stream: str = "reading", prefix: str = "") -> Floats:
     """What was read of a target (grasp, value), counts; with ``truth`` and ``gt_expected_`` what was to be expected."""
     columns = [prefix + column for column in biotac_sp.columns(target)]
     rows = [[shard.table(stream).column(column)[0].as_py() for column in columns] for shard in made.recordings.values()]

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.simulation.bow import Bow
 from tacpipe.simulation.primitives import Box, Ellipsoid, Frustum, Shape
-
-Floats = NDArray[np.float64]
 
 BOX = Box(np.array([0.02, 0.03, 0.045]))
 ELLIPSOID = Ellipsoid(np.array([0.02, 0.03, 0.05]))

@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.metrics.forecast import skill
 from tacpipe.plugins.registry import load
 from tacpipe.simulation import taxels, trajectory
@@ -26,8 +26,6 @@ from tacpipe.tasks.forward.predictors import BASELINE, MODEL, predicted
 from tests.asked import fitting
 from tests.stages.conftest import FakeShard as Recording
 from tests.stages.learning_fakes import FakeShard, dataset
-
-Floats = NDArray[np.floating[Any]]
 
 HORIZON = 10
 ROW_NS = 20_000_000
@@ -80,23 +78,23 @@ def forecasters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Forecaste
     }
 
 
-def column(shard: FakeShard, name: str) -> Floats:
+def column(shard: FakeShard, name: str) -> AnyFloats:
     return np.asarray(shard.content.column(name).to_numpy(), dtype=np.float64)
 
 
-def columns(shard: FakeShard, pattern: str) -> Floats:
+def columns(shard: FakeShard, pattern: str) -> AnyFloats:
     return np.column_stack([column(shard, pattern.format(axis)) for axis in "xyz"])
 
 
-def aloft(shard: FakeShard, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
+def aloft(shard: FakeShard, starts: Int64s) -> Bools:
     """Which windows begin when the object is in the air: before, the grip tells most of what comes."""
     position = columns(shard, "robot_position_{}_m")
     apart = np.linalg.norm(position - position[0], axis=1)
-    found: NDArray[np.bool_] = np.logical_or.accumulate(apart > ALOFT_M)[starts]
+    found: Bools = np.logical_or.accumulate(apart > ALOFT_M)[starts]
     return found
 
 
-def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False) -> dict[str, Floats]:
+def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False) -> dict[str, AnyFloats]:
     """The squared errors in counts (window, step) of model and persistence, in the air."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     starts = track.starts(forecaster.context, forecaster.horizon)
@@ -147,7 +145,7 @@ def acceleration_forecast() -> Any:
     return lambda given: network((torch.from_numpy(given).float() - mean) / spread).detach().numpy()
 
 
-def flight(index: int) -> tuple[Floats, Floats]:
+def flight(index: int) -> tuple[AnyFloats, AnyFloats]:
     """What is known of a random trajectory in the air at each row, and the change of acceleration to come."""
     rng = np.random.default_rng([7, index])
     path = trajectory.trajectory(trajectory.PROTOCOLS[index % 2], 12.0, 1.5, rng)
@@ -157,7 +155,7 @@ def flight(index: int) -> tuple[Floats, Floats]:
     return known(position, acceleration, now), acceleration[now + HORIZON] - acceleration[now]
 
 
-def known(position: Floats, acceleration: Floats, now: NDArray[np.int64]) -> Floats:
+def known(position: AnyFloats, acceleration: AnyFloats, now: Int64s) -> AnyFloats:
     before = [acceleration[now - lag] for lag in LAGS]
     return np.hstack([*before, position[now] - position[0], position[now] - position[now - 1]])
 
@@ -189,8 +187,8 @@ def bound_without_plan() -> float:
 class Watch:
     """How near load comes to slip, (time,): felt, and foretold ten steps before; and what it is where slip begins."""
 
-    felt: Floats
-    ahead: Floats
+    felt: AnyFloats
+    ahead: AnyFloats
     limit: float
 
 
@@ -209,10 +207,10 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     return Watch(felt, pull_over_pressure(ahead), limit)
 
 
-def pull_over_pressure(counts: Floats) -> Floats:
+def pull_over_pressure(counts: AnyFloats) -> AnyFloats:
     """The ratio (time,) that friction bounds; ``counts`` are (time, channel)."""
     x, y, z = (counts[:, axis::3].sum(axis=1) for axis in range(3))
-    ratio: Floats = np.hypot(x, y) / np.maximum(np.abs(z), 1.0)
+    ratio: AnyFloats = np.hypot(x, y) / np.maximum(np.abs(z), 1.0)
     return ratio
 
 
@@ -249,7 +247,7 @@ def loaded(index: int) -> FakeShard:
     return FakeShard(shard.name, content, shard.attributes)
 
 
-def altered(shard: FakeShard, change: dict[str, Floats]) -> FakeShard:
+def altered(shard: FakeShard, change: dict[str, AnyFloats]) -> FakeShard:
     """The recording with some values added to its columns."""
     content = shard.content
     for name, values in change.items():
@@ -261,7 +259,7 @@ def altered(shard: FakeShard, change: dict[str, Floats]) -> FakeShard:
     return FakeShard(shard.name, content, shard.attributes)
 
 
-def said(forecaster: Forecaster, shard: FakeShard) -> tuple[NDArray[np.int64], Floats]:
+def said(forecaster: Forecaster, shard: FakeShard) -> tuple[Int64s, AnyFloats]:
     """The rows at which predictions are made, and these (window, step, channel)."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     parts = list(predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
@@ -269,7 +267,7 @@ def said(forecaster: Forecaster, shard: FakeShard) -> tuple[NDArray[np.int64], F
     return np.concatenate([some.now for some in parts]), counts
 
 
-def from_row(shard: FakeShard, row: int, values: Floats | float) -> Floats:
+def from_row(shard: FakeShard, row: int, values: AnyFloats | float) -> AnyFloats:
     added = np.zeros(shard.content.num_rows)
     added[row:] = values
     return added
@@ -300,7 +298,7 @@ def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
     noise = (np.square(taxels.NOISE_COUNT) + 1 / 12).mean()
     forecaster = trained(tmp_path, [loaded(index) for index in range(8)], [loaded(8)], epochs=6, hidden=32)
     own = slice(0, len(forecaster.codec.channels) // 2)  # xela1: what stands between its rows is not interpolated
-    squared: dict[str, list[Floats]] = {MODEL: [], BASELINE: []}
+    squared: dict[str, list[AnyFloats]] = {MODEL: [], BASELINE: []}
     for index in range(9, 14):
         shard = loaded(index)
         track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
 from tacpipe.tasks.material import task as material
@@ -45,7 +45,7 @@ def slides(seed: int, numbers: range, spectra: str) -> list[Slide]:
 
 
 @cache
-def named(spectra: str) -> dict[str, NDArray[np.float64]]:
+def named(spectra: str) -> dict[str, Floats]:
     """How RoboSkin's slides of each material of each seed are named while it is not told of it: shares named rightly.
 
     ``every``: of all materials, ``among``: of those held out; by what the BioTac was told. Both are (material,).
@@ -66,7 +66,7 @@ def named(spectra: str) -> dict[str, NDArray[np.float64]]:
     return {name: np.array(shares) for name, shares in found.items()}
 
 
-def margin(shares: NDArray[np.float64], chance: float) -> float:
+def margin(shares: Floats, chance: float) -> float:
     """Three standard errors of the mean over materials, of which a guesser names all slides rightly or none."""
     return float(3 * max(shares.std(ddof=1), np.sqrt(chance * (1 - chance))) / np.sqrt(len(shares)))
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray
 from tacpipe.channels import schema
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import IIWA14
 
 START_NS = 1_581_072_654_000_000_000
 LIMIT_M_S = 0.025
-Floats = NDArray[np.floating[Any]]
 
 
-def finger(pressure: NDArray[Any], seed: int = 0) -> pa.Table:
+def finger(pressure: AnyArray, seed: int = 0) -> pa.Table:
     """Return a BioTac's stream at 100 Hz: electrodes from 10 to 60 counts, and this pressure."""
     rng = np.random.default_rng(seed)
     rows = len(pressure)
@@ -26,7 +23,7 @@ def finger(pressure: NDArray[Any], seed: int = 0) -> pa.Table:
     return schema.stream(START_NS + np.arange(rows) * 10_000_000, list(counts), schema.biotac_fields())
 
 
-def pressed(rows: int = 800, reached: int = 0) -> NDArray[Any]:
+def pressed(rows: int = 800, reached: int = 0) -> AnyArray:
     """Return a pressure that reaches 40 counts in the row ``reached``, and falls below for most of what follows."""
     found = np.full(rows, 25)
     found[:reached] = np.minimum(np.arange(reached), 39)

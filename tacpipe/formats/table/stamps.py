@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Int64s, Times
 from tacpipe.formats.table.layout import TimeUnit
 
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
@@ -29,7 +29,7 @@ class StampError(ValueError):
         self.row, self.found, self.wanted = row, found, wanted
 
 
-def nanoseconds(column: pa.Array, unit: TimeUnit, zone: str = "UTC") -> NDArray[np.int64]:
+def nanoseconds(column: pa.Array, unit: TimeUnit, zone: str = "UTC") -> Int64s:
     """Return stamps as nanoseconds (time,); numbers as ``unit`` has them, rounded half to even.
 
     Raises `StampError` for a missing stamp, one that is not a time, and one beyond what 64 bits hold (the year 2262).
@@ -55,14 +55,14 @@ def nanoseconds(column: pa.Array, unit: TimeUnit, zone: str = "UTC") -> NDArray[
     return _of_floats(column, 10 ** DIGITS[unit])
 
 
-def _of_text(column: pa.Array, zone: str) -> NDArray[np.int64]:
+def _of_text(column: pa.Array, zone: str) -> Int64s:
     text = pc.replace_substring_regex(pc.utf8_trim_whitespace(column.cast(pa.string())), _LOGGED, r"\1.\2")
     zoned = [bool(_ZONED.fullmatch(one)) for one in text[:1].to_pylist()]
     if zoned == [True]:
         stamps = _parsed(text, pa.timestamp("ns", "UTC"))
     else:
         stamps = pc.assume_timezone(_parsed(text, pa.timestamp("ns")), zone)
-    found: NDArray[np.int64] = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
+    found: Int64s = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
     return found
 
 
@@ -81,16 +81,16 @@ def _parsed(text: pa.Array, kind: pa.DataType) -> pa.Array:
         raise
 
 
-def _of_decimals(column: pa.Array, digits: int) -> NDArray[np.int64]:
+def _of_decimals(column: pa.Array, digits: int) -> Int64s:
     kept = pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))
     # A decimal128 is a whole number of its last digit in two words of eight bytes, the low one first.
     words = np.frombuffer(kept.buffers()[1], dtype="<i8").reshape(-1, 2)[kept.offset :][: len(kept)]
-    t_ns: NDArray[np.int64] = words[:, 0].astype(np.int64)
+    t_ns: Times = words[:, 0].astype(np.int64)
     _refuse(pa.array(words[:, 1] != t_ns >> 63), column, "a time before the year 2262")
     return t_ns
 
 
-def _of_integers(column: pa.Array, factor: int) -> NDArray[np.int64]:
+def _of_integers(column: pa.Array, factor: int) -> Int64s:
     values = column.to_numpy(zero_copy_only=False)
     most = np.iinfo(np.int64).max // factor
     _refuse(
@@ -98,16 +98,16 @@ def _of_integers(column: pa.Array, factor: int) -> NDArray[np.int64]:
         column,
         "a time before the year 2262",
     )
-    t_ns: NDArray[np.int64] = values.astype(np.int64) * factor
+    t_ns: Times = values.astype(np.int64) * factor
     return t_ns
 
 
-def _of_floats(column: pa.Array, factor: int) -> NDArray[np.int64]:
+def _of_floats(column: pa.Array, factor: int) -> Int64s:
     values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
     _refuse(pa.array(bad), column, "a time before the year 2262")
     whole = np.floor(values)  # apart from the rest: their product with the factor would be rounded
-    t_ns: NDArray[np.int64] = whole.astype(np.int64) * factor + np.rint((values - whole) * factor).astype(np.int64)
+    t_ns: Times = whole.astype(np.int64) * factor + np.rint((values - whole) * factor).astype(np.int64)
     return t_ns
 
 

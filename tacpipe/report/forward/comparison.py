@@ -9,11 +9,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, AnyFloats, Int64s
 from tacpipe.metrics import forecast
 from tacpipe.metrics.forecast import Interval
 from tacpipe.metrics.headline import Headline
@@ -24,8 +23,6 @@ from tacpipe.report.forward.methods import Method, Run
 from tacpipe.report.spread import Spread, spread
 from tacpipe.tasks.forward import headline as headlines
 
-Floats = NDArray[np.floating[Any]]
-
 _draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 
@@ -34,34 +31,34 @@ class Pool:
     """The error sums of one predictor over runs, next to those of persistence on the same windows."""
 
     recordings: tuple[str, ...]
-    windows: NDArray[np.int64]  # (recording,), those of several runs added
+    windows: Int64s  # (recording,), those of several runs added
     distinct_windows: int  # each counted once
     runs: int
     steps: tuple[int, ...]
     channels: int
-    squared: Floats  # (recording, step)
-    absolute: Floats  # (recording, step)
-    baseline: Floats  # (recording, step), squared errors of persistence
+    squared: AnyFloats  # (recording, step)
+    absolute: AnyFloats  # (recording, step)
+    baseline: AnyFloats  # (recording, step), squared errors of persistence
 
     @property
-    def mse(self) -> Floats:
+    def mse(self) -> AnyFloats:
         """The mean squared error of each step, (step,)."""
-        found: Floats = self.squared.sum(axis=0) / (self.windows.sum() * self.channels)
+        found: AnyFloats = self.squared.sum(axis=0) / (self.windows.sum() * self.channels)
         return found
 
     @property
-    def mae(self) -> Floats:
+    def mae(self) -> AnyFloats:
         """The mean absolute error of each step, (step,)."""
-        found: Floats = self.absolute.sum(axis=0) / (self.windows.sum() * self.channels)
+        found: AnyFloats = self.absolute.sum(axis=0) / (self.windows.sum() * self.channels)
         return found
 
     @property
-    def baseline_mse(self) -> Floats:
+    def baseline_mse(self) -> AnyFloats:
         """The mean squared error of persistence at each step, (step,)."""
-        found: Floats = self.baseline.sum(axis=0) / (self.windows.sum() * self.channels)
+        found: AnyFloats = self.baseline.sum(axis=0) / (self.windows.sum() * self.channels)
         return found
 
-    def at(self, values: Floats, steps: Sequence[int]) -> Floats:
+    def at(self, values: AnyFloats, steps: Sequence[int]) -> AnyFloats:
         """Return the columns of ``values`` (…, step) that belong to ``steps``."""
         return values[..., [self.steps.index(step) for step in steps]]
 
@@ -175,7 +172,7 @@ def headline(method: Method, others: Sequence[Method], steps: Sequence[int], kno
 
 def _sums(runs: Sequence[Run], predictor: str, steps: Sequence[int], known: bool | None) -> Sums:
     """Return what a headline is computed from, by seed and recording."""
-    found: dict[tuple[Hashable, str], Floats] = {}
+    found: dict[tuple[Hashable, str], AnyFloats] = {}
     for run in runs:
         one = _part(run, predictor, "both", known)
         if one is None:
@@ -254,7 +251,7 @@ def _part(run: Run, predictor: str, group: str, known: bool | None) -> Pool | No
     return Pool(names, windows, *described, sums[0][held], sums[1][held], baseline[0][held])
 
 
-def _skills(weights: NDArray[Any], pooled: Pool, steps: Sequence[int]) -> Floats:
+def _skills(weights: AnyArray, pooled: Pool, steps: Sequence[int]) -> AnyFloats:
     """Return skill at ``steps`` and its mean, (draw, step + 1), each recording counted as ``weights`` (draw, it) state."""
     found = forecast.skill(
         weights @ pooled.at(pooled.squared, steps), weights @ pooled.at(pooled.baseline, steps)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Floats = NDArray[np.floating[Any]]
 
 FILE = "errors.parquet"
 MODEL, BASELINE = "model", "persistence"
@@ -40,14 +39,14 @@ class ErrorSums:
     groups: tuple[str, ...]
     recordings: tuple[str, ...]  # that the model was not trained on
     steps: tuple[int, ...]
-    known: NDArray[np.bool_]  # (recording,): other recordings of its object were trained on
-    windows: NDArray[np.int64]  # (recording,)
+    known: Bools  # (recording,): other recordings of its object were trained on
+    windows: Int64s  # (recording,)
     channels: Mapping[str, int]  # by group
-    squared: Floats  # (predictor, group, recording, step)
-    absolute: Floats  # (predictor, group, recording, step)
+    squared: AnyFloats  # (predictor, group, recording, step)
+    absolute: AnyFloats  # (predictor, group, recording, step)
     named: bool = True  # whether any recording names its object: else none is known or unseen
 
-    def of(self, predictor: str, group: str) -> tuple[Floats, Floats] | None:
+    def of(self, predictor: str, group: str) -> tuple[AnyFloats, AnyFloats] | None:
         """Return squared and absolute sums, both (recording, step); None where there are none."""
         if predictor not in self.predictors or group not in self.groups:
             return None
@@ -105,7 +104,7 @@ def read(content: bytes) -> ErrorSums:
     )
 
 
-def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:
     """Return the distinct values of a text column in the order in which they come, and the place of each row's."""
     encoded = column.combine_chunks().dictionary_encode()
     return tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.report.drawing import COLOURS, FAINT, INK, Floats, svg
+from tacpipe.arrays import AnyFloats
+from tacpipe.report.drawing import COLOURS, FAINT, INK, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -116,7 +117,7 @@ def explained_variance(ratio: Sequence[float], kept: int) -> str:
     return svg(draw, "Fraction of variance by principal component", size=(5.4, 3.4))
 
 
-def covariance(matrix: Floats) -> str:
+def covariance(matrix: AnyFloats) -> str:
     """Return a covariance matrix (latent, latent) in squares: the stronger the colour, the farther from 0."""
 
     def draw(axes: list[Axes]) -> None:
@@ -158,7 +159,7 @@ def loss_by_width(series: Mapping[str, Mapping[int, float]]) -> str:
     return svg(draw, "Reconstruction error by number of latents", size=(5.4, 3.4))
 
 
-def traces(time_s: Floats, truth: Mapping[str, Floats], ahead: Mapping[str, Mapping[str, Floats]]) -> str:
+def traces(time_s: AnyFloats, truth: Mapping[str, AnyFloats], ahead: Mapping[str, Mapping[str, AnyFloats]]) -> str:
     """Return one panel a latent: the truth (time,) and what was predicted for later at the time it was known.
 
     ``ahead`` is by latent, then by label (``t+5``). NaN breaks a line.

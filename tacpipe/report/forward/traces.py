@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.report.drawing import Floats
+from tacpipe.arrays import AnyFloats
 from tacpipe.report.forward import figures
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ def draw(shard: Recording, latents: Sequence[int], steps: Sequence[int]) -> str:
     if not chosen:
         return ""
 
-    def values(name: str) -> Floats:
-        column: Floats = table.column(name).to_numpy().astype(np.float64)
+    def values(name: str) -> AnyFloats:
+        column: AnyFloats = table.column(name).to_numpy().astype(np.float64)
         column[broken] = np.nan
         return column[: len(shown_s)]
 

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.metrics.proportions import wilson
 from tacpipe.report.material.methods import Run
 from tacpipe.report.material.predictions import LEVEL, MODEL, NOTHING
-
-Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class Verdicts:
     """The fraction of runs that named each slide right."""
 
     recordings: tuple[str, ...]
-    fraction: Floats  # (slide,)
+    fraction: AnyFloats  # (slide,)
 
 
 def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accuracy | None:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tacpipe.arrays import Ints
 from tacpipe.report import markup
 from tacpipe.report.markup import listed
 from tacpipe.report.material import comparison, figures, tables
-from tacpipe.report.material.figures import Integers
 from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import MODEL, NOTHING
 
@@ -30,7 +30,7 @@ def section(methods: Sequence[Method]) -> str:
     return f'<h3>Which materials are confused</h3><div class="pair">{"".join(drawn)}</div>{markup.note(NOTE)}'
 
 
-def counted(method: Method, sensor: str) -> tuple[Integers, list[int]]:
+def counted(method: Method, sensor: str) -> tuple[Ints, list[int]]:
     """Return how often each material was taken for each, pooled over runs, (material, named), and the materials."""
     truth, predicted = [], []
     for run in method.of(sensor):
@@ -45,7 +45,7 @@ def counted(method: Method, sensor: str) -> tuple[Integers, list[int]]:
     return counts, [int(one) for one in materials]
 
 
-def worst(counts: Integers, materials: Sequence[int]) -> str:
+def worst(counts: Ints, materials: Sequence[int]) -> str:
     """Return the materials most often taken for another, in words."""
     wrong = counts - np.diag(np.diag(counts))
     order = np.argsort(-wrong, axis=None, kind="stable")[:MOST_PAIRS]

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tacpipe.report.drawing import COLOURS, FAINT, INK, STYLES, Floats, hue, legend_below, svg
+from tacpipe.arrays import AnyFloats, Bools, Ints
+from tacpipe.report.drawing import COLOURS, FAINT, INK, STYLES, hue, legend_below, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Integers = NDArray[np.integer[Any]]
 
 MARKERS = ("o", "^", "s", "D")
 
@@ -34,8 +33,8 @@ class Cloud:
     """Latents of one sensor's slides in two dimensions."""
 
     sensor: str
-    points: Floats  # (slide, 2)
-    materials: Integers  # (slide,)
+    points: AnyFloats  # (slide, 2)
+    materials: Ints  # (slide,)
 
 
 def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Sequence[str] = ()) -> str:
@@ -65,7 +64,7 @@ def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Seque
     return svg(draw, title, size=(5.4, 3.4 + 0.2 * len(bands)))
 
 
-def confusion(counts: Integers, materials: Sequence[int], title: str) -> str:
+def confusion(counts: Ints, materials: Sequence[int], title: str) -> str:
     """Return how often each material (row) was taken for each (column), in squares; mistakes stand as numbers."""
 
     def draw(axes: list[Axes]) -> None:
@@ -130,7 +129,7 @@ def latents(clouds: Sequence[Cloud], partners: Mapping[int, int], title: str) ->
     return svg(draw, title, size=(5.0, 4.4))
 
 
-def profile(time_s: Floats, lines: Mapping[str, Floats], during: NDArray[np.bool_], quantity: str, title: str) -> str:
+def profile(time_s: AnyFloats, lines: Mapping[str, AnyFloats], during: Bools, quantity: str, title: str) -> str:
     """Return a recording's course over time, one line a name, with the slide shaded."""
 
     def draw(axes: list[Axes]) -> None:
@@ -162,5 +161,5 @@ def _apart(counts: Sequence[int]) -> list[int]:
     return kept[::-1]
 
 
-def _means(cloud: Cloud) -> dict[int, Floats]:
+def _means(cloud: Cloud) -> dict[int, AnyFloats]:
     return {int(one): cloud.points[cloud.materials == one].mean(axis=0) for one in np.unique(cloud.materials)}

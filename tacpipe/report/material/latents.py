@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.report import markup
 from tacpipe.report.material import comparison, figures
 from tacpipe.report.material.figures import Cloud
 from tacpipe.report.material.methods import Method, Run, ordered, shown
-from tacpipe.report.material.predictions import Floats, Predictions
+from tacpipe.report.material.predictions import Predictions
 
 NOTE = (
     "Latents of unseen slides on their first two principal components, both sensors together: a colour is a material, whose "
@@ -33,7 +34,7 @@ def section(methods: Sequence[Method]) -> str:
     return f'<h3>Latents</h3><div class="pair">{"".join(drawn)}</div>{markup.note(NOTE)}'
 
 
-def projected(parts: Sequence[Floats]) -> list[Floats]:
+def projected(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
     """Return points of several sets, each (slide, latent), on the first two principal components of all, (slide, 2).
 
     Of the two directions of a component the one is taken in which its largest weight is positive.
@@ -92,6 +93,6 @@ def _rows(runs: Sequence[Run]) -> tuple[tuple[str, str], list[Predictions]] | No
     return (sensors[0], sensors[1]), parts
 
 
-def _latents(part: Predictions) -> Floats:
+def _latents(part: Predictions) -> AnyFloats:
     assert part.latents is not None
     return part.latents

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Floats = NDArray[np.floating[Any]]
 
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
@@ -29,9 +29,9 @@ class Predictions:
 
     recordings: NDArray[np.str_]  # (slide,)
     sensors: NDArray[np.str_]  # (slide,)
-    materials: NDArray[np.int64]  # (slide,), the truth
-    predicted: Mapping[str, NDArray[np.int64]]  # by predictor, (slide,)
-    latents: Floats | None  # (slide, latent); None where the model has none
+    materials: Int64s  # (slide,), the truth
+    predicted: Mapping[str, Int64s]  # by predictor, (slide,)
+    latents: AnyFloats | None  # (slide, latent); None where the model has none
     sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
 
     def of(self, sensor: str) -> Predictions:
@@ -81,12 +81,12 @@ def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
     )
 
 
-def _counted(table: pa.Table, config: Mapping[str, Any]) -> NDArray[np.bool_]:
+def _counted(table: pa.Table, config: Mapping[str, Any]) -> Bools:
     """Return which rows count (slide,)."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = table["material"].to_numpy()
     params = params_of.counting(registry.load("train.material"), config.get("params", {}))
-    counted: NDArray[np.bool_] = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
+    counted: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
     counted &= sensors != str(params.get("frozen_sensor", ""))
     for sensor, held in config.get("held_out", {}).items():
         counted &= ~((sensors == sensor) & np.isin(materials, held))

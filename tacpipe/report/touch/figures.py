@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.report.drawing import COLOURS, FAINT, INK, Floats, hue, legend_below, svg
+from tacpipe.arrays import AnyFloats
+from tacpipe.report.drawing import COLOURS, FAINT, INK, hue, legend_below, svg
 from tacpipe.report.spread import Spread
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ class Scattered:
 
     name: str
     novel: bool
-    true: Floats  # (grasp,)
-    predicted: Floats  # (grasp,)
+    true: AnyFloats  # (grasp,)
+    predicted: AnyFloats  # (grasp,)
 
 
 def scatter(objects: Sequence[Scattered], constant: float, quantity: str, title: str) -> str:
@@ -71,7 +72,7 @@ def settings(errors: Mapping[str, Spread], levels: Mapping[str, float], title: s
     return svg(draw, title, size=(5.4, 3.4 + 0.2 * len(levels)))
 
 
-def cloud(points_m: Floats, contacts_m: Floats, title: str) -> str:
+def cloud(points_m: AnyFloats, contacts_m: AnyFloats, title: str) -> str:
     """Return a cloud (point, xyz) from the camera and from the side, with where two fingers touch it (finger, xyz).
 
     Coloured points lie near a contact. Of large clouds, evenly many are left out.
@@ -106,7 +107,7 @@ def cloud(points_m: Floats, contacts_m: Floats, title: str) -> str:
     return svg(draw, title, size=(5.4, 3.6))
 
 
-def _dots(axes: Axes, places: Floats, colour: str) -> None:
+def _dots(axes: Axes, places: AnyFloats, colour: str) -> None:
     """Draw many points as one path, which a page holds in a fraction of what a mark for each would take."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.report.drawing import COLOURS, FAINT, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.floating[Any]]
 
 DOT_MM = 1.1  # radius of an electrode as drawn; the nearest two lie farther apart than twice that
 APART_MM = 26.0  # from one fingertip to the next
@@ -28,7 +27,7 @@ class Fingertip:
     """What is drawn on one fingertip."""
 
     title: str
-    strength: Floats  # (electrode,), -1 to 1: how strongly it is coloured, below 0 in the other colour
+    strength: AnyFloats  # (electrode,), -1 to 1: how strongly it is coloured, below 0 in the other colour
     texts: Sequence[str]  # in each electrode
 
 

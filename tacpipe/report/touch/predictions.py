@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools, Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.tasks.touch.result_names import GRASPS, MODEL, TRUE
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Recording
 
-Floats = NDArray[np.float64]
 Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
 
 UNNAMED = "unnamed"  # an object of which no recording states the name
@@ -29,10 +29,10 @@ class Predictions:
 
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
-    known: NDArray[np.bool_]  # (grasp,), whether the model was trained on other grasps of the object
+    known: Bools  # (grasp,), whether the model was trained on other grasps of the object
     true: Touch
     predicted: Mapping[str, Touch]  # by predictor
-    t_ns: NDArray[np.int64] | None = None  # (grasp,)
+    t_ns: Times | None = None  # (grasp,)
 
     @property
     def in_a_row(self) -> tuple[int, int]:
@@ -51,7 +51,7 @@ class Predictions:
         """Return the rows of known or of novel objects, or all."""
         return self if known is None else self.rows(self.known == known)
 
-    def rows(self, chosen: NDArray[Any]) -> Predictions:
+    def rows(self, chosen: AnyArray) -> Predictions:
         """Return some rows, stated by a mask (grasp,) or by their numbers."""
         predicted = {
             name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.predicted.items()

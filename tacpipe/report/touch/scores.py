@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.metrics import regression
 from tacpipe.metrics.headline import Headline
@@ -17,8 +18,6 @@ from tacpipe.report.spread import Spread, spread
 from tacpipe.report.touch.methods import Method, Run
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
-
-Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -55,9 +54,9 @@ def in_counts(target: str, fraction: float) -> float:
 class _Rows(NamedTuple):
     """What a run reports on a target."""
 
-    true: Floats  # (grasp, value), normalised
-    predicted: Floats  # (grasp, value)
-    constant: Floats  # (grasp, value), NaN where the result holds none
+    true: AnyFloats  # (grasp, value), normalised
+    predicted: AnyFloats  # (grasp, value)
+    constant: AnyFloats  # (grasp, value), NaN where the result holds none
     recordings: NDArray[np.str_]  # (grasp,)
     objects: NDArray[np.str_]  # (grasp,)
 
@@ -121,7 +120,7 @@ def best(methods: Sequence[Method], target: str, known: bool | None) -> Method |
     return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
-def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> Floats | None:
+def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> AnyFloats | None:
     """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
     parts = _rows(runs, target, known, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Times
 from tacpipe.simulation.emulation.poisson_events import Happening
-
-Times = NDArray[np.int64]
 
 
 def no_steps(t_ns: Times) -> Times:

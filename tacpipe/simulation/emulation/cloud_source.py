@@ -6,8 +6,8 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bytes, Float32s, Int64s
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import grasp_scene, tabletop
 from tacpipe.simulation.emulation.source import BLOCK_S, Timing
@@ -30,7 +30,7 @@ class CloudSource:
         """Return the points of the clouds of block ``number``; ``rows`` reports on which each is."""
         return self._samples(number)
 
-    def numbers(self, block: int) -> NDArray[np.int64]:
+    def numbers(self, block: int) -> Int64s:
         """Return the numbers of a block's clouds, counted from 0 through the stream (cloud,)."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
@@ -40,7 +40,7 @@ class CloudSource:
         values = (np.concatenate(points), np.concatenate(colours)) if self._coloured else (np.concatenate(points),)
         return Samples(values, rows=rows)
 
-    def _seen(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def _seen(self, number: int) -> tuple[Float32s, Bytes]:
         scene = grasp_scene.perform(self._seed, number)
         other = grasp_scene.thing(self._seed, number + 1)
         rng = np.random.default_rng([self._seed, 9, number])

@@ -9,12 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Floats, Times
 from tacpipe.signals import kinematics
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 READY_RAD = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # of the robot's own examples
 LOWEST_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # Franka Emika, Panda documentation
@@ -73,7 +70,7 @@ def torques(angle_rad: Floats, force_n: Floats) -> Floats:
     return borne
 
 
-def hand(frames: NDArray[np.floating]) -> tuple[Floats, Floats]:
+def hand(frames: AnyFloats) -> tuple[Floats, Floats]:
     """Return place (time, axis) and rotation (time, 3, 3) of the hand, of what `kinematics.joint_frames` gives."""
     last = frames[:, -1]
     cos, sin = np.cos(HAND_RAD), np.sin(HAND_RAD)

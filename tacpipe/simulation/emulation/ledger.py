@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation import byte_faults, perfect
 from tacpipe.simulation.emulation.byte_faults import CAUSES, Item
@@ -80,7 +80,7 @@ class Ledger:
         sent_ns, number = self._sent_ns[row], self._number[row]
         return Entry(self._due_ns[row], sent_ns, number, size, cause, invisible, self._source[row])
 
-    def column(self, name: str) -> NDArray[Any]:
+    def column(self, name: str) -> AnyArray:
         """Return a column (entry,): ``due_ns``, ``sent_ns``, ``number``, ``size``, ``cause`` (code), ..."""
         kept: array[int] = getattr(self, f"_{name}")
         return np.array(kept[: len(self)], dtype=np.int64)
@@ -93,15 +93,15 @@ class Ledger:
         return {cause: count for cause, count in found.items() if count}
 
     @property
-    def whole(self) -> NDArray[np.int64]:
+    def whole(self) -> Int64s:
         """The rows of entries that went out as frames should (entry,)."""
         codes = np.array([CODES[cause] for cause in UNHARMED])
         count = len(self)  # of all columns, though it may grow meanwhile
         size, cause, number = (self.column(name)[:count] for name in ("size", "cause", "number"))
-        rows: NDArray[np.int64] = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
+        rows: Int64s = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
         return rows
 
-    def samples(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> Samples:
+    def samples(self, rows: Sequence[int] | Int64s | None = None) -> Samples:
         """Return what a perfect link would give of entries, made once more from the source; by default of all `whole` ones.
 
         Values are those that were encoded, as far as the protocol can hold them; ``rows`` reports on which entry each is.
@@ -111,7 +111,7 @@ class Ledger:
         parts = [perfect.decoded(sensor, sensor.encode(part)) for part in self._parts(rows)]
         return perfect.joined(parts)
 
-    def frames(self, rows: Sequence[int] | NDArray[np.int64] | None = None) -> list[bytes]:
+    def frames(self, rows: Sequence[int] | Int64s | None = None) -> list[bytes]:
         """Return the frames of entries as they were meant to go out; by default of all that did `whole`."""
         rows = self.whole if rows is None else np.asarray(rows, dtype=np.int64)
         frames: list[bytes] = []
@@ -120,7 +120,7 @@ class Ledger:
             frames += one_by_one(sensor, sensor.encode(part))
         return frames
 
-    def _parts(self, rows: NDArray[np.int64]) -> Iterator[Samples]:
+    def _parts(self, rows: Int64s) -> Iterator[Samples]:
         """Yield the samples of entries, as far as neighbours are of one block."""
         numbers, sources = self.column("number")[rows], self.column("source")[rows]
         blocks = np.array(
@@ -156,7 +156,7 @@ class Ledger:
         (folder / f"{self.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def taken(samples: Samples, rows: NDArray[np.int64]) -> Samples:
+def taken(samples: Samples, rows: Int64s) -> Samples:
     """Return the samples of some frames, in their order."""
     if samples.rows is not None:  # many samples a frame, as the points of a cloud
         parts = [np.flatnonzero(samples.rows == row) for row in rows]

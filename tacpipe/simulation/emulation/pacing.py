@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Times
 from tacpipe.errors import UsageError
-
-Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.simulation.emulation.world import World
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 WIDTH_M = 0.03  # of a pad, along either axis
 SIGMA_M = 0.005  # of the Gaussian that shares the pressure

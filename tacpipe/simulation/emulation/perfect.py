@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Int64s
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 
@@ -34,7 +34,7 @@ def joined(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Sam
     return Samples(values, seq, t_device_ns, device_seq, np.concatenate(rows) if rows else None)
 
 
-def _together(parts: Sequence[Samples], name: str) -> NDArray[np.int64] | None:
+def _together(parts: Sequence[Samples], name: str) -> Int64s | None:
     kept = [one for part in parts if (one := getattr(part, name)) is not None]
     return np.concatenate(kept) if kept else None
 

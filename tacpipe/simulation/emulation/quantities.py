@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.channels import schema
 from tacpipe.simulation.emulation import pad as pad_of_taxels
 from tacpipe.simulation.emulation.world import World
@@ -20,8 +20,6 @@ from tacpipe.simulation.mechanics import GRAVITY_M_S2
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 CLEARANCE_M = 0.12  # from the wrist's proximity sensor down to the object, as long as it does not slip
 WARMING_C, WARM_C, WARMING_NS = 4.0, 31.0, 600_000_000_000  # a device warms up by so much, towards so much, that slowly

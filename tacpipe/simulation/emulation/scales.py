@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Floats
 from tacpipe.simulation.emulation import pad
 from tacpipe.simulation.emulation.quantities import axis_of, of
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Floats = NDArray[np.float64]
 
 UNITS = {  # of SI units, or of °C
     "m": 1.0, "mm": 1e3, "cm": 1e2, "um": 1e6, "rad": 1.0, "deg": 180 / np.pi, "N": 1.0, "mN": 1e3, "N m": 1.0,
@@ -43,7 +42,7 @@ NOISE = 0.002  # standard deviation as a fraction of what a device is made for
 SILENT = ("time", "status", "sequence", "label", "mask", "orientation", "mass", "friction")  # quantities without noise
 
 
-def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.random.Generator) -> list[NDArray[Any]]:
+def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.random.Generator) -> list[AnyArray]:
     """Return the column (time,) of each field, in its own type, of what the world shows (time, field), SI."""
     full = FULL.get(quantity, 1.0)
     if quantity in SHARED:  # a device with many taxels is made for less on each
@@ -53,7 +52,7 @@ def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.rand
     return [_column(field, column, full, quantity) for field, column in zip(fields, noisy.T, strict=True)]
 
 
-def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> NDArray[Any]:
+def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyArray:
     kind = np.dtype(field.type.to_pandas_dtype())
     scale = unit_scale(of(field, "unit") or "1")
     if scale is None and quantity in FULL:
@@ -65,7 +64,7 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> NDAr
     if kind.kind in "iu":
         limits = np.iinfo(kind)
         values = np.rint(values).clip(limits.min, limits.max)
-    column: NDArray[Any] = values.astype(kind)
+    column: AnyArray = values.astype(kind)
     return column
 
 

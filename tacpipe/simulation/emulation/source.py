@@ -10,11 +10,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Counts, Floats, Int64s, Times
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.simulation import faults, pick_and_move, proximity, taxels
 from tacpipe.simulation.emulation import quantities, scales
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from _typeshed import DataclassInstance
 
-Times = NDArray[np.int64]
-Columns = dict[int, NDArray[Any]]  # number of the field to its values (time,)
+Columns = dict[int, AnyArray]  # number of the field to its values (time,)
 
 BLOCK_S = 0.5
 KEPT = 3  # blocks that are kept in case they are asked for once more
@@ -46,7 +45,7 @@ class Timing:
     steps: Callable[[Times], Times] = no_steps  # by how much the clock was set until then, ns (time,)
     wrap_s: float | None = None  # counters go round so long after the start; None: they begin anywhere
 
-    def taken_ns(self, number: NDArray[np.int64]) -> Times:
+    def taken_ns(self, number: Int64s) -> Times:
         """Return when samples ``number`` (sample,) are taken, in the world's time."""
         taken: Times = self.start_ns + np.rint(number * (1e9 / self.rate_hz / (1 + self.clock.skew))).astype(np.int64)
         return taken
@@ -66,7 +65,7 @@ class Sampled(Protocol):
     def block(self, number: int) -> Samples:
         """Return the samples of block ``number``."""
 
-    def numbers(self, block: int) -> NDArray[np.int64]:
+    def numbers(self, block: int) -> Int64s:
         """Return the numbers of a block's frames, counted from 0 through the stream (frame,)."""
 
 
@@ -82,7 +81,7 @@ class Source:
         self._seed = list(seed)
         self._groups = _grouped(self.fields)
         self._widths = _widths(sensor, self.fields)
-        self._drift: list[NDArray[np.float64]] = [np.zeros((USKIN // 3, 3))]  # of a uSkin at the start of each block
+        self._drift: list[Floats] = [np.zeros((USKIN // 3, 3))]  # of a uSkin at the start of each block
         self._samples = functools.lru_cache(KEPT)(self._made)
         rng = np.random.default_rng([*seed, 0])
         self._first = [
@@ -94,7 +93,7 @@ class Source:
         """Return the samples of block ``number``, `rows` of them."""
         return self._samples(number)
 
-    def numbers(self, block: int) -> NDArray[np.int64]:
+    def numbers(self, block: int) -> Int64s:
         """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
@@ -136,7 +135,7 @@ class Source:
         values = quantities.look(quantity, view, fields)
         return dict(zip(group, scales.sent(quantity, values, fields, rng), strict=True))
 
-    def _uskin(self, view: View, block: int, rng: np.random.Generator) -> NDArray[np.uint16]:
+    def _uskin(self, view: View, block: int, rng: np.random.Generator) -> Counts:
         """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that continues."""
         one = view.world.skins[view.finger]
         noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
@@ -144,7 +143,7 @@ class Source:
         digits = taxels.digitised(counts + self._drifted(block))
         return faults.hold(digits, pick_and_move.Rig().hold_probability, rng)[0]
 
-    def _drifted(self, block: int) -> NDArray[np.float64]:
+    def _drifted(self, block: int) -> Floats:
         """Return the drift of a uSkin in a block (time, taxel, axis), a random walk from where the last block left it."""
         while True:
             number = min(block, len(self._drift) - 1)
@@ -191,7 +190,7 @@ def _widths(sensor: Sensor, fields: Sequence[pa.Field]) -> list[int]:
     return widths
 
 
-def _blocks(widths: Sequence[int], columns: Columns) -> tuple[NDArray[Any], ...]:
+def _blocks(widths: Sequence[int], columns: Columns) -> tuple[AnyArray, ...]:
     """Return the columns side by side in blocks (sample, channel) of these widths."""
     stops = np.cumsum(widths).tolist()
     runs = [range(stop - width, stop) for stop, width in zip(stops, widths, strict=True)]

@@ -12,13 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.simulation import mechanics, pick_and_move, trajectory
 from tacpipe.simulation.emulation import joints
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 TRIAL_S, RETURN_S = 10.5, 1.5  # of a cycle
 RELEASE_S = 0.3  # in which the fingers open, at the beginning of the way back

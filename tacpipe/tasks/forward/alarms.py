@@ -8,13 +8,12 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.signals import anticipation, holds
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Predicted
 from tacpipe.tasks.forward.tracks import Track
 
-Floats = NDArray[np.floating[Any]]
 Layout = Sequence[Mapping[str, str]]
 
 WATCHED = (MODEL, BASELINE, "damped_trend", "last_value_linear", "ridge", "ridge_actions")
@@ -26,9 +25,9 @@ class Loads:
 
     layout: Layout
     horizon: int
-    truth: list[Floats] = field(default_factory=list)  # (time, feature) each
-    groups: list[NDArray[np.int64]] = field(default_factory=list)
-    ahead: dict[str, list[Floats]] = field(default_factory=dict)
+    truth: list[AnyFloats] = field(default_factory=list)  # (time, feature) each
+    groups: list[Int64s] = field(default_factory=list)
+    ahead: dict[str, list[AnyFloats]] = field(default_factory=dict)
     steps_s: list[float] = field(default_factory=list)
 
     def begin(self, track: Track) -> None:
@@ -87,14 +86,14 @@ class Loads:
             found[name] = {key: _number(value) for key, value in asdict(score).items()}
         return found
 
-    def _said(self) -> list[tuple[str, Floats]]:
+    def _said(self) -> list[tuple[str, AnyFloats]]:
         joined = {name: np.concatenate(parts) for name, parts in self.ahead.items()}
         return [(name, values) for name, values in joined.items() if np.isfinite(values).any()]
 
     def _rate_hz(self) -> float:
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
 
-    def _loads(self, counts: Floats) -> Floats:
+    def _loads(self, counts: AnyFloats) -> AnyFloats:
         """Return the mean of each sensor's axes (time, feature) of ``counts`` (time, channel)."""
         places = [(one.get("stream", ""), one.get("axis", "")) for one in self.layout]
         return np.stack(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline
@@ -25,7 +25,6 @@ from tacpipe.tasks.forward.training import HISTORY, check_codec
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-Floats = NDArray[np.floating[Any]]
 
 STORED_STEPS = (1, 3, 5, 10)  # whose predictions are stored; 3, 5 and 10 are those of the paper's figures
 
@@ -80,7 +79,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
 
 def _prediction_table(
-    forecaster: Forecaster, track: Track, starts: NDArray[np.int64], steps: Sequence[int], stored: NDArray[np.float32]
+    forecaster: Forecaster, track: Track, starts: Int64s, steps: Sequence[int], stored: Float32s
 ) -> pa.Table:
     """Return one row a window: the time at which its prediction is available, the features then and those predicted.
 

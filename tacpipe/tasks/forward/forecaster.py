@@ -9,9 +9,9 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from tacpipe.arrays import AnyFloats, Bools, Times
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored
 from tacpipe.codecs.frame_stacking import INCREMENTS
@@ -29,7 +29,6 @@ from tacpipe.tasks.forward.params import Change, Params
 from tacpipe.tasks.forward.rows import acted
 from tacpipe.tasks.opened import Chain
 
-Floats = NDArray[np.floating[Any]]
 Config = dict[str, Any]
 
 TASK = "forward"
@@ -50,9 +49,9 @@ CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safe
 class WindowArrays(NamedTuple):
     """Windows of a recording, as `Forecaster.predict_windows` reads them."""
 
-    window: Floats  # (window, context, column): `window_columns`, `derived_columns`, width of the gripper in m
-    plan: Floats  # (window, horizon, column): `plan_columns`, `derived_columns`
-    t_ns: NDArray[np.int64]  # (window,), time of the newest row that is read
+    window: AnyFloats  # (window, context, column): `window_columns`, `derived_columns`, width of the gripper in m
+    plan: AnyFloats  # (window, horizon, column): `plan_columns`, `derived_columns`
+    t_ns: Times  # (window,), time of the newest row that is read
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Forecaster:
         return self.params.actions
 
     @property
-    def orientation(self) -> Floats:
+    def orientation(self) -> AnyFloats:
         """The quaternion (4,) whose sign recordings are given."""
         return np.array(self.config["inputs"]["orientation_reference"])
 
@@ -121,12 +120,12 @@ class Forecaster:
         return self.codec.kind != "raw" and self.codec.representation != INCREMENTS
 
     @property
-    def feature_half(self) -> Floats:
+    def feature_half(self) -> AnyFloats:
         """Half of each feature's training range (feature,): what the paper's error is measured in."""
         return np.array(self.config["scaling"]["feature_half"])
 
     @property
-    def channel_scale(self) -> Floats:
+    def channel_scale(self) -> AnyFloats:
         """The training standard deviation of each channel in counts (channel,)."""
         return np.array(self.config["scaling"]["channel_count"])
 
@@ -184,7 +183,7 @@ class Forecaster:
             if any(one.shape != (1, self.horizon, touch.shape[2]) for one in predicted.values()):
                 raise ValueError("the baselines predict another number of steps or channels")
 
-    def predict_windows(self, window: Floats, plan: Floats) -> Floats:
+    def predict_windows(self, window: AnyFloats, plan: AnyFloats) -> AnyFloats:
         """Return predicted counts above rest of arrays; `model.ForwardModel.predict` describes both."""
         window = np.asarray(window)
         single = window.ndim == 2
@@ -193,14 +192,14 @@ class Forecaster:
         predicted = self._of_arrays(touch, arm, finger)
         return predicted[0] if single else predicted
 
-    def _of_arrays(self, touch: Floats, arm: Floats, finger: Floats) -> Floats:
+    def _of_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
         read = Windows(*(torch.from_numpy(np.ascontiguousarray(one.swapaxes(0, 1))) for one in (latent, arm, finger)))
         return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
 
-    def _check_levels(self, touch: Floats) -> None:
+    def _check_levels(self, touch: AnyFloats) -> None:
         """Refuse windows (window, context, channel) whose levels are not near rest; see `model.ForwardModel.predict`."""
         largest = self.largest_level
         if largest is None:
@@ -219,13 +218,13 @@ class Forecaster:
             )
 
     @torch.no_grad()
-    def features(self, windows: Windows) -> Floats:
+    def features(self, windows: Windows) -> AnyFloats:
         """Return the features to come (window, horizon, feature), in the codec's unit."""
         predicted: Tensor = self.model(acted(windows, self.actions))
-        features: Floats = predicted.transpose(0, 1).numpy()
+        features: AnyFloats = predicted.transpose(0, 1).numpy()
         return features
 
-    def decoded(self, features: Floats, last: Floats, last_feature: Floats) -> Floats:
+    def decoded(self, features: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
         """Return counts above rest (window, horizon, channel) of predicted features (window, horizon, feature).
 
         ``last`` (window, channel) and ``last_feature`` (window, feature) are those of the last row read. A model that
@@ -236,12 +235,12 @@ class Forecaster:
             return self.anchored(levels, last, last_feature)
         return levels.astype(np.float64, copy=False)
 
-    def anchored(self, levels: Floats, last: Floats, last_feature: Floats) -> Floats:
+    def anchored(self, levels: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
         """Return decoded levels (window, horizon, channel) moved by what the codec lost of the last row."""
-        moved: Floats = levels + (last - self.codec.decode(last_feature))[:, None]
+        moved: AnyFloats = levels + (last - self.codec.decode(last_feature))[:, None]
         return moved
 
-    def _parts(self, window: Floats, plan: Floats) -> tuple[Floats, Floats, Floats]:
+    def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32."""
         channels = len(self.codec.channels)
         for name, given, rows, before, widths in (
@@ -274,7 +273,7 @@ class Forecaster:
         touch = np.ascontiguousarray(window[..., :channels], dtype=np.float32)
         return touch, arm.astype(np.float32), finger.astype(np.float32)
 
-    def _arm(self, rows: Floats, whole: bool) -> Floats:
+    def _arm(self, rows: AnyFloats, whole: bool) -> AnyFloats:
         """Return the arm's rows (row, 13) with velocities, and quaternions of the sign that the model was trained on."""
         rows = np.hstack([rows[:, :3], continuous(rows[:, 3:POSE].astype(np.float64)), rows[:, POSE:]])
         if not whole:
@@ -305,12 +304,12 @@ def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:
     return codec.layout if codec.kind == "raw" else ()
 
 
-def largest_level(touch: Floats) -> float:
+def largest_level(touch: AnyFloats) -> float:
     """Return the largest 95th percentile over channels of absolute levels ``touch`` (time, channel); 0 without rows."""
     return float(np.quantile(np.abs(touch), FAR, axis=1).max(initial=0.0)) if touch.size else 0.0
 
 
-def _begins(touch: Floats) -> NDArray[np.bool_]:
+def _begins(touch: AnyFloats) -> Bools:
     """Return where each window begins in the windows' rows one after the other, (window · context,)."""
     begins = np.zeros(touch.shape[:2], dtype=bool)
     begins[:, 0] = True

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
-
-Floats = NDArray[np.floating[Any]]
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them
@@ -37,7 +34,7 @@ def shown(steps: Sequence[int]) -> tuple[int, ...]:
     return tuple(step for step in STEPS if step in steps) or (max(steps),)
 
 
-def sums(squared: Floats, absolute: Floats, persistence: Floats, values: float) -> Floats:
+def sums(squared: AnyFloats, absolute: AnyFloats, persistence: AnyFloats, values: float) -> AnyFloats:
     """Return what adds up over recordings, from the error sums of a recording at the shown steps, each (step,).
 
     ``values`` is how many values each was summed over: windows times channels.
@@ -61,16 +58,16 @@ def headline(
 def _measure(steps: Sequence[int]) -> Measure:
     count, ahead = len(steps), [f"t+{step}" for step in steps]
 
-    def error(found: Floats) -> Floats:
+    def error(found: AnyFloats) -> AnyFloats:
         squared, persistence = found[:, :count], found[:, count : 2 * count]
         errs = persistence > 0  # where persistence never errs, nothing is relative to it
         ratio = np.where(errs, squared / np.where(errs, persistence, 1), 0.0)
         return np.where(errs.any(axis=1), ratio.sum(axis=1) / np.maximum(errs.sum(axis=1), 1), np.nan)
 
-    def gain(one: Floats, other: Floats) -> Floats:
+    def gain(one: AnyFloats, other: AnyFloats) -> AnyFloats:
         return np.where(other > 0, 1 - one / np.where(other > 0, other, 1), np.nan)
 
-    def values(found: Floats) -> tuple[float, ...]:
+    def values(found: AnyFloats) -> tuple[float, ...]:
         mae = found[2 * count : 3 * count] / found[-1] if found[-1] else np.full(count, np.nan)
         return (*map(float, mae), 1 - float(error(found[None])[0]))
 

@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import forecast
 from tacpipe.metrics.headline import Headline
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
 
-Floats = NDArray[np.floating[Any]]
-Masks = Mapping[str, NDArray[np.bool_]]  # name of a group of channels, (channel,)
+Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)
 Tree = dict[str, Any]  # names down to numbers
 
 _COLUMNS = pa.schema(
@@ -44,13 +43,13 @@ _COLUMNS = pa.schema(
 class Errors:
     """Sums of one predictor's errors over the windows of a recording, each (step, feature) or (step, channel)."""
 
-    latent_squared: Floats | None
-    feature_squared: Floats | None
-    count_squared: Floats
-    count_absolute: Floats
+    latent_squared: AnyFloats | None
+    feature_squared: AnyFloats | None
+    count_squared: AnyFloats
+    count_absolute: AnyFloats
 
     @classmethod
-    def of(cls, predicted: Prediction, truth: Prediction, feature_half: Floats) -> Errors:
+    def of(cls, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> Errors:
         """Return the errors of ``predicted``; ``feature_half`` (feature,) is what the paper's scaling divides by."""
         latent = feature = None
         if predicted.latent is not None and truth.latent is not None:
@@ -84,7 +83,7 @@ class Trial:
     windows: int = 0
     errors: dict[str, Errors] = field(default_factory=dict)
 
-    def add(self, predictions: Mapping[str, Prediction], truth: Prediction, feature_half: Floats) -> None:
+    def add(self, predictions: Mapping[str, Prediction], truth: Prediction, feature_half: AnyFloats) -> None:
         """Count some more windows of the recording."""
         self.windows += len(truth.count)
         for name, predicted in predictions.items():
@@ -92,7 +91,7 @@ class Trial:
             self.errors[name] = self.errors[name] + found if name in self.errors else found
 
 
-def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, NDArray[np.bool_]]:
+def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
     """Return masks (channel,) for both sensors together, each sensor (``sensor1``… in order of columns) and each axis."""
     groups = {"both": np.ones(len(layout), dtype=bool)}
     streams = list(dict.fromkeys(one["stream"] for one in layout if "stream" in one))
@@ -103,7 +102,7 @@ def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, NDArray[np.
     return groups
 
 
-def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: Floats, seed: int = 0) -> Tree:
+def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats, seed: int = 0) -> Tree:
     """Return the metrics of ``metrics.json``; ``channel_scale`` (channel,) is each channel's spread in training.
 
     Recordings that the model has not seen are at the top, and under ``known`` and ``unseen`` once more those of objects
@@ -127,8 +126,8 @@ def headline(method: str, trials: Sequence[Trial], horizon: int) -> list[Headlin
     steps = headlines.shown(range(1, horizon + 1))
     at = [step - 1 for step in steps]
 
-    def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], Floats]:
-        found: dict[tuple[Any, str], Floats] = {}
+    def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:
+        found: dict[tuple[Any, str], AnyFloats] = {}
         for one in chosen:
             errors, persistence = one.errors[predictor], one.errors[BASELINE].count_squared
             squared, absolute, still = (
@@ -165,7 +164,7 @@ def horizons_csv(tree: Tree, rate_hz: float) -> bytes:
     return _csv(("predictor", "step", "horizon_ms", "mse_counts", "mae_counts", "mse_standard"), rows)
 
 
-def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: Floats) -> bytes:
+def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFloats) -> bytes:
     """Return the sums behind all errors as a Parquet table, so that results can be pooled by recording.
 
     A row a recording, predictor, group and step: ``windows`` and ``channels`` that ``squared`` and ``absolute`` errors
@@ -188,7 +187,7 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: Floats
     return to_parquet(pa.table(columns, schema=_COLUMNS))
 
 
-def _pooled(errors: Errors, groups: Masks, channel_scale: Floats) -> Iterator[tuple[str, Any, Any, int]]:
+def _pooled(errors: Errors, groups: Masks, channel_scale: AnyFloats) -> Iterator[tuple[str, Any, Any, int]]:
     """Yield each group's name, its sums of squared and absolute errors (step,) and its number of channels."""
     for group, mask in groups.items():
         yield (
@@ -222,7 +221,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
     )
 
 
-def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: Floats, seed: int) -> Tree:
+def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats, seed: int) -> Tree:
     """Return errors of each predictor, skill and counts over the recordings that hold windows."""
     held = [one for one in trials if one.windows]
     windows = np.array([one.windows for one in held], dtype=np.int64)
@@ -253,23 +252,23 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
     return tree
 
 
-def _steps(sums: Floats, windows: NDArray[np.int64]) -> Tree:
+def _steps(sums: AnyFloats, windows: Int64s) -> Tree:
     """Return the mean error by step and over all steps; ``sums`` is (recording, step, channel)."""
     error = forecast.mean_error(sums, windows)
     return {f"t{step}": _rounded(value) for step, value in enumerate(error, 1)} | {"mean": _rounded(error.mean())}
 
 
-def _grouped(sums: Floats, windows: NDArray[np.int64], groups: Masks) -> Tree:
+def _grouped(sums: AnyFloats, windows: Int64s, groups: Masks) -> Tree:
     """Return the mean error by group of channels and step."""
     return {name: _steps(sums[:, :, mask], windows) for name, mask in groups.items()}
 
 
-def _by_step(trials: Sequence[Trial], predictor: str, kept: str) -> Floats:
+def _by_step(trials: Sequence[Trial], predictor: str, kept: str) -> AnyFloats:
     """Return one kind of a predictor's error sums over all channels, shape (recording, step)."""
     return np.stack([getattr(one.errors[predictor], kept).sum(axis=1) for one in trials])
 
 
-def _intervals(model: Floats, baseline: Floats, seed: int) -> Tree:
+def _intervals(model: AnyFloats, baseline: AnyFloats, seed: int) -> Tree:
     """Return skill with its interval by step and over all; what is not defined is left out. Sums (recording, step)."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
     found = forecast.skill_interval(wide[0], wide[1], seed=seed)

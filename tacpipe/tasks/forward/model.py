@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast, overload
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.io.parquet import one_after_another
 from tacpipe.tasks.forward import prediction
-from tacpipe.tasks.forward.forecaster import Floats, Forecaster, WindowArrays
+from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.opened import opened
 
 if TYPE_CHECKING:
@@ -25,11 +26,11 @@ class ForwardModel(Forecaster):
     def predict(self, recordings: Dataset | Recording, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
 
     @overload
-    def predict(self, window: Floats, plan: Floats, /) -> Floats: ...
+    def predict(self, window: AnyFloats, plan: AnyFloats, /) -> AnyFloats: ...
 
     def predict(
-        self, given: Dataset | Recording | Floats, plan: Floats | None = None, /, *, steps: Sequence[int] = STEPS
-    ) -> pa.Table | Floats:
+        self, given: Dataset | Recording | AnyFloats, plan: AnyFloats | None = None, /, *, steps: Sequence[int] = STEPS
+    ) -> pa.Table | AnyFloats:
         """Return predicted tactile signals: of a dataset or one of its recordings as a table, of arrays as an array.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes
@@ -52,7 +53,7 @@ class ForwardModel(Forecaster):
         `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
         """
         if plan is not None:
-            return self.predict_windows(cast("Floats", given), plan)
+            return self.predict_windows(cast("AnyFloats", given), plan)
         recordings = opened(cast("Dataset | Recording", given), self.chain)
         return one_after_another(prediction.tables(self, recordings, sorted(set(steps))))
 

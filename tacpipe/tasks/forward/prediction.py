@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import tracks
@@ -19,8 +19,6 @@ from tacpipe.tasks.forward.training import check_codec
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-
-Floats = NDArray[np.floating[Any]]
 
 
 def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int]) -> Result:
@@ -73,9 +71,7 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
 
 
-def _table(
-    forecaster: Forecaster, t_ns: NDArray[np.int64], counts: NDArray[np.float32], steps: Sequence[int]
-) -> pa.Table:
+def _table(forecaster: Forecaster, t_ns: Times, counts: Float32s, steps: Sequence[int]) -> pa.Table:
     """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]

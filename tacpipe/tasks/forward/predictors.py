@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.models.windows import Windows, motion
@@ -17,8 +16,6 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.rows import rows
 from tacpipe.tasks.forward.tracks import Track
-
-Floats = NDArray[np.floating[Any]]
 
 MODEL, BASELINE = "model", "persistence"
 CHUNK = 2048  # windows predicted at once
@@ -31,16 +28,16 @@ class Prediction:
     Features are those of the model's codec; None for a predictor that has none.
     """
 
-    latent: Floats | None
-    count: Floats
+    latent: AnyFloats | None
+    count: AnyFloats
 
 
 @dataclass(frozen=True)
 class Predicted:
     """Some windows of a recording: the measured signals, and the predictions of each predictor."""
 
-    now: NDArray[np.int64]  # (window,), the last row that is read
-    features: Floats  # (window, step, feature) of the model
+    now: Int64s  # (window,), the last row that is read
+    features: AnyFloats  # (window, step, feature) of the model
     truth: Prediction
     predictions: dict[str, Prediction]
 
@@ -50,18 +47,18 @@ class Forecast:
     """Some windows of a recording, and the predictions of the model alone."""
 
     windows: Windows
-    past: NDArray[np.int64]  # (window, context), rows that are read
-    future: NDArray[np.int64]  # (window, step), rows that are predicted
-    features: Floats  # (window, step, feature)
-    count: Floats  # (window, step, channel)
+    past: Int64s  # (window, context), rows that are read
+    future: Int64s  # (window, step), rows that are predicted
+    features: AnyFloats  # (window, step, feature)
+    count: AnyFloats  # (window, step, channel)
 
     @property
-    def now(self) -> NDArray[np.int64]:
+    def now(self) -> Int64s:
         """The last row that is read (window,)."""
         return self.past[:, -1]
 
 
-def forecasts(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Forecast]:
+def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Forecast]:
     """Yield the model's predictions for the windows of ``track`` that begin at ``starts``, some windows at a time."""
     context, horizon = forecaster.context, forecaster.horizon
     track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
@@ -77,7 +74,7 @@ def forecasts(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -
         yield Forecast(windows, past, future, features, count)
 
 
-def predicted(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -> Iterator[Predicted]:
+def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
     """Yield what all predictors predict for the windows of ``track`` that begin at ``starts``, some windows at a time."""
     for some in forecasts(forecaster, track, starts):
         last, last_feature = track.tactile[some.now], track.latent[some.now]
@@ -93,7 +90,9 @@ def predicted(forecaster: Forecaster, track: Track, starts: NDArray[np.int64]) -
         yield Predicted(some.now, some.features, truth, predictions)
 
 
-def _of_model(forecaster: Forecaster, some: Forecast, last: Floats, last_feature: Floats) -> dict[str, Prediction]:
+def _of_model(
+    forecaster: Forecaster, some: Forecast, last: AnyFloats, last_feature: AnyFloats
+) -> dict[str, Prediction]:
     """Return the model's prediction, and persistence; ``last`` (window, channel) is the last row that is read."""
     codec, horizon = forecaster.codec, forecaster.horizon
     still = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
@@ -106,7 +105,9 @@ def _of_model(forecaster: Forecaster, some: Forecast, last: Floats, last_feature
     return found
 
 
-def _of_codec(forecaster: Forecaster, ahead: Floats, last: Floats, last_feature: Floats) -> dict[str, Prediction]:
+def _of_codec(
+    forecaster: Forecaster, ahead: AnyFloats, last: AnyFloats, last_feature: AnyFloats
+) -> dict[str, Prediction]:
     """Return what the codec alone loses of the true features to come, ``ahead`` (window, horizon, feature)."""
     codec = forecaster.codec
     if codec.kind == "raw":
@@ -119,6 +120,6 @@ def _of_codec(forecaster: Forecaster, ahead: Floats, last: Floats, last_feature:
     return found
 
 
-def _held(values: Floats, horizon: int) -> Floats:
+def _held(values: AnyFloats, horizon: int) -> AnyFloats:
     """Return ``values`` (window, channel) at every step, (window, step, channel)."""
     return np.repeat(values[:, None], horizon, axis=1)

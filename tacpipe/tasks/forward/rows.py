@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.models import windows as windows_of
 from tacpipe.models.windows import Windows
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.training import loop
-
-Floats = NDArray[np.floating[Any]]
 
 ACTIONS = ("planned", "none", "shuffled")
 
@@ -29,7 +26,7 @@ class Rows:
     touch: Tensor  # (time, feature)
     arm: Tensor  # (time, 13)
     finger: Tensor  # (time,)
-    tactile: Floats  # (time, channel), counts above rest
+    tactile: AnyFloats  # (time, channel), counts above rest
     starts: Tensor  # (window,)
     context: int
     horizon: int
@@ -62,7 +59,7 @@ class Rows:
 
 def rows(
     tracks: Sequence[Track],
-    starts: Sequence[NDArray[np.int64]],
+    starts: Sequence[Int64s],
     context: int,
     horizon: int,
     *,
@@ -74,7 +71,7 @@ def rows(
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
     offsets = np.cumsum([0] + [len(one.t_ns) for one in tracks])
 
-    def stacked(name: str, width: tuple[int, ...]) -> Floats:
+    def stacked(name: str, width: tuple[int, ...]) -> AnyFloats:
         return np.concatenate([np.zeros((0, *width), np.float32)] + [getattr(one, name) for one in tracks])
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)

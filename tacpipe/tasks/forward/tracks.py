@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
 from tacpipe.channels import masks
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored, tactile
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Recording
 
-Floats = NDArray[np.floating[Any]]
 
 POSITION = tuple(f"robot_position_{axis}_m" for axis in "xyz")
 ORIENTATION = tuple(f"robot_orientation_{axis}" for axis in "xyzw")
@@ -41,22 +40,22 @@ class Track:
     """The rows of one recording; tactile channels in counts above rest, latents in the codec's unit."""
 
     name: str
-    t_ns: NDArray[np.int64]  # (time,)
-    contact: NDArray[np.int64]  # (time,), below 0 where nothing is touched
-    groups: NDArray[np.int64]  # (time,), equal where rows follow one another without a gap
-    usable: NDArray[np.bool_]  # (time,)
-    latent: Floats  # (time, latent)
-    arm: Floats  # (time, 13): `ARM`
-    finger: Floats  # (time,), m; 0 where it is not recorded
-    tactile: Floats  # (time, channel)
+    t_ns: Times  # (time,)
+    contact: Int64s  # (time,), below 0 where nothing is touched
+    groups: Int64s  # (time,), equal where rows follow one another without a gap
+    usable: Bools  # (time,)
+    latent: AnyFloats  # (time, latent)
+    arm: AnyFloats  # (time, 13): `ARM`
+    finger: AnyFloats  # (time,), m; 0 where it is not recorded
+    tactile: AnyFloats  # (time, channel)
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
     object: str | None = None  # the grasped object, where a label names it
 
-    def starts(self, context: int, horizon: int, stride: int = 1) -> NDArray[np.int64]:
+    def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
         return window_starts(self.groups, self.usable, context, horizon, stride)
 
-    def contact_starts(self, context: int, horizon: int, stride: int) -> NDArray[np.int64]:
+    def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
         """Return the first rows of the windows that lie within one contact (window,)."""
         same = np.concatenate([[0], np.cumsum(np.diff(self.contact) != 0)])[: len(self.contact)]
         groups = self.groups * (int(same.max(initial=0)) + 1) + same
@@ -88,7 +87,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes]) -> codecs.Codec:
     return codecs.Raw(channels, tuple(tactile.layout(table.schema, channels)))
 
 
-def inputs(table: pa.Table, names: Sequence[str]) -> Floats:
+def inputs(table: pa.Table, names: Sequence[str]) -> AnyFloats:
     """Return the named columns as float64, shape (time, column).
 
     Raises `TacpipeError` for a column that is absent, and for the simulator's ground truth.
@@ -140,7 +139,7 @@ def track(shard: Recording, codec: codecs.Codec) -> Track:
     )
 
 
-def _velocity(table: pa.Table, t_ns: NDArray[np.int64], pose: Floats) -> Floats:
+def _velocity(table: pa.Table, t_ns: Times, pose: AnyFloats) -> AnyFloats:
     """Return the hand's linear and angular velocity (time, 6): from the joints where they are those of a known arm."""
     names = [f"robot_joint{joint}_rad" for joint in range(1, JOINTS + 1)]
     speeds = [f"robot_joint{joint}_velocity_rad_s" for joint in range(1, JOINTS + 1)]
@@ -151,14 +150,14 @@ def _velocity(table: pa.Table, t_ns: NDArray[np.int64], pose: Floats) -> Floats:
     return kinematics.differences(t_ns, pose[:, :3], pose[:, 3:])
 
 
-def whole_numbers(table: pa.Table, name: str) -> NDArray[np.int64]:
+def whole_numbers(table: pa.Table, name: str) -> Int64s:
     """Return an integer column, shape (time,). Raises `TacpipeError` where it is absent."""
     if name not in table.column_names:
         raise TacpipeError(f"There is no column {name}. Run `tacpipe segment contacts` on the synchronized recordings.")
     return np.asarray(table.column(name).to_numpy(), dtype=np.int64)
 
 
-def aligned(arm: Floats, reference: Floats) -> Floats:
+def aligned(arm: AnyFloats, reference: AnyFloats) -> AnyFloats:
     """Return the arm's rows (time, 13) with the quaternions' common sign nearest to that of ``reference`` (4,).
 
     A quaternion and its negative are the same rotation. Within a recording the sign is continuous already; between
@@ -193,7 +192,7 @@ def rate_hz(tracks: Sequence[Track]) -> float:
     return round(float(np.median(list(rates.values()))), 3)
 
 
-def _orientation(quaternions: Floats) -> Floats:
+def _orientation(quaternions: AnyFloats) -> AnyFloats:
     """Return unit quaternions (time, 4) of continuous sign; those that cannot be normalised become NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return continuous(quaternions.astype(np.float64))

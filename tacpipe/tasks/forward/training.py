@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
 from torch import nn
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.errors import TacpipeError
@@ -45,7 +45,6 @@ from tacpipe.training import loop, scaling
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-Floats = NDArray[np.floating[Any]]
 
 HISTORY = "history.jsonl"
 CALIBRATED = 16_384  # windows that scales are fitted on, evenly spread: they overlap, so hardly a row is left out
@@ -171,7 +170,7 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str) ->
     return rows(part, starts, context, horizon, actions=params.actions, device=device)
 
 
-def _linear(part: Rows) -> tuple[Floats, Floats, Floats]:
+def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     """Return past touch (window, context, channel), motion (window, row, 12) and touch to come, for the baselines."""
     starts = part.some(LINEAR)
     at = starts.cpu().numpy()[:, None]
@@ -209,7 +208,7 @@ def _described(codec: codecs.Codec) -> dict[str, Any]:
     return {"kind": codec.kind, "of": codec.representation, "frames": frames, "latents": latents, "name": name}
 
 
-def _reference(quaternions: Sequence[Floats]) -> Floats:
+def _reference(quaternions: Sequence[AnyFloats]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
     return next((one[0].astype(np.float64) for one in quaternions if len(one)), np.array([0.0, 0.0, 0.0, 1.0]))
 

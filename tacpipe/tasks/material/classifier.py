@@ -9,8 +9,8 @@ from typing import Any, Self, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
@@ -43,16 +43,14 @@ ROCKET, SPECTRA = "minirocket", "spectra"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
 
 Config = dict[str, Any]
-Floats = NDArray[np.float32]
-Materials = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class ReaderOutput:
     """Predictions of a reader for slides."""
 
-    scores: Floats  # (slide, class), in the order of the model's classes
-    latents: Floats | None  # (slide, latent)
+    scores: Float32s  # (slide, class), in the order of the model's classes
+    latents: Float32s | None  # (slide, latent)
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class NetworkReader:
     network: Network
     scaling: Affine
 
-    def read(self, frames: Floats) -> ReaderOutput:
+    def read(self, frames: Float32s) -> ReaderOutput:
         """Return scores and latents of slides (slide, time, channel) in device counts."""
         scores, latents = [], []
         device = next(self.network.parameters()).device
@@ -75,12 +73,12 @@ class NetworkReader:
                 latents.append(found.latents.cpu().numpy())
         return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
 
-    def scores_of(self, latents: Floats) -> Floats:
+    def scores_of(self, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) that this sensor's classifier gives to latents, of another sensor maybe."""
         device = next(self.network.parameters()).device
         self.network.eval()
         with torch.no_grad():
-            scores: Floats = self.network.classify(torch.from_numpy(latents).to(device)).cpu().numpy()
+            scores: Float32s = self.network.classify(torch.from_numpy(latents).to(device)).cpu().numpy()
         return scores
 
 
@@ -91,7 +89,7 @@ class RocketReader:
     strong: MinirocketClassifier
     classes: tuple[int, ...]
 
-    def read(self, frames: Floats) -> ReaderOutput:
+    def read(self, frames: Float32s) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
         return ReaderOutput(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
 
@@ -106,12 +104,12 @@ class SpectraReader:
     transfer: Transfer
     classes: tuple[int, ...]
 
-    def read(self, frames: Floats) -> ReaderOutput:
+    def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
         found = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
         return ReaderOutput(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
 
-    def expected(self, latents: Floats) -> Floats:
+    def expected(self, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
@@ -170,7 +168,7 @@ class Classifier:
             if any(shape != (len(noise), len(self.classes)) for shape in shapes):
                 raise ValueError(f"slides of {name} get scores of {shapes}, not of {len(self.classes)} classes")
 
-    def probabilities(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
+    def probabilities(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
 
         Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
@@ -179,10 +177,10 @@ class Classifier:
         """
         scores = self.scores(slides, sensor).astype(np.float64)
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
-        found: Floats = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+        found: Float32s = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
         return found
 
-    def scores(self, slides: Floats | NDArray[np.float64], sensor: str = "") -> Floats:
+    def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
@@ -230,9 +228,9 @@ class Classifier:
                 f"Segment it with the same params, or train on slides like it."
             )
 
-    def named(self, scores: Floats) -> Materials:
+    def named(self, scores: Float32s) -> Int64s:
         """Return the material of the highest score of each slide (slide,)."""
-        named: Materials = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
+        named: Int64s = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
         return named
 
     def partner(self, sensor: str) -> str:
@@ -284,7 +282,7 @@ class Classifier:
         }
 
 
-def spread(scores: Floats, known: Any, classes: tuple[int, ...]) -> Floats:
+def spread(scores: Float32s, known: Any, classes: tuple[int, ...]) -> Float32s:
     """Return scores of the classes ``known`` as columns of all ``classes``, the lowest possible where one is unknown.
 
     >>> spread(np.array([[1.0, 2.0]], np.float32), [3, 5], (3, 4, 5)).tolist()

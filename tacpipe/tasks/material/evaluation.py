@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Float32s, Int64s
 from tacpipe.datasets import origin
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline
@@ -18,16 +18,7 @@ from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material import metrics
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.classifier import (
-    CONFIG,
-    MEAN_LEVEL,
-    Classifier,
-    Floats,
-    Materials,
-    NetworkReader,
-    ReaderOutput,
-    SpectraReader,
-)
+from tacpipe.tasks.material.classifier import CONFIG, MEAN_LEVEL, Classifier, NetworkReader, ReaderOutput, SpectraReader
 from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
 from tacpipe.tasks.material.params import XLSTM, Raec
 from tacpipe.tasks.material.slides import Slides
@@ -44,16 +35,16 @@ class Evaluated:
     """The slides of one sensor and the predictions for them."""
 
     slides: Slides
-    seen: NDArray[np.bool_]  # (slide,): the model was trained on it
+    seen: Bools  # (slide,): the model was trained on it
     output: ReaderOutput
-    predicted: dict[str, Materials]  # predictor -> the material it names (slide,)
-    held: NDArray[np.bool_]  # (slide,): of a material whose label the sensor did not learn
-    zero_shot: tuple[Materials, Materials] | None = None  # another sensor's names: of all materials, of held-out ones
-    counted: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
+    predicted: dict[str, Int64s]  # predictor -> the material it names (slide,)
+    held: Bools  # (slide,): of a material whose label the sensor did not learn
+    zero_shot: tuple[Int64s, Int64s] | None = None  # another sensor's names: of all materials, of held-out ones
+    counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
 
-    def right(self, predictor: str, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def right(self, predictor: str, chosen: Bools) -> Bools:
         """Return which of the chosen slides a predictor named rightly."""
-        found: NDArray[np.bool_] = (self.predicted[predictor] == self.slides.materials)[chosen]
+        found: Bools = (self.predicted[predictor] == self.slides.materials)[chosen]
         return found
 
 
@@ -138,7 +129,7 @@ def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evalu
     return found
 
 
-def _exchanged(classifier: Classifier, sensor: str, latents: Floats) -> Materials:
+def _exchanged(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s:
     """Return the materials that the classifier of another sensor gives latents, in this sensor's names of materials.
 
     Sensors that were aligned by permuted classes share a space in which one's material lies where another's does; the
@@ -154,7 +145,7 @@ def _exchanged(classifier: Classifier, sensor: str, latents: Floats) -> Material
     return np.array([back[int(one)] for one in named], np.int64)
 
 
-def _partner_scores(classifier: Classifier, sensor: str, latents: Floats) -> Floats:
+def _partner_scores(classifier: Classifier, sensor: str, latents: Float32s) -> Float32s:
     own, reader = classifier.readers[sensor], classifier.readers[classifier.partner(sensor)]
     if isinstance(own, SpectraReader):
         return own.expected(latents)
@@ -162,9 +153,7 @@ def _partner_scores(classifier: Classifier, sensor: str, latents: Floats) -> Flo
     return reader.scores_of(latents)
 
 
-def _by_another(
-    classifier: Classifier, sensor: str, latents: Floats, held_out: list[int]
-) -> tuple[Materials, Materials]:
+def _by_another(classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]) -> tuple[Int64s, Int64s]:
     """Return the materials by the classes that other sensors learned: of all materials, and of those held out alone."""
     scores = _partner_scores(classifier, sensor, latents)
     among = np.isin(classifier.classes, held_out)
@@ -245,7 +234,7 @@ def predictions_table(
     return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))
 
 
-def score_columns(classifier: Classifier, scores: Floats) -> list[tuple[pa.Field, Any]]:
+def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Field, Any]]:
     """Return a column of scores a material."""
     about = {"quantity": "score"}
     return [
@@ -254,7 +243,7 @@ def score_columns(classifier: Classifier, scores: Floats) -> list[tuple[pa.Field
     ]
 
 
-def latent_columns(latents: Floats) -> list[tuple[pa.Field, Any]]:
+def latent_columns(latents: Float32s) -> list[tuple[pa.Field, Any]]:
     """Return a column a latent."""
     about = {"quantity": "latent"}
     return [

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
-
-Floats = NDArray[np.floating[Any]]
 
 TASK = "material"
 CHANCE = "chance"
@@ -44,7 +42,7 @@ def _sums(right: Mapping[tuple[Any, str], tuple[int, int]]) -> Sums:
     return {key: np.array(one, dtype=np.float64) for key, one in right.items()}
 
 
-def _wrong(found: Floats) -> Floats:
+def _wrong(found: AnyFloats) -> AnyFloats:
     return np.where(found[:, 1] > 0, 1 - found[:, 0] / np.maximum(found[:, 1], 1), np.nan)
 
 

@@ -7,9 +7,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tacpipe.arrays import Bools
 from tacpipe.metrics.proportions import mcnemar, wilson
 from tacpipe.tasks.material.classifier import MEAN_LEVEL
 
@@ -17,7 +15,7 @@ MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
 Tree = dict[str, Any]
 
 
-def accuracy(correct: Mapping[str, NDArray[np.bool_]]) -> Tree:
+def accuracy(correct: Mapping[str, Bools]) -> Tree:
     """Return accuracy, right ones, number and 95 % Wilson interval by sensor; a sensor without slides is left out.
 
     Accuracy is the ratio of right names: equation (4) of the paper, taken literally, would be a mean squared difference
@@ -44,7 +42,7 @@ def chance(counts: Mapping[str, int], classes: int) -> Tree:
     return {"accuracy": shares, "n": {sensor: counts[sensor] for sensor in shares}}
 
 
-def summary(right: Mapping[str, Mapping[str, NDArray[np.bool_]]], classes: int) -> Tree:
+def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> Tree:
     """Return the metrics of predictors: ``right`` holds by predictor and sensor which slides were named rightly (slide,).
 
     ``skill`` is the fraction of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Int64s
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.tasks.material import prediction
-from tacpipe.tasks.material.classifier import Classifier, Floats, Materials
+from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.opened import opened
 
 if TYPE_CHECKING:
@@ -23,11 +24,11 @@ class MaterialModel(Classifier):
     def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
 
     @overload
-    def predict(self, slides: Floats | NDArray[np.float64], /, sensor: str = "") -> Materials: ...
+    def predict(self, slides: Float32s | NDArray[np.float64], /, sensor: str = "") -> Int64s: ...
 
     def predict(
-        self, given: Dataset | Recording | Floats | NDArray[np.float64], /, sensor: str = ""
-    ) -> pa.Table | Materials:
+        self, given: Dataset | Recording | Float32s | NDArray[np.float64], /, sensor: str = ""
+    ) -> pa.Table | Int64s:
         """Return the material of slides: of a dataset or one of its recordings as a table, of arrays as an array.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
@@ -44,7 +45,7 @@ class MaterialModel(Classifier):
             return prediction.predictions(self, opened(given, self.chain))
         return self.named(self.scores(given, sensor))
 
-    def frames(self, recording: Recording) -> tuple[Floats, str]:
+    def frames(self, recording: Recording) -> tuple[Float32s, str]:
         """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.
 
         The channels are those of ``layouts[sensor].channels``, columns of the recording. Raises as `predict`.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Float32s, Floats, Int64s
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -48,16 +48,16 @@ class Slides:
 
     layout: Layout
     names: tuple[str, ...]
-    frames: NDArray[np.float32]  # (slide, time, channel), device counts
-    materials: NDArray[np.int64]  # (slide,); UNKNOWN where none is labelled
+    frames: Float32s  # (slide, time, channel), device counts
+    materials: Int64s  # (slide,); UNKNOWN where none is labelled
     digests: tuple[str, ...]
-    speeds_m_s: NDArray[np.float64]  # (slide,); NaN where none is recorded
+    speeds_m_s: Floats  # (slide,); NaN where none is recorded
 
     def __len__(self) -> int:
         """Return how many slides there are."""
         return len(self.names)
 
-    def some(self, chosen: NDArray[np.bool_]) -> Slides:
+    def some(self, chosen: Bools) -> Slides:
         """Return the slides that a mask (slide,) chooses."""
         at = np.flatnonzero(chosen)
         return Slides(
@@ -83,7 +83,7 @@ def read(
     Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
     slides of one sensor differ in channels, frames or rate.
     """
-    found: dict[str, list[tuple[Recording, Layout, NDArray[np.float32]]]] = {}
+    found: dict[str, list[tuple[Recording, Layout, Float32s]]] = {}
     there: set[str] = set()
     for name, shard in sorted(recordings.recordings.items()):
         sensor = shard.attributes.get("sensor")
@@ -103,7 +103,7 @@ def read(
     return {sensor: _bundle(several, labelled) for sensor, several in sorted(found.items())}
 
 
-def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, NDArray[np.float32]]:
+def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
     """Return the layout of a slide and its frames (time, channel)."""
     if STREAM not in shard.streams and "" not in shard.streams:
         raise TacpipeError(
@@ -129,14 +129,14 @@ def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[L
     return Layout(sensor, tuple(channels), len(values), rate_hz, str(shard.attributes.get("layout") or "time")), values
 
 
-def _columns(table: pa.Table, channels: Sequence[str]) -> NDArray[np.float32]:
+def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
     values = np.empty((table.num_rows, len(channels)), np.float32)
     for index, name in enumerate(channels):
         values[:, index] = table.column(name).to_numpy()
     return values
 
 
-def _bundle(several: Sequence[tuple[Recording, Layout, NDArray[np.float32]]], labelled: bool) -> Slides:
+def _bundle(several: Sequence[tuple[Recording, Layout, Float32s]], labelled: bool) -> Slides:
     """Return the slides of one sensor, alike in layout."""
     first, layout, _ = several[0]
     for shard, other, _ in several:

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
-
-Floats = NDArray[np.float64]
 
 NEAREST = 3  # training grasps whose mean is predicted
 
@@ -23,7 +22,7 @@ class Baselines:
 
     readings: Mapping[str, Floats]  # by target (grasp, value), device counts
     objects: tuple[str, ...]
-    t_ns: NDArray[np.int64]  # (grasp,)
+    t_ns: Times  # (grasp,)
 
     @classmethod
     def of(cls, grasps: Grasps) -> Baselines:
@@ -59,7 +58,7 @@ class Baselines:
             },
         }
 
-    def same_reading(self, grasps: Grasps) -> NDArray[np.bool_]:
+    def same_reading(self, grasps: Grasps) -> Bools:
         """Return whether each grasp (grasp,) has a reading of training, to the count: one that was logged twice."""
         before, now = (
             np.concatenate([values[name] for name in self.readings], axis=1)

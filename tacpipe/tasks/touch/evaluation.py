@@ -6,12 +6,12 @@ import csv
 import io
 import json
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray, Bools
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import origin
 from tacpipe.errors import TacpipeError
@@ -27,8 +27,6 @@ from tacpipe.tasks.touch.result_names import CONSTANT, GRASPS, MODEL, NEAREST_IN
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-
-Mask = NDArray[np.bool_]
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -71,7 +69,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
 
 def _headlines(
-    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Mask, known: Mask
+    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Bools, known: Bools
 ) -> list[headline.Headline]:
     """Return how the model compares with its baselines on each target, on known objects and on novel ones."""
     objects = {name: of or "unnamed" for name, of in zip(grasps.names, grasps.objects, strict=True)}
@@ -93,7 +91,7 @@ def _headlines(
     return found
 
 
-def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Mask, known: Mask) -> Tree:
+def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, known: Bools) -> Tree:
     """Return the measures of every predictor on some grasps, over all of them and by object.
 
     Where an object among them is not ``known``, intervals are over objects: what the next one will be like is the question.
@@ -114,7 +112,7 @@ def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Mask, kno
     return tree
 
 
-def _tree(grasps: Grasps, predicted: Readings, constant: Readings, mask: Mask, clusters: NDArray[Any]) -> Tree:
+def _tree(grasps: Grasps, predicted: Readings, constant: Readings, mask: Bools, clusters: AnyArray) -> Tree:
     readings, one, mean = (metrics.chosen(values, mask) for values in (grasps.readings, predicted, constant))
     return metrics.tree(readings, one, mean, clusters[mask].tolist())
 
@@ -133,7 +131,7 @@ def _by_object_csv(tree: Tree) -> bytes:
     return text.getvalue().encode()
 
 
-def _about(grasps: Grasps, seen: Mask, known: Mask) -> pa.Table:
+def _about(grasps: Grasps, seen: Bools, known: Bools) -> pa.Table:
     """Return a row a grasp: which recording, object and session, when, and whether the model knows it or its object."""
     return pa.table(
         {

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud, require_columns
 from tacpipe.clouds.grasp import Grasp
@@ -17,7 +17,6 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
 
-Floats = NDArray[np.float64]
 
 STREAMS = ("cloud", "grasp")
 READING = "reading"
@@ -32,7 +31,7 @@ class Grasps:
     names: tuple[str, ...]
     objects: tuple[str, ...]  # empty where none is labelled
     sessions: tuple[str, ...]
-    t_ns: NDArray[np.int64]  # (grasp,)
+    t_ns: Times  # (grasp,)
     clouds: tuple[Cloud, ...]
     grasps: tuple[Grasp, ...]
     readings: Mapping[str, Floats]  # by target (grasp, value), device counts; empty without readings

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
-
-Floats = NDArray[np.floating[Any]]
 
 TASK = "touch"
 PARTS = {True: "known objects", False: "novel objects", None: "all objects"}
@@ -65,13 +63,13 @@ def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
 
 
 def _measure(range_counts: float, cluster: str) -> Measure:
-    def rmse(found: Floats) -> Floats:
+    def rmse(found: AnyFloats) -> AnyFloats:
         return np.sqrt(np.where(found[:, 1] > 0, found[:, 0] / np.maximum(found[:, 1], 1), np.nan))
 
-    def gain(one: Floats, other: Floats) -> Floats:
+    def gain(one: AnyFloats, other: AnyFloats) -> AnyFloats:
         return np.where(other > 0, 1 - one / np.where(other > 0, other, 1), np.nan)
 
-    def values(found: Floats) -> tuple[float, ...]:
+    def values(found: AnyFloats) -> tuple[float, ...]:
         share = float(rmse(found[None])[0])
         return share, share * range_counts
 

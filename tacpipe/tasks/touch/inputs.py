@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Floats
 from tacpipe.clouds import frame
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
@@ -22,7 +22,7 @@ from tacpipe.clouds.normalisation import (
 )
 from tacpipe.errors import TacpipeError
 
-Arrays = tuple[NDArray[np.float32], NDArray[np.float32]]
+Arrays = tuple[Float32s, Float32s]
 
 MODES = ("xyz", "rgb", "xyzcont", "rgbcont", "xyzpose", "rgbpose")
 WRISTS = ("given", "estimated")
@@ -85,7 +85,7 @@ class Sources:
         return [Extent.of(cloud) for cloud in self.clouds]
 
     @cached_property
-    def wrists(self) -> list[NDArray[np.float64] | None]:
+    def wrists(self) -> list[Floats | None]:
         """Each wrist's rotation, or its estimate."""
         if self.inputs.wrist == "estimated":
             return [frame.estimated_wrist(grasp) for grasp in self.grasps]

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from tacpipe.arrays import Float32s
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch.inputs import Arrays
 
@@ -104,7 +104,7 @@ def output(model: nn.Module, arrays: Arrays) -> Tensor:
     return found
 
 
-def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> NDArray[np.float32]:
+def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Float32s:
     """Return the mean over ``draws`` of what a network makes of the first ``count`` grasps, (grasp, value), scaled."""
     rows = []
     with torch.no_grad():

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
@@ -23,7 +23,6 @@ from tacpipe.tasks.touch.losses import Drawn, predictions
 from tacpipe.tasks.touch.patches import Patches, PatchSources, require_colours
 from tacpipe.training.scaling import Affine
 
-Floats = NDArray[np.float64]
 NetworkParams = params_of.Patches | params_of.Pointnet
 LARGEST = 100_000  # points of a cloud, and times that they are drawn
 

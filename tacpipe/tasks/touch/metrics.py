@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.metrics import regression
 
-Floats = NDArray[np.float64]
 Readings = Mapping[str, Floats]  # by target (grasp, value), device counts
 Tree = dict[str, Any]
 
@@ -54,7 +53,7 @@ def by_electrode(readings: Readings, predicted: Readings) -> Tree:
     return found
 
 
-def chosen(predicted: Readings, mask: NDArray[np.bool_]) -> dict[str, Floats]:
+def chosen(predicted: Readings, mask: Bools) -> dict[str, Floats]:
     """Return the values of the grasps that a mask (grasp,) chooses."""
     return {target: values[mask] for target, values in predicted.items()}
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Float32s, Floats, Indices
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.frame import local_points
@@ -55,8 +55,8 @@ class PatchSources:
     ) -> None:
         """Take clouds and grasps; raises `TacpipeError` where colours are to be read and a cloud has none."""
         self.patches = patches
-        self.clouds: list[NDArray[np.float32]] = []  # of (point, channel)
-        self.near: list[list[NDArray[np.intp]]] = []  # of points about g1 and about g2
+        self.clouds: list[Float32s] = []  # of (point, channel)
+        self.near: list[list[Indices]] = []  # of points about g1 and about g2
         if patches.coloured:
             require_colours(names, clouds)
         for cloud, grasp in zip(clouds, grasps, strict=True):
@@ -96,21 +96,21 @@ def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
             )
 
 
-def _about(points: NDArray[np.float64], place_m: float, radius_m: float) -> NDArray[np.intp]:
+def _about(points: Floats, place_m: float, radius_m: float) -> Indices:
     """Return the points within the radius of a contact, or the nearest one where there is none."""
     away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
     inside = np.flatnonzero(away <= radius_m)
     return inside if len(inside) else np.array([int(away.argmin())])
 
 
-def _chosen(total: int, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def _chosen(total: int, count: int, rng: np.random.Generator) -> Indices:
     """Return ``count`` draws of ``total``: each at most once as long as they last, then again."""
     if count <= total:
-        chosen: NDArray[np.intp] = rng.choice(total, count, replace=False, shuffle=False)
+        chosen: Indices = rng.choice(total, count, replace=False, shuffle=False)
         return chosen
     return np.concatenate([np.arange(total), rng.integers(0, total, count - total)])
 
 
-def _numbers(grasps: Sequence[Grasp], placed: bool) -> NDArray[np.float32]:
+def _numbers(grasps: Sequence[Grasp], placed: bool) -> Float32s:
     rows = [[grasp.opening_m / UNIT_M] + (list(geometry.place(grasp).values()) if placed else []) for grasp in grasps]
     return np.array(rows, np.float32)

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
@@ -26,7 +26,6 @@ from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.params import Params, Trees
 from tacpipe.training.scaling import Affine
 
-Floats = NDArray[np.float64]
 Config = dict[str, Any]
 
 TASK = "touch"

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
@@ -37,7 +37,6 @@ from tacpipe.training.scaling import Affine
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-Floats = NDArray[np.float64]
 Config = dict[str, Any]
 
 LEAVES = (2, 4, 8)  # rows of a leaf that are tried

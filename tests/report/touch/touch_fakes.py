@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
@@ -41,12 +41,12 @@ PARAMS = {
 Errors = Mapping[str, float]  # by object; how far what is said lies from the truth, as a share of the range
 
 
-def truth(target: str, grasps: int, seed: int = 0) -> NDArray[Any]:
+def truth(target: str, grasps: int, seed: int = 0) -> AnyArray:
     """Return true values (grasp, value) as shares of the range, 0.5 on average and 0.1 off it."""
     width = biotac_sp.width(target)
     signs = np.where(np.arange(grasps) % 2 == 0, 1.0, -1.0)[:, None]
     pattern = np.cos(np.arange(width) + seed)[None] if width > 1 else np.ones((1, 1))
-    shares: NDArray[Any] = 0.5 + 0.1 * signs * pattern / np.sqrt(np.mean(pattern**2))
+    shares: AnyArray = 0.5 + 0.1 * signs * pattern / np.sqrt(np.mean(pattern**2))
     return shares
 
 
@@ -141,7 +141,7 @@ def recorded(names: Sequence[str] = ("bleach-001", "drill-002")) -> Any:
     return FakeDataset(shards)
 
 
-def _table(touch: Mapping[str, NDArray[Any]]) -> pa.Table:
+def _table(touch: Mapping[str, AnyArray]) -> pa.Table:
     """Return shares of ranges as the stream that holds them, in device counts, with a row of the seen grasp."""
     found: dict[str, Any] = {}
     for target, shares in touch.items():

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tacpipe.arrays import AnyArray
 from tacpipe.recording import rig
 from tacpipe.recording.rig import Rig
 
@@ -34,7 +34,7 @@ def awaited(found: Callable[[], Any]) -> Any:
     return value
 
 
-def in_order(rows: NDArray[Any], among: NDArray[Any]) -> bool:
+def in_order(rows: AnyArray, among: AnyArray) -> bool:
     """Return whether all of ``rows`` are found in ``among``, in this order, perhaps with others between."""
     left = iter(among)
     return len(rows) > 0 and all(any(np.array_equal(row, one) for one in left) for row in rows)

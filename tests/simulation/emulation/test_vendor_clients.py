@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from anyskin import AnySkinBase
 from flexitac import FlexiTacSensor
-from numpy.typing import NDArray
 from optoforce import OptoForce16, OptoForce22, OptoForce34
 from optoforce.reading import FX_SCALE
 from paxini_sdk import HighSpeedHandBoard
 from pyrobotiqtactile import RobotiqTactileSensor
 from tactile_sdk import TactilePressureSDK
 
+from tacpipe.arrays import AnyArray
 from tacpipe.recording.rig import Rig
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation.emulator import Emulator
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.rig
 FRAMES = 20
 
 
-def read(asked: Rig, client: Callable[[str], list[Any]]) -> tuple[NDArray[Any], Samples]:
+def read(asked: Rig, client: Callable[[str], list[Any]]) -> tuple[AnyArray, Samples]:
     """Return what a client that is given the port reads (frame, …), and what was sent."""
     with Emulator(asked) as emulator:
         found = client(emulator.rig.streams["load"].address.place)

@@ -9,29 +9,30 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 from tests.models.window_fakes import LAYOUT
 from tests.stages.learning_fakes import CHANNELS, table
-from tests.tasks.forward.trials import Floats, track
+from tests.tasks.forward.trials import track
 
 HORIZON, ROWS, STEP = 4, 400, 200  # rows; the load steps up at row 200
 
 
-def made(load: Floats) -> Track:
+def made(load: AnyFloats) -> Track:
     """A track all of whose channels have this load (time,)."""
     return track(table(np.repeat(load[:, None], len(CHANNELS), axis=1)))
 
 
-def stepped(seed: int = 0) -> Floats:
+def stepped(seed: int = 0) -> AnyFloats:
     """A load that is quiet and steps up by much."""
     load = np.random.default_rng(seed).normal(0, 1, ROWS)
     load[STEP:] += 200
     return load
 
 
-def said(one: Track, ahead: dict[str, Floats]) -> Predicted:
+def said(one: Track, ahead: dict[str, AnyFloats]) -> Predicted:
     """What predictors say of each row (time,) but the first: the load of the last step of the horizon."""
     now = np.arange(1, len(one.t_ns) - HORIZON)
     predictions = {
@@ -41,7 +42,7 @@ def said(one: Track, ahead: dict[str, Floats]) -> Predicted:
     return Predicted(now, np.zeros(0), Prediction(None, np.zeros(0)), predictions)
 
 
-def loads(*parts: tuple[Track, dict[str, Floats]]) -> Loads:
+def loads(*parts: tuple[Track, dict[str, AnyFloats]]) -> Loads:
     found = Loads(LAYOUT, HORIZON)
     for one, ahead in parts:
         found.begin(one)
@@ -50,7 +51,7 @@ def loads(*parts: tuple[Track, dict[str, Floats]]) -> Loads:
     return found
 
 
-def seer(load: Floats) -> dict[str, Floats]:
+def seer(load: AnyFloats) -> dict[str, AnyFloats]:
     """A model that knows, a persistence that does not, and one that nobody watches."""
     knows = np.concatenate([load[HORIZON:], np.full(HORIZON, load[-1])])
     return {"model": knows, "persistence": load, "context_mean": load}
@@ -72,7 +73,7 @@ def test_a_model_that_knows_leads_the_event_and_persistence_misses_it() -> None:
 
 def test_levels_give_no_more_than_one_false_alarm_a_minute_where_they_were_set() -> None:
     load = stepped()
-    noisy: dict[str, Floats] = {"model": load + np.random.default_rng(1).normal(0, 5, ROWS)}
+    noisy: dict[str, AnyFloats] = {"model": load + np.random.default_rng(1).normal(0, 5, ROWS)}
     found = loads((made(load), noisy))
     levels = found.calibrated()
     assert np.array(levels["sd"]).shape == (6,)

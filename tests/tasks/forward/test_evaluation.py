@@ -14,23 +14,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
 from tacpipe.io import parquet
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel
 from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
-from tests.tasks.forward.trials import (
-    CONTEXT,
-    HORIZON,
-    LENGTH,
-    Floats,
-    compressed,
-    counts,
-    foretold,
-    judged,
-    poses,
-    trained,
-)
+from tests.tasks.forward.trials import CONTEXT, HORIZON, LENGTH, compressed, counts, foretold, judged, poses, trained
 
 LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
 
@@ -64,12 +54,12 @@ def latent_models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathF
     return found
 
 
-def sliding(values: Floats) -> Floats:
+def sliding(values: AnyFloats) -> AnyFloats:
     """All windows (window, row, channel) of rows (time, channel)."""
     return np.lib.stride_tricks.sliding_window_view(values, LENGTH, axis=0).swapaxes(1, 2)
 
 
-def oracle(*shards: FakeShard) -> dict[str, Floats]:
+def oracle(*shards: FakeShard) -> dict[str, AnyFloats]:
     """Errors (window, step, channel) of the two that need no fit, from the columns."""
     windows = np.concatenate([sliding(counts(one)) for one in shards])
     ahead = windows[:, CONTEXT:]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load as load_stage
@@ -24,7 +25,6 @@ from tests.tasks.forward.trials import (
     CONTEXT,
     HORIZON,
     LENGTH,
-    Floats,
     asked,
     compressed,
     counts,
@@ -61,7 +61,7 @@ def forecaster(models: Mapping[str, Mapping[str, bytes]]) -> ForwardModel:
     return load(models["gru raw"])
 
 
-def windows(count: int = 3) -> tuple[Floats, Floats]:
+def windows(count: int = 3) -> tuple[AnyFloats, AnyFloats]:
     """Random windows and plans with poses alone."""
     rng = np.random.default_rng(0)
     arm = np.concatenate([rng.normal(0, 0.1, (count, LENGTH, 3)), rng.normal(1, 0.05, (count, LENGTH, 4))], axis=-1)
@@ -170,7 +170,7 @@ def test_the_plan_of_a_step_changes_only_it_and_later_ones(
     assert (np.abs(after[:, 2:] - before[:, 2:]).max(axis=(0, 2)) > 1e-3).all()
 
 
-def spoiled(at: tuple[int, ...], value: float, of_plan: bool = False) -> tuple[Floats, Floats]:
+def spoiled(at: tuple[int, ...], value: float, of_plan: bool = False) -> tuple[AnyFloats, AnyFloats]:
     window, plan = windows()
     (plan if of_plan else window)[at] = value
     return window, plan
@@ -190,7 +190,9 @@ def spoiled(at: tuple[int, ...], value: float, of_plan: bool = False) -> tuple[F
         ((windows()[0], np.zeros((3, HORIZON, 7))), "The plan holds a quaternion of length 0"),
     ],
 )
-def test_what_cannot_be_read_is_one_sentence(given: tuple[Floats, Floats], said: str, forecaster: ForwardModel) -> None:
+def test_what_cannot_be_read_is_one_sentence(
+    given: tuple[AnyFloats, AnyFloats], said: str, forecaster: ForwardModel
+) -> None:
     with pytest.raises(TacpipeError, match=said):
         forecaster.predict(*given)
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import Result
@@ -24,7 +24,6 @@ from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
 
-Floats = NDArray[np.floating[Any]]
 CONTEXT, HORIZON = 5, 4
 LENGTH = CONTEXT + HORIZON
 SMALL = {"architecture": "gru", "hidden": 16, "epochs": 2, "batch": 64, "context": CONTEXT, "horizon": HORIZON}
@@ -63,7 +62,7 @@ def judged(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, b
     return json.loads(result.files["metrics.json"]), result
 
 
-def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[np.int64], Predicted]:
+def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, Int64s, Predicted]:
     """What a model says of all windows of a recording, with the windows' first rows."""
     found = tracks.track(shard, forecaster.codec)
     starts = found.starts(forecaster.context, forecaster.horizon)
@@ -71,7 +70,7 @@ def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, NDArray[
     return found, starts, some
 
 
-def asked(found: tracks.Track, starts: NDArray[np.int64], columns: int = 13) -> tuple[Floats, Floats]:
+def asked(found: tracks.Track, starts: Int64s, columns: int = 13) -> tuple[AnyFloats, AnyFloats]:
     """The windows and plans that `predict` is given for these first rows; without velocities where 7 columns do."""
     past, plan = (starts[:, None] + np.arange(*ends) for ends in ((0, CONTEXT), (CONTEXT, LENGTH)))
     finger = [found.finger[past][..., None]] if columns > 7 else []
@@ -79,24 +78,24 @@ def asked(found: tracks.Track, starts: NDArray[np.int64], columns: int = 13) -> 
     return window, found.arm[plan][..., :columns]
 
 
-def counts(shard: FakeShard) -> Floats:
+def counts(shard: FakeShard) -> AnyFloats:
     """Counts above rest as they stand in a recording's columns (time, channel)."""
     return np.column_stack([shard.content[name].to_numpy() for name in CHANNELS]).astype(np.float64) - REST
 
 
-def poses(shard: FakeShard) -> Floats:
+def poses(shard: FakeShard) -> AnyFloats:
     """The poses as they stand in a recording's columns (time, 7)."""
     return np.column_stack([shard.content[name].to_numpy() for name in tracks.POSE])
 
 
-def panda(rows: int = 60) -> tuple[Floats, dict[str, Floats]]:
+def panda(rows: int = 60) -> tuple[AnyFloats, dict[str, AnyFloats]]:
     """The hand's poses (time, 7) of a Panda that swings, and the columns of its joints."""
     time_s, start = np.arange(rows)[:, None] * 0.02, np.array([0.0, -0.4, 0.1, -2.0, 0.0, 1.8, 0.7])
     size, rate = np.linspace(0.05, 0.2, 7), np.linspace(2, 4, 7)
     angles, speeds = start + size * np.sin(rate * time_s), size * rate * np.cos(rate * time_s)
     last = kinematics.joint_frames(kinematics.PANDA, angles)[:, -1]
     place = last[:, :3, :3] @ np.array([0.0, 0.0, 0.2]) + last[:, :3, 3]
-    columns: dict[str, Floats] = {f"robot_joint{joint + 1}_rad": angles[:, joint] for joint in range(7)}
+    columns: dict[str, AnyFloats] = {f"robot_joint{joint + 1}_rad": angles[:, joint] for joint in range(7)}
     columns |= {f"robot_joint{joint + 1}_velocity_rad_s": speeds[:, joint] for joint in range(7)}
     return np.hstack([place, Rotation.from_matrix(last[:, :3, :3]).as_quat()]), columns
 
