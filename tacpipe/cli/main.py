@@ -27,7 +27,7 @@ Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data,
 6 lock wait timed out, 130 interrupted.
 """
 SUMMARIES = {
-    "ingest": "Read published recordings into a dataset.",
+    "ingest": "Read recordings of files into a dataset.",
     "segment": "Mark contacts and slips, or cut out slides and grasps.",
     "compress": "Compress tactile channels to a few latents.",
     "train": "Train the model of a task.",

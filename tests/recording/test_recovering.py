@@ -252,7 +252,7 @@ def test_a_disk_that_is_full_while_it_seals_keeps_the_spool_and_it_is_recovered(
 
     assert ended.code == 1 and not (lab.folder / "rec").exists()
     assert ended.err.startswith("tacpipe: The disk under ") and ended.err.count("\n") == 1
-    kept = f"What was recorded is kept in {folder}; `tacpipe acquire --recover` seals it once that is mended.\n"
+    kept = f"What was recorded is kept in {folder}; `tacpipe acquire --recover` seals it once that is fixed.\n"
     assert ended.err.endswith(kept)
     lab.run("acquire --recover")
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))

@@ -63,7 +63,14 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
     rig = Rig(spheres=True, effort_spread=0.05, drift_count_day=0.0)
     training, tested = grasps(rig, range(160)), grasps(rig, range(160, 240))
     pressures = {"targets": "pdc_th,pdc_mf"}
-    scaled = {**POINTNET, **pressures, "together": True, "normalisation": "minmax", "inputs": "xyzpose", "epochs": 15}
+    scaled = {
+        **POINTNET,
+        **pressures,
+        "multi_target": True,
+        "normalisation": "minmax",
+        "inputs": "xyzpose",
+        "epochs": 15,
+    }
     boxed = judged(training, tested, tmp_path / "boxed", **scaled)
     metric = judged(training, tested, tmp_path / "metric", **pressures)
     for target in ("pdc_th", "pdc_mf"):
@@ -124,7 +131,7 @@ def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and
 ) -> None:
     rig = Rig(one_pose=True, shift=1.0, drift_count_day=0.0, families="cone,bow", objects=2, stiffness="rigid")
     training, tested = grasps(rig, range(400)), grasps(rig, range(400, 600))
-    small = {**POINTNET, "targets": "e_th,e_mf", "together": True, "points": 32, "epochs": 20}
+    small = {**POINTNET, "targets": "e_th,e_mf", "multi_target": True, "points": 32, "epochs": 20}
     errors = {}
     for inputs in ("xyz", "xyzcont"):
         told = judged(training, tested, tmp_path / inputs, **{**small, "inputs": inputs})

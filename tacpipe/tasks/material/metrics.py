@@ -21,6 +21,7 @@ def accuracy(correct: Mapping[str, Bools]) -> Tree:
     Accuracy is the ratio of right names: equation (4) of the paper, taken literally, would be a mean squared difference
     of labels.
 
+    >>> import numpy as np
     >>> accuracy({"biotac": np.array([True, False])})["accuracy"]
     {'biotac': 0.5}
     """
