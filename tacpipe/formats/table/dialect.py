@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 SEPARATORS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_WHOLE = re.compile(r"[-+]?\d{1,18}")
 _COMMA_NUMBER = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 MISSING = ("", "NA", "N/A", "nan", "NaN", "null", "None", "-")
 
@@ -29,12 +30,14 @@ class Dialect:
     missing: tuple[str, ...] = ()  # cells of MISSING that are there
 
     def number(self, cell: str) -> float | None:
-        """Return the number that a cell holds, None where it holds none.
+        """Return the number that a cell holds, an int where it is written as one, None where it holds none.
 
-        >>> of(["a;b", "1,5;x"]).number("1,5")
-        1.5
+        >>> of(["a;b", "1,5;x"]).number("1,5"), of(["1,2.0"]).number("2.0"), of(["1,2.0"]).number("1")
+        (1.5, 2.0, 1)
         """
         text = cell.strip()
+        if _WHOLE.fullmatch(text):
+            return int(text)
         if self.decimal == ",":
             return float(text.replace(",", ".")) if _COMMA_NUMBER.fullmatch(text) else None
         return float(text) if _NUMBER.fullmatch(text) else None

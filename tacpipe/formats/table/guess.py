@@ -341,9 +341,9 @@ def _kind(values: Sequence[float | str]) -> str:
         return "text" if values else "float64"
     if any(isinstance(value, bool) for value in values):
         return "bool"
-    numbers = [float(value) for value in values]
-    if any(not number.is_integer() for number in numbers):
+    if any(isinstance(value, float) for value in values):  # 2.0 too: a cell below it may hold 2.5
         return "float64"
+    numbers = [int(value) for value in values]
     return next((kind for kind, least, most in _INTEGERS if least <= min(numbers) and max(numbers) <= most), "float64")
 
 

@@ -19,6 +19,7 @@ from tacpipe.printable import listed
 GAP = 3.0  # times the usual step
 ROWS = 3  # that are shown
 COLUMNS = 6  # that are shown
+_KINDS = {"double": "float64", "float": "float32"}  # what a layout calls them
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def of(table: pa.Table) -> Read:
         columns[field.name] = (
             about.get("quantity", ""),
             about.get("unit", ""),
-            str(field.type),
+            _KINDS.get(str(field.type), str(field.type)),
             ends["min"],
             ends["max"],
         )
@@ -70,7 +71,8 @@ def text(layout: Layout, folder: Path) -> str:
     """Return what would be read as lines: all recordings and labels, and the first recording's streams in full."""
     sources = recordings.found(layout, folder)
     labelled = labels.found(layout, folder, sources)
-    lines = [f"{len(sources)} recordings: {listed([one.name for one in sources], 6)}"]
+    count = f"{len(sources)} recording{'s' * (len(sources) != 1)}"
+    lines = [f"{count}: {listed([one.name for one in sources], 6)}"]
     lines += _labels(labelled)
     first = sources[0]
     lines.append(f"\n{first.name}, the first:")

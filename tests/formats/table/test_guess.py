@@ -89,6 +89,13 @@ def test_how_a_file_is_written_is_found_from_its_lines(separator: str, header: b
     assert (found.separator, found.header, len(found.rows)) == (separator, header, 5)
 
 
+def test_whole_numbers_that_are_written_as_decimal_ones_are_floats(tmp_path: Path) -> None:
+    (tmp_path / "skin_1.csv").write_text("time,force_x_n,taxel1\n1700000000,3.0,3\n1700000001,4.0,4\n")
+    printed = guess.layout(tmp_path)
+    assert 'match = "force_x_n", quantity = "force", unit = "N", type = "float64"' in printed
+    assert 'unit = "count", type = "uint16"' in printed
+
+
 def test_a_folder_without_tables_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("nothing")
     with pytest.raises(UsageError, match=r"\.csv"):
