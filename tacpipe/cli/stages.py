@@ -13,17 +13,15 @@ import typer
 
 from tacpipe.engine import pipeline
 from tacpipe.engine.outcome import Outcome
-from tacpipe.engine.request import Request
+from tacpipe.engine.request import OPTIONS, Request
 from tacpipe.errors import FAILED
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage
 
 EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
-_CHECKED = {"jobs": NonNegativeInt, "fold": NonNegativeInt | None, "role": Literal["train", "val", "test"] | None}
 
 
 def add(program: typer.Typer, name: str, command: str) -> None:
@@ -42,8 +40,9 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 
 def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str]) -> None:
     progress.set_quiet(given["quiet"])
-    for flag, kind in _CHECKED.items():
-        fields_of.check(given.get(flag), kind, f"--{flag}")
+    for flag, kind in OPTIONS.items():
+        if given.get(flag) is not None:  # not every stage has each of them
+            fields_of.check(given[flag], kind, f"--{flag}")
     if given.get("guess") and stage.guess is not None:
         terminal.result(stage.guess(given["source"]).rstrip("\n"))
         return

@@ -150,8 +150,8 @@ def _gone(name: str, before: Manifest, after: Manifest) -> bool:
     """
     if name not in after.recordings:
         return True
-    sources = (_raw(one.sources.get(name, {})) for one in (before, after))
-    same_files = name in before.sources and next(sources) == next(sources) and before.stage != ACQUIRE
+    earlier, now = (_raw(one.sources.get(name, {})) for one in (before, after))
+    same_files = name in before.sources and earlier == now and before.stage != ACQUIRE
     return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
 
 

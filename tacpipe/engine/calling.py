@@ -7,20 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import pipeline
-from tacpipe.engine.request import Request
+from tacpipe.engine.request import OPTIONS, Request
 from tacpipe.errors import ResultWarning, UsageError
 from tacpipe.io import progress
 from tacpipe.plugins import fields, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage
 
 Given = str | PathLike[str] | Dataset
-_CHECKED = {"jobs": NonNegativeInt, "fold": NonNegativeInt, "role": Literal["train", "val", "test"] | None}
 _STACK = 3  # frames from a warning to who called `tacpipe.run`
 
 
@@ -50,7 +48,7 @@ def call(
 ) -> Dataset | Path:
     """Run stage ``name`` and return its output: see `tacpipe.run`, whose arguments these are."""
     stage = registry.load(name)
-    for flag, kind in _CHECKED.items():
+    for flag, kind in OPTIONS.items():
         fields.check(getattr(how, flag), kind, flag)
     _refuse_unread(name, stage, datasets, named, how)
     paths: dict[str, Any] = {key: _path(given) for key, given in named.items()}

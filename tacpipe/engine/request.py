@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tacpipe.datasets import manifest, recording_names, roles
 from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
@@ -16,8 +16,12 @@ from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
+
+# what options of a run may be that are no params
+OPTIONS = {"jobs": NonNegativeInt, "fold": NonNegativeInt, "role": Literal["train", "val", "test"] | None}
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from tacpipe.arrays import Floats, Int64s, Times
+from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.table import stamps
 from tacpipe.io import regular
 from tacpipe.io.parquet import owned
 from tacpipe.printable import excerpt, listed, plain
@@ -185,10 +186,8 @@ def _first_fault(path: Path, names: Sequence[str], trailing_comma: bool, seconds
 def _nanoseconds(path: Path, name: str, column: pa.ChunkedArray) -> Int64s:
     """Return decimal seconds as whole nanoseconds, int64 (time,). Raises `TacpipeError` for those that are none."""
     chunk = column.combine_chunks()
-    # A decimal128(19, 9) is stored as its number of 1e-9ths in two words of eight bytes, the low one first.
-    words = np.frombuffer(chunk.buffers()[1], dtype="<i8").reshape(-1, 2)[chunk.offset :][: len(chunk)]
-    t_ns: Times = words[:, 0].astype(np.int64)
-    bad = (words[:, 1] != 0) | (t_ns < 0)
+    t_ns, fits = stamps.last_digits(chunk)
+    bad = ~fits | (t_ns < 0)
     if bad.any():
         index = int(bad.argmax())
         raise TacpipeError(

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -156,6 +155,8 @@ class TomlFile:
 
     def read(self, path: str) -> str:
         """Return what the file at ``path`` holds. Raises `UsageError` where there is none or it is not TOML."""
+        import tomllib  # not at each start of a command
+
         if not path:
             return path
         try:

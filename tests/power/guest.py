@@ -35,19 +35,6 @@ STEPS = {  # mark that is set once the command has returned, and the command
 }
 ACQUIRE = "acquire rig.toml -o data/acquired --duration 2 --name one --quiet"
 RECOVER = "acquire --recover -o data/acquired --quiet"
-RIG = """
-[[stream]]
-name = "wire"
-sensor = "generic"
-transport = "serial:{terminal}"
-
-[stream.options]
-rate_hz = 200
-marker = "A5 5A"
-numbers = [{{ name = "n", type = "u32" }}, {{ name = "value", type = "u16" }}, {{ name = "check", type = "u8" }}]
-sequence = {{ number = "n" }}
-sum = {{ kind = "sum8", number = "check", begin = 2 }}
-"""
 FIRST, MORE = ("a", "b", "c"), ("d",)
 libc = ctypes.CDLL(None, use_errno=True)
 
@@ -122,7 +109,7 @@ def record(kind: str, modules: str) -> dict[str, Any]:
         assert code == 0, printed
         mark(name)
     with device() as terminal:
-        Path("rig.toml").write_text(RIG.format(terminal=terminal))
+        Path("rig.toml").write_text(counted_device.WIRE.format(terminal=terminal))
         code, printed = tacpipe(ACQUIRE)
     assert code == 0, printed
     mark("acquired")

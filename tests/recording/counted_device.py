@@ -21,6 +21,19 @@ import tty
 
 RATE_HZ = 200.0
 MARK = b"\xa5\x5a"
+WIRE = """
+[[stream]]
+name = "wire"
+sensor = "generic"
+transport = "serial:{terminal}"
+
+[stream.options]
+rate_hz = 200
+marker = "A5 5A"
+numbers = [{{ name = "n", type = "u32" }}, {{ name = "value", type = "u16" }}, {{ name = "check", type = "u8" }}]
+sequence = {{ number = "n" }}
+sum = {{ kind = "sum8", number = "check", begin = 2 }}
+"""
 
 
 def value(number: int) -> int:

@@ -29,19 +29,9 @@ from tests.recording import counted_device
 pytestmark = pytest.mark.rig
 ROOT = Path(__file__).parents[2]
 HANGS_S = 600.0
-RIG = """
-[[stream]]
-name = "wire"
-sensor = "generic"
-transport = "serial:{terminal}"
-
-[stream.options]
-rate_hz = 200
-marker = "A5 5A"
-numbers = [{{ name = "n", type = "u32" }}, {{ name = "value", type = "u16" }}, {{ name = "check", type = "u8" }}]
-sequence = {{ number = "n" }}
-sum = {{ kind = "sum8", number = "check", begin = 2 }}
-
+RIG = (
+    counted_device.WIRE
+    + """
 [[stream]]
 name = "net"
 sensor = "generic"
@@ -53,6 +43,7 @@ packets = true
 numbers = [{{ name = "n", type = "u32" }}, {{ name = "value", type = "u16" }}]
 sequence = {{ number = "n" }}
 """
+)
 # how long a device may take is as in all tests of this tier, but what counts as a stall is as for users
 RUN = "from tests.recording import patient; import pytest, os, time; del patient.LIMITS['tacpipe.recording.pace'];"
 RUN += "patient.relax(pytest.MonkeyPatch()); {change}; from tacpipe.cli import main as cli; cli.main()"

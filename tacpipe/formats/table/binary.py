@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -58,17 +59,18 @@ class NumpyArchive:
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
-        return list(self._columns())
+        return list(self._columns)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield all rows of the columns that ``types`` names."""
-        columns = self._columns()
+        columns = self._columns
         yield pa.table({name: pa.array(columns[name]) for name in types})
 
     def place(self, index: int) -> str:
         """Return how the data row ``index`` (from 0) is named in errors."""
         return f"row {index + 1}"
 
+    @functools.cached_property
     def _columns(self) -> dict[str, np.ndarray]:
         found: dict[str, np.ndarray] = {}
         try:
@@ -109,16 +111,17 @@ class JsonLines:
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
-        return list(self._table().column_names)
+        return list(self._table.column_names)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield all rows of the columns that ``types`` names."""
-        yield _flat(self.path, self._table().select(list(types)))
+        yield _flat(self.path, self._table.select(list(types)))
 
     def place(self, index: int) -> str:
         """Return how the data row ``index`` (from 0) is named in errors."""
         return f"line {index + 1}"
 
+    @functools.cached_property
     def _table(self) -> pa.Table:
         with regular.failing(self.path):
             content = regular.source(self.path)

@@ -18,7 +18,7 @@ import numpy as np
 from tacpipe.errors import UsageError
 from tacpipe.formats.table import binary, compressed, dialect
 from tacpipe.formats.table.dialect import Dialect
-from tacpipe.formats.table.layout import EXTENSIONS, GZIP, UNKNOWN
+from tacpipe.formats.table.layout import EXTENSIONS, UNKNOWN, extension
 from tacpipe.io import files as file_system
 from tacpipe.printable import plain
 
@@ -69,12 +69,13 @@ class _Group:
     stream: str
     pattern: str
     paths: tuple[Path, ...]
+    first: Looked  # what the first of them shows
 
 
 def layout(folder: Path) -> str:
     """Return the text of a layout for the files below ``folder``. Raises `UsageError` where none can be a stream."""
     every = [Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names]
-    data = [path for path in every if _extension(path) in EXTENSIONS]
+    data = [path for path in every if extension(path) in EXTENSIONS]
     if not data:
         raise UsageError(f"{folder} holds no file of {', '.join(EXTENSIONS)}; there is nothing to guess from.")
     groups, labels = _grouped(folder, data)
@@ -82,18 +83,13 @@ def layout(folder: Path) -> str:
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
     ]
-    parts += [_stream(folder, group) for group in groups]
+    parts += [_stream(group) for group in groups]
     described = [path for path in every if path.suffix.lower() in (".yaml", ".yml", ".json")]
-    parts += [_labels_of(group, folder) for group in labels]
+    parts += [_labels_of(group) for group in labels]
     if described:
         parts.append(f"[[labels]]\nfile = {_quoted(_pattern(described))}")
     parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
     return "\n\n".join(parts) + "\n"
-
-
-def _extension(path: Path) -> str:
-    suffixes = [suffix.lower() for suffix in path.suffixes]
-    return suffixes[-2] if suffixes[-1:] == [GZIP] and len(suffixes) > 1 else "".join(suffixes[-1:])
 
 
 def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group]]:
@@ -112,7 +108,7 @@ def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Gr
         name = name if name.isidentifier() else "table"
         name = name if name not in used else next(f"{name}{n}" for n in itertools.count(2) if f"{name}{n}" not in used)
         used.add(name)
-        group = _Group(name, _pattern(paths), tuple(paths))
+        group = _Group(name, _pattern(paths), tuple(paths), looked)
         single = looked.text is not None and looked.text.header and len(looked.text.rows) == 1 and len(paths) > 1
         (labels if shared or single else streams).append(group)
     return streams, labels
@@ -163,7 +159,7 @@ def _shared(texts: Sequence[str]) -> str:
 
 def _look(path: Path) -> Looked:
     """Return what the first rows of a file show."""
-    kind = EXTENSIONS[_extension(path)]
+    kind = EXTENSIONS[extension(path)]
     if kind == "csv":
         found = dialect.of(_lines(path))
         columns = list(zip(*found.rows, strict=True)) or [()] * len(found.names)
@@ -195,18 +191,18 @@ def _is_labels(found: Looked) -> bool:
     return texts and _time_column(found) is None and 0 < len(found.text.rows) < LINES - 1
 
 
-def _labels_of(group: _Group, folder: Path) -> str:
+def _labels_of(group: _Group) -> str:
     lines = ["[[labels]]", f"file = {_quoted(group.pattern if len(group.paths) > 1 else group.paths[0].as_posix())}"]
     if len(group.paths) == 1:
-        found = _look(folder / group.paths[0])
+        found = group.first
         keys = [name for name, values in found.values.items() if len(set(values)) == len(values)]
         named = next((name for name in keys if _RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
         lines.append(f"key = {_quoted(named)}  # the column that names recordings")
     return "\n".join(lines)
 
 
-def _stream(folder: Path, group: _Group) -> str:
-    found = _look(folder / group.paths[0])
+def _stream(group: _Group) -> str:
+    found = group.first
     time = _time_column(found)
     apart = {time} if time else set()
     lines = [

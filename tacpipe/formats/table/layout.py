@@ -93,8 +93,7 @@ class Stream:
         """Return the format of a file: the layout's, or that of its extension. Raises `UsageError` where neither says."""
         if self.format is not None:
             return self.format
-        suffixes = [suffix.lower() for suffix in path.suffixes]
-        last = suffixes[-2] if suffixes[-1:] == [GZIP] and len(suffixes) > 1 else "".join(suffixes[-1:])
+        last = extension(path)
         if last not in EXTENSIONS:
             raise UsageError(
                 f"{path} has none of the extensions {', '.join(EXTENSIONS)}. Set format in [streams.{self.name}]."
@@ -104,6 +103,16 @@ class Stream:
     def separator_of(self, path: Path) -> str:
         """Return what stands between the cells of a text file."""
         return self.separator or ("\t" if ".tsv" in [suffix.lower() for suffix in path.suffixes] else ",")
+
+
+def extension(path: Path) -> str:
+    """Return the extension of a file, that below .gz where it is compressed.
+
+    >>> extension(Path("a.CSV")), extension(Path("a.csv.gz")), extension(Path("a"))
+    ('.csv', '.csv', '')
+    """
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    return suffixes[-2] if suffixes[-1:] == [GZIP] and len(suffixes) > 1 else "".join(suffixes[-1:])
 
 
 @dataclass(frozen=True)

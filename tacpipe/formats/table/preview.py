@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tacpipe.formats.table import labels, reading, recordings
-from tacpipe.formats.table.columns import TIME
+from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed
@@ -19,7 +19,7 @@ from tacpipe.printable import listed
 GAP = 3.0  # times the usual step
 ROWS = 3  # that are shown
 COLUMNS = 6  # that are shown
-_KINDS = {"double": "float64", "float": "float32"}  # what a layout calls them
+_KINDS = {kind: name for name, kind in TYPES.items()}  # what a layout calls them
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def of(table: pa.Table) -> Read:
         columns[field.name] = (
             about.get("quantity", ""),
             about.get("unit", ""),
-            _KINDS.get(str(field.type), str(field.type)),
+            _KINDS.get(field.type, str(field.type)),
             ends["min"],
             ends["max"],
         )

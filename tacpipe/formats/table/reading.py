@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from tacpipe.arrays import Indices, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.table import binary, columns, stamps
@@ -19,6 +20,8 @@ from tacpipe.formats.table.layout import Stream
 from tacpipe.formats.table.text import TextTable
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals.resampling import uniform_grid
+
+Place = Callable[[int], str]  # of a row in a block: how errors name it
 
 
 class Rows(Protocol):
@@ -66,11 +69,7 @@ def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
         return _long(file, stream, recording)
     wanted = columns.chosen(stream, [name for name in names if name not in apart], path)
     types = {**_types(file, stream), **{one.name: one.read_as for one in wanted}}
-    blocks = []
-    begun = 0
-    for block in file.batches(types):
-        blocks.append(_converted(file, stream, block, wanted, begun, recording))
-        begun += block.num_rows
+    blocks = [_converted(stream, block, wanted, place) for block, place in _blocks(file, stream, types, recording)]
     return _finished(pa.concat_tables(blocks) if blocks else None, file, stream, recording)
 
 
@@ -84,18 +83,26 @@ def _types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:
     return found
 
 
-def _converted(
-    file: Rows, stream: Stream, block: pa.Table, wanted: list[Chosen], begun: int, recording: str | None
-) -> pa.Table:
-    """Return a block with stamps and declared types, of one recording alone where there are many."""
-    rows = None
-    if stream.recording:
-        rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
-        block = block.take(pa.array(rows))
+def _blocks(
+    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None
+) -> Iterator[tuple[pa.Table, Place]]:
+    """Yield the blocks of a file, of one recording alone where it holds many, and what names a row of each in errors."""
+    begun = 0
+    for block in file.batches(types):
+        rows = np.arange(block.num_rows)
+        if stream.recording:
+            rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
+        in_file = rows + begun  # (row,), counted from the first row of the file
+        begun += block.num_rows
 
-    def place(row: int) -> str:
-        return f"{file.path}, {file.place(begun + (row if rows is None else int(rows[row])))}"
+        def place(row: int, in_file: Indices = in_file) -> str:
+            return f"{file.path}, {file.place(int(in_file[row]))}"
 
+        yield (block.take(pa.array(rows)) if stream.recording else block), place
+
+
+def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place) -> pa.Table:
+    """Return a block with stamps and declared types."""
     made = {}
     if stream.time.column:
         made[TIME] = pa.array(_stamped(block.column(stream.time.column), stream, place))
@@ -112,7 +119,7 @@ def _converted(
     return pa.table(list(made.values()), pa.schema(fields))
 
 
-def _stamped(column: pa.ChunkedArray, stream: Stream, place: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
+def _stamped(column: pa.ChunkedArray, stream: Stream, place: Place) -> Times:
     try:
         return stamps.nanoseconds(column, stream.time.unit, stream.time.zone)
     except stamps.StampError as error:
@@ -173,20 +180,11 @@ def _long(file: Rows, stream: Stream, recording: str | None) -> pa.Table:
             f"[streams.{stream.name}] is in long form, so rows share moments: give the column of their stamps."
         )
     types = {**_types(file, stream), stream.long.channel: pa.string(), stream.long.value: pa.float64()}
-    times, channels, values, begun = [], [], [], 0
-    for block in file.batches(types):
-        rows = np.arange(block.num_rows)
-        if stream.recording:
-            rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
-            block = block.take(pa.array(rows))
-
-        def place(row: int, rows: Any = rows, begun: int = begun) -> str:
-            return f"{file.path}, {file.place(begun + int(rows[row]))}"
-
+    times, channels, values = [], [], []
+    for block, place in _blocks(file, stream, types, recording):
         times.append(_stamped(block.column(stream.time.column), stream, place))
         channels.append(block.column(stream.long.channel).cast(pa.string()).combine_chunks())
         values.append(block.column(stream.long.value).cast(pa.float64()).to_numpy())
-        begun += len(rows) if not stream.recording else block.num_rows
     if not sum(map(len, times)):
         return _finished(None, file, stream, recording)
     t_ns, at = np.unique(np.concatenate(times), return_inverse=True)

@@ -12,9 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tacpipe.arrays import Int64s, Times
+from tacpipe.arrays import Bools, Int64s, Times
 from tacpipe.formats.table.layout import TimeUnit
 
+IN_RANGE = "a time before the year 2262"  # where 64 bits of nanoseconds end
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
 DECIMAL = pa.decimal128(38, 18)  # as which text is read
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
@@ -44,7 +45,7 @@ def nanoseconds(column: pa.Array, unit: TimeUnit, zone: str = "UTC") -> Int64s:
     if pa.types.is_timestamp(column.type):
         if column.type.tz is None and zone != "UTC":
             column = pc.assume_timezone(column, zone)
-        stamps = _cast(column, pa.timestamp("ns", column.type.tz)).cast(pa.int64())
+        stamps = _cast(column, pa.timestamp("ns", column.type.tz), IN_RANGE).cast(pa.int64())
         return np.asarray(stamps.to_numpy(zero_copy_only=False), np.int64)
     if unit == "iso8601":
         return _of_text(column, zone)
@@ -59,35 +60,33 @@ def _of_text(column: pa.Array, zone: str) -> Int64s:
     text = pc.replace_substring_regex(pc.utf8_trim_whitespace(column.cast(pa.string())), _LOGGED, r"\1.\2")
     zoned = [bool(_ZONED.fullmatch(one)) for one in text[:1].to_pylist()]
     if zoned == [True]:
-        stamps = _parsed(text, pa.timestamp("ns", "UTC"))
+        wanted = "a time in ISO 8601, with a zone, as the first row has one"
+        stamps = _cast(text, pa.timestamp("ns", "UTC"), wanted)
     else:
-        stamps = pc.assume_timezone(_parsed(text, pa.timestamp("ns")), zone)
+        wanted = "a time in ISO 8601, without a zone, as the first row has none"
+        stamps = pc.assume_timezone(_cast(text, pa.timestamp("ns"), wanted), zone)
     found: Int64s = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
     return found
 
 
-def _parsed(text: pa.Array, kind: pa.DataType) -> pa.Array:
-    try:
-        return text.cast(kind)
-    except pa.ArrowInvalid:
-        for row, one in enumerate(text):
-            try:
-                one.cast(kind)
-            except pa.ArrowInvalid:
-                zone = (
-                    "with a zone, as the first row has one" if kind.tz else "without a zone, as the first row has none"
-                )
-                raise StampError(row, one.as_py(), f"a time in ISO 8601, {zone}") from None
-        raise
-
-
 def _of_decimals(column: pa.Array, digits: int) -> Int64s:
-    kept = pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))
-    # A decimal128 is a whole number of its last digit in two words of eight bytes, the low one first.
-    words = np.frombuffer(kept.buffers()[1], dtype="<i8").reshape(-1, 2)[kept.offset :][: len(kept)]
-    t_ns: Times = words[:, 0].astype(np.int64)
-    _refuse(pa.array(words[:, 1] != t_ns >> 63), column, "a time before the year 2262")
+    t_ns, fits = last_digits(
+        pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))
+    )
+    _refuse(pa.array(~fits), column, IN_RANGE)
     return t_ns
+
+
+def last_digits(column: pa.Array) -> tuple[Int64s, Bools]:
+    """Return decimals as whole numbers of their last digit (row,), and whether 64 bits hold each.
+
+    >>> last_digits(pa.array(["1.25", "-3"]).cast(pa.decimal128(19, 2)))[0]
+    array([ 125, -300])
+    """
+    # A decimal128 is such a number in two words of eight bytes, the low one first.
+    words = np.frombuffer(column.buffers()[1], dtype="<i8").reshape(-1, 2)[column.offset :][: len(column)]
+    found: Int64s = words[:, 0].astype(np.int64)
+    return found, words[:, 1] == found >> 63
 
 
 def _of_integers(column: pa.Array, factor: int) -> Int64s:
@@ -96,7 +95,7 @@ def _of_integers(column: pa.Array, factor: int) -> Int64s:
     _refuse(
         pa.array((values > most) | (values < -most if values.dtype.kind == "i" else False)),
         column,
-        "a time before the year 2262",
+        IN_RANGE,
     )
     t_ns: Times = values.astype(np.int64) * factor
     return t_ns
@@ -105,13 +104,14 @@ def _of_integers(column: pa.Array, factor: int) -> Int64s:
 def _of_floats(column: pa.Array, factor: int) -> Int64s:
     values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
-    _refuse(pa.array(bad), column, "a time before the year 2262")
+    _refuse(pa.array(bad), column, IN_RANGE)
     whole = np.floor(values)  # apart from the rest: their product with the factor would be rounded
     t_ns: Times = whole.astype(np.int64) * factor + np.rint((values - whole) * factor).astype(np.int64)
     return t_ns
 
 
-def _cast(column: pa.Array, kind: pa.DataType) -> pa.Array:
+def _cast(column: pa.Array, kind: pa.DataType, wanted: str) -> pa.Array:
+    """Return a column as ``kind``; raises `StampError`, with what is ``wanted``, for the first that cannot be."""
     try:
         return column.cast(kind)
     except pa.ArrowInvalid:
@@ -119,7 +119,7 @@ def _cast(column: pa.Array, kind: pa.DataType) -> pa.Array:
             try:
                 one.cast(kind)
             except pa.ArrowInvalid:
-                raise StampError(row, str(one.as_py()), "a time before the year 2262") from None
+                raise StampError(row, str(one.as_py()), wanted) from None
         raise
 
 

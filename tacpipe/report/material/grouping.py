@@ -63,7 +63,7 @@ def _settings(run: Run) -> dict[str, Any]:
         **{name: value for name, value in params.items() if (name in closed if closed else name not in idle)},
         "architecture": architecture,
         "joint": joint,
-        "frozen_sensor": bool(frozen),  # each run tells of the sensor that was mapped, so both are one method
+        "frozen_sensor": bool(frozen),  # each run reports on the sensor that was mapped, so both are one method
         "pairing": str(params.get("pairing", "random")) if joint or frozen else "random",
         "labels": str(params.get("labels", "true")),
         "subsample_sensor": str(params.get("subsample_sensor", "")) if ratio < 100 else "",

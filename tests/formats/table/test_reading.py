@@ -181,6 +181,18 @@ def test_a_value_that_is_wrong_in_a_later_block_is_named_by_its_line(
         reading.table(tmp_path / "skin.csv", labs.stream())
 
 
+def test_a_wrong_stamp_of_one_recording_in_long_form_is_named_by_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tacpipe.formats.table.text.BLOCK_BYTES", 64)
+    rows = [f"{row},fx,0.5,{'ab'[row % 2]}" for row in range(100)]
+    rows[80] = "NA,fx,0.5,a"
+    (tmp_path / "skin.csv").write_text("\n".join(["time,sensor,reading,trial", *rows]))
+    extra = 'recording = "trial"\nmissing = ["NA"]\nlong = { channel = "sensor", value = "reading" }'
+    with pytest.raises(TacpipeError, match="line 82"):
+        reading.table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "fx" }'), "a")
+
+
 def test_pickles_in_an_archive_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "skin.npz", time=np.array([{}, {}], dtype=object))
     with pytest.raises(TacpipeError, match=r"skin\.npz"):
