@@ -76,6 +76,9 @@ LACK = {  # and for each that does need one, with that extra
     "report results/forward -o {o}.html --traces 1": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
+    "ingest mcap bags -o {o}": "ros",
+    "ingest rosbag bags -o {o}": "ros",
+    "ingest rosbag bags --guess": "ros",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
@@ -127,6 +130,8 @@ def prepare(folder: Path) -> None:
     (folder / "tables" / "a.csv").write_text("time,x\n0,1\n1,2\n")
     layout = '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "time" }\ncolumns = [{ match = "x" }]\n'
     (folder / "tables" / "layout.toml").write_text(layout)
+    (folder / "bags").mkdir()
+    (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
 
