@@ -197,7 +197,7 @@ class _Joints:
 
 def _joint(leaf: Leaf, index: int, number: int, joint: str) -> Column:
     name, quantity, unit = _JOINT[str(leaf.path[0])]
-    if _SLIDES.search(joint):  # its unit would be m; a message does not say which joints slide
+    if _SLIDES.search(joint):  # its unit would be m; a message does not state which joints slide
         name, unit = f"joint{{}}_{leaf.path[0]}", ""
     return Column(name.format(number), leaf, index, _about(quantity, unit, joint=joint))
 
