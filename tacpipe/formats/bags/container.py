@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, ros, sqlite_file
+from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, protobuf_messages, ros, sqlite_file
 from tacpipe.formats.bags.own import Own
 from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
 from tacpipe.formats.bags.topics import Decoder, Topic, TopicError
@@ -61,7 +61,7 @@ class Bag:
 
 def opened(path: Path) -> Bag:
     """Return the bag at ``path``. Raises `MissingModuleError` where a library is missing."""
-    extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard")
+    extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard", "google.protobuf")
     return Bag(path)
 
 
@@ -244,4 +244,8 @@ def _decoder(channel: Channel) -> Decoder:
         return ros.Ros(name, ros.types(name, kind, text), channel.encoding == "cdr")
     if channel.encoding == "json":
         return json_messages.Json(text)
-    raise TopicError(f"its messages are written as {plain(channel.encoding) or 'nothing known'}, not ros1, cdr or json")
+    if channel.encoding == "protobuf":
+        return protobuf_messages.Protobuf(channel.type, channel.schema)
+    raise TopicError(
+        f"its messages are written as {plain(channel.encoding) or 'nothing known'}, not ros1, cdr, json or protobuf"
+    )
