@@ -13,7 +13,7 @@ from tacpipe.channels import schema
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import faults, pick_and_move, taxels
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 
 TRIALS = 20
 simulate, synchronize = load("simulate.forward"), load("synchronize")
@@ -26,14 +26,14 @@ def recorded(trial: int, **rig: Any) -> RecordingOutput:
 
 
 def synced(recording: RecordingOutput, **params: Any) -> RecordingOutput:
-    found: RecordingOutput = synchronize(synchronize.params(**params), FakeShard(recording.streams))
+    found: RecordingOutput = synchronize(synchronize.params(**params), FakeRecording(recording.streams))
     return found
 
 
 @cache
 def labelled(trial: int, **rig: Any) -> pa.Table:
     table = synced(recorded(trial, **rig)).streams[""]
-    return slips(slips.params(), FakeShard(contacts(contacts.params(), FakeShard({"": table})).streams))
+    return slips(slips.params(), FakeRecording(contacts(contacts.params(), FakeRecording({"": table})).streams))
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:
