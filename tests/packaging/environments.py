@@ -32,7 +32,7 @@ CORE = (
     "simulate touch --trials 1 -o data/grasps",
 )
 LEARN = (
-    "train forward data/segments --split data/split -o model --architecture linear",
+    "train forward data/segments --split data/split -o model --epochs 1",
     "evaluate model data/segments --split data/split -o results",
     "report results -o report.html",
 )
