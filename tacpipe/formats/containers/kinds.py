@@ -27,7 +27,7 @@ KINDS: Mapping[str, Kind] = {
     "mcap": Kind("tacpipe.formats.bags.container:opened", (".mcap",)),
     "rosbag": Kind(
         "tacpipe.formats.bags.container:opened",
-        (".bag", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
+        (".bag", ".bag.active", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
         ("metadata.yaml",),
         b"rosbag2_bagfile_information",
     ),

@@ -38,6 +38,7 @@ def of(contents: Contents, command: str, path: Path) -> str:
         f"#   {command} FOLDER --layout THIS --dry-run"
     ]
     parts += [f"# {plain(source)} is left out: {why}" for source, why in contents.skipped.items()]
+    parts += [f"# {plain(one, 400)}" for one in contents.notes]
     parts += [_stream(one) for one in contents.streams]
     return "\n\n".join(parts) + "\n"
 

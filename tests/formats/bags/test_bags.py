@@ -472,6 +472,20 @@ def test_a_look_has_the_columns_of_the_whole(tmp_path: Path) -> None:
     assert looked == {name: one.table.schema for name, one in streams(bag).items()}
 
 
+def test_a_look_that_ended_early_states_no_number_of_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tacpipe.formats.bags.container.LOOK_MESSAGES", 10)
+    contents = opened(WAYS["ros2-mcap"](tmp_path)).look(None)
+    assert [(one.table.num_rows, one.rows) for one in contents.streams] == [(5, None), (5, None)]
+    assert contents.notes
+
+
+def test_a_bag_whose_recorder_was_killed_is_found(lab: Lab) -> None:
+    path = writers.ros1(lab.folder / "a.bag", arm(TYPES1))
+    path.rename(lab.folder / "run.bag.active")
+    lab.run("ingest rosbag . -o data/rec")
+    assert list(lab.manifest("data/rec").recordings) == ["run"]
+
+
 def test_only_the_topics_that_were_asked_for_are_read(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
     contents = opened(bag).read(["/left/skin"], None)

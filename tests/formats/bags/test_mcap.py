@@ -123,6 +123,19 @@ def test_a_message_that_is_not_an_object_of_json_costs_its_topic(tmp_path: Path,
     assert ([one.source for one in contents.streams], list(contents.skipped)) == (["/good"], ["/bad"])
 
 
+def test_an_attachment_is_named_as_one_that_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        writer.add_attachment(START_NS, START_NS, "calibration.yaml", "text/yaml", b"x" * 10_000)
+        writer.add_message(writer.register_channel("/a", "json", 0), START_NS, b'{"v": 1}', START_NS)
+        writer.finish()  # type: ignore[no-untyped-call]
+    contents = read(path)
+    assert len(contents.streams) == 1
+    assert "calibration.yaml" in contents.notes[0]
+
+
 def test_a_publish_time_of_its_own_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
