@@ -55,7 +55,7 @@ class Bag:
             files, messages_compressed, notes = _files(self.path, stack)
             reading = _Reading(sources, messages_compressed)
             for number, file in enumerate(files):
-                reading.take(READERS[_ending(file)](file), number, most)
+                reading.take(_records(file), number, most)
         contents = reading.contents()
         return Contents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
 
@@ -84,6 +84,12 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
         raise TacpipeError(f"{path}: {plain(unknown[0])} is of the storage {storage}; mcap and sqlite3 are read.")
     compressed = str(about.get("compression_mode") or "").lower() == "message"
     return [_unpacked(one, stack) for one in there], compressed, notes
+
+
+def _records(path: Path) -> Iterator[Record]:
+    if _ending(path) not in READERS:
+        raise TacpipeError(f"{path} is not a bag by its name; {', '.join(READERS)} are read.")
+    return READERS[_ending(path)](path)
 
 
 def _ending(path: Path) -> str:

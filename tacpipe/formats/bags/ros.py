@@ -117,7 +117,7 @@ def _by_keys(
     if not keys:
         yield left, shape
         return
-    places = np.concatenate([np.arange(leaf.offset, leaf.offset + (leaf.count or 0)) for leaf in keys])
+    places = np.concatenate([np.arange(leaf.offset, leaf.offset + leaf.size) for leaf in keys])
     while len(left):
         first = matrix[left[0]]
         same = (matrix[left][:, places] == first[places]).all(axis=1)

@@ -43,6 +43,14 @@ class Leaf:
     count: int | None  # of an array; of a text its bytes; None: a single number
     within: tuple[tuple[int, str], ...]  # message types around it: length of their path, name
 
+    @property
+    def size(self) -> int:
+        """How many bytes it takes."""
+        if self.kind == "stamp":
+            return 8
+        width = 1 if self.kind == TEXT else np.dtype(NUMBERS[self.kind]).itemsize
+        return width * (1 if self.count is None else self.count)
+
 
 @dataclass(frozen=True)
 class Encoding:
@@ -78,6 +86,10 @@ class Shape:
     def text(self, leaf: Leaf) -> str:
         """Return a text of the first message."""
         return self.first[leaf.offset : leaf.offset + (leaf.count or 0)].decode(errors="replace")
+
+    def number(self, leaf: Leaf) -> int:
+        """Return a whole number of the first message."""
+        return int(self.numbers(leaf, np.frombuffer(self.first, np.uint8)[None])[0])
 
     def numbers(self, leaf: Leaf, matrix: Matrix) -> npt.NDArray[Any]:
         """Return a number (message,), an array of numbers (message, position), or stamps (message,) in nanoseconds."""

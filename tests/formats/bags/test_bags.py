@@ -283,6 +283,23 @@ def test_arrays_that_change_their_length_leave_nan(tmp_path: Path) -> None:
     assert str(table.column("data_2").to_pylist()) == "[nan, nan, 2.0]"
 
 
+def test_the_dimensions_of_an_array_are_the_places_of_its_columns(tmp_path: Path) -> None:
+    name = "std_msgs/msg/UInt8MultiArray"
+    dimensions = [{"label": "row", "size": 2, "stride": 6}, {"label": "column", "size": 3, "stride": 3}]
+    message = writers.build(TYPES, name, layout={"dim": dimensions}, data=range(6))
+    table = only(writers.ros2(tmp_path / "a", [("/skin", name, START_NS, message)]))
+    assert table.column_names == ["t_log_ns", *(f"data_{number}" for number in range(6))]
+    assert table.schema.field("data_4").metadata == {b"row": b"1", b"column": b"1"}
+
+
+def test_a_table_layout_that_takes_another_file_for_a_bag_is_refused(lab: Lab) -> None:
+    (lab.folder / "in").mkdir()
+    (lab.folder / "in" / "a.csv").write_text("t\n1\n")
+    (lab.folder / "l.toml").write_text('[streams.s]\nfiles = "{trial}.csv"\nformat = "rosbag"\nsource = "/s"')
+    refused = lab.call("ingest table in --layout l.toml -o data/rec")
+    assert refused.code == 1 and "a.csv" in refused.err
+
+
 def test_images_are_kept_as_encoded_frames(tmp_path: Path) -> None:
     name = "sensor_msgs/msg/CompressedImage"
     frames = [b"\xff\xd8" + bytes([n]) * (5000 + 1000 * (n % 3)) for n in range(20)]
