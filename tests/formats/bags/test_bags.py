@@ -536,3 +536,18 @@ def test_a_bag_of_others_is_read(path: str, rows: dict[str, int], skipped: int) 
     assert {name: found.get(name) for name in rows} == rows
     assert len(contents.skipped) == skipped
     assert not contents.notes
+
+
+def test_messages_with_texts_of_any_length_are_read_in_their_order(tmp_path: Path) -> None:
+    name = "rcl_interfaces/msg/Log"
+    rng = np.random.default_rng(3)
+    texts = [["x" * int(length) for length in rng.integers(0, 9, 4)] for _ in range(400)]
+    sent: list[Sent] = []
+    for number, (message, *others) in enumerate(texts):
+        fields = dict(zip(("name", "file", "function"), others, strict=True))
+        log = writers.build(TYPES, name, level=number % 50, msg=message, line=number, **fields)
+        sent.append(("/rosout", name, START_NS + number, log))
+    table = only(writers.ros2(tmp_path / "a", sent))
+    assert table.column("line").to_pylist() == list(range(400))
+    assert table.column("line").type == pa.uint32()
+    assert [[row["msg"], row["name"], row["file"], row["function"]] for row in table.to_pylist()] == texts
