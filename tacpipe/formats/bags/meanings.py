@@ -81,7 +81,7 @@ def _geometry() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
         found[field_of, ("magnetic_field", part)] = (f"magnetic_field_{part}_t", "magnetic_field", "T", part)
     found["sensor_msgs/msg/Temperature", ("temperature",)] = ("temperature_degc", "temperature", "degC", "")
     found["sensor_msgs/msg/FluidPressure", ("fluid_pressure",)] = ("pressure_pa", "static_pressure", "Pa", "")
-    found["sensor_msgs/msg/Range", ("range",)] = ("range_m", "distance", "m", "")
+    found["sensor_msgs/msg/Range", ("range",)] = ("range_m", "proximity", "m", "")
     return found
 
 

@@ -172,7 +172,7 @@ def test_usual_messages_have_quantities_and_units(tmp_path: Path) -> None:
         "geometry_msgs/msg/AccelStamped": ("acceleration_x_m_s2", "acceleration", "m/s^2"),
         "sensor_msgs/msg/Imu": ("acceleration_z_m_s2", "acceleration", "m/s^2"),
         "sensor_msgs/msg/Temperature": ("temperature_degc", "temperature", "degC"),
-        "sensor_msgs/msg/Range": ("range_m", "distance", "m"),
+        "sensor_msgs/msg/Range": ("range_m", "proximity", "m"),
         "lab_msgs/msg/Grip": ("left_torque_x_nm", "torque", "N m"),
     }
     sent: list[Sent] = [

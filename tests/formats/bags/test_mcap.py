@@ -253,6 +253,24 @@ def test_a_bag_needs_no_layout(lab: Lab) -> None:
     assert one.table("joint_states").column("t_log_ns").to_pylist() == (arm["t_ns"] + 300_000).tolist()
 
 
+def test_a_layout_may_choose_the_log_time_whatever_the_order_of_the_headers(lab: Lab) -> None:
+    types, name = writers.store(), "geometry_msgs/msg/WrenchStamped"
+    sent = []
+    for number, late_ns in enumerate((0, 30, 20)):
+        header = writers.header(types, START_NS - late_ns)
+        message = writers.build(types, name, header=header, wrench={"force": {"z": number}})
+        sent.append(("/w", name, START_NS + number, message))
+    writers.ros2(lab.folder / "bags" / "t0", sent)
+    (lab.folder / "l.toml").write_text('[streams.w]\nsource = "/w"\ntime = { column = "t_log_ns", unit = "ns" }')
+    lab.run("ingest rosbag bags -o data/header")
+    lab.run("ingest rosbag bags --layout l.toml -o data/log")
+    found = {}
+    for way in ("header", "log"):
+        (one,) = tacpipe.open(lab.folder / "data" / way)
+        found[way] = one.table("w").column("force_z_n").to_pylist()
+    assert found == {"header": [1, 2, 0], "log": [0, 1, 2]}
+
+
 def test_a_guess_of_a_bag_given_back_reads_the_same(lab: Lab) -> None:
     skin, arm = _recording(0)
     writers.ros2(lab.folder / "bags" / "t0", _messages(writers.store(), skin, arm))
