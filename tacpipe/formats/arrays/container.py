@@ -1,0 +1,140 @@
+"""HDF5 files and Zarr stores as containers of streams (`tacpipe.formats.containers.container`)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.formats.arrays import columns, episodes, parts, times
+from tacpipe.formats.arrays.episodes import Episode
+from tacpipe.formats.arrays.parts import Part
+from tacpipe.formats.arrays.tree import LONGEST_TEXT, Tree, plain_attributes
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Contents, SourceStream, Time
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import plain
+
+ROWS = 3  # that a look reads
+DEPTH = 4  # of texts of JSON in attributes
+
+
+@dataclass(frozen=True)
+class ArrayContainer:
+    """A file of arrays; ``open_tree`` opens it."""
+
+    path: Path
+    open_tree: Callable[[], AbstractContextManager[Tree]]
+
+    def episodes(self) -> Sequence[str]:
+        """Return the names of the recordings inside, none where the whole is one."""
+        with self.open_tree() as tree:
+            return [one.name for one in episodes.found(tree) if one.name is not None]
+
+    def look(self, episode: str | None) -> Contents:
+        """Return the streams of a recording with their first rows."""
+        with self.open_tree() as tree:
+            return _contents(tree, episodes.named(tree, episode), None, ROWS)
+
+    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+        """Return the streams of a recording, all or those of some sources."""
+        with self.open_tree() as tree:
+            return _contents(tree, episodes.named(tree, episode), sources, None)
+
+
+def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, most: int | None) -> Contents:
+    found = parts.of(tree, episode)
+    skipped = dict(found.skipped)
+    attributes, long = _attributes(tree, episode)
+    for one in found.scalars:
+        attributes |= plain_attributes({episode.inside(one.path).replace("/", "."): tree.read(one, 0, 1)})
+    skipped |= long
+    timed = [(part, times.of(tree, episode, part)) for part in found.parts]
+    chosen = [(part, time) for part, time in timed if (part.source in sources if sources is not None else True)]
+    if sources is None and any(time.given for _, time in chosen):
+        for part, time in chosen:
+            if not time.given:
+                skipped[part.source] = "has no stamps and no rate; a layout that names it gives them"
+        chosen = [(part, time) for part, time in chosen if time.given]
+    names = kinds.identifiers([_called(part, tree.path) for part, _ in timed])
+    streams = [
+        SourceStream(
+            part.source,
+            names[_called(part, tree.path)],
+            time,
+            _table(tree, episode, part, most),
+            times.rows(episode, part),
+        )
+        for part, time in chosen
+    ]
+    return Contents(streams, attributes, skipped)
+
+
+def _called(part: Part, path: Path) -> str:
+    """Return what a stream is named after: its source, or the array where the recording's own group holds but one."""
+    if part.source != parts.ROOT:
+        return part.source
+    return part.arrays[0].name if len(part.arrays) == 1 else "steps"
+
+
+def _table(tree: Tree, episode: Episode, part: Part, most: int | None) -> pa.Table:
+    start, stop = episode.start, episode.start + times.rows(episode, part)
+    stop = stop if most is None else min(stop, start + most)
+    fields: list[pa.Field] = []
+    values: list[pa.Array] = []
+    aloha = _is_aloha(tree, episode)
+    for array in [*([part.time] if part.time is not None else []), *part.arrays]:
+        read = tree.read(array, start, stop)
+        for field, column in columns.of(array, read, part.frames, part.source, aloha):
+            fields.append(field)
+            values.append(column)
+    return pa.table(values, pa.schema(fields))
+
+
+def _is_aloha(tree: Tree, episode: Episode) -> bool:
+    """Return whether a recording is laid out as ALOHA's are."""
+    group = f"{episode.group}/observations".strip("/")
+    return tree.is_group(group) and any(one.name == "qpos" for one in tree.members(group)[0])
+
+
+def _attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute], dict[str, str]]:
+    """Return the attributes of a recording's group and those above, and which texts are too long for one."""
+    made: dict[str, Attribute] = {}
+    long: dict[str, str] = {}
+    for group in times.above(episode.group):
+        for name, value in tree.attributes(group).items():
+            text = value.decode(errors="replace") if isinstance(value, bytes) else value
+            inner = _flat(text)
+            made |= plain_attributes({f"{name}.{key}": one for key, one in inner.items()} if inner else {name: value})
+            if isinstance(text, str) and len(text) > LONGEST_TEXT and not inner:
+                long[f"attribute {plain(name)}"] = f"is a text of {len(text)} characters, too long for a label"
+    return made, long
+
+
+def _flat(text: Any) -> dict[str, Any]:
+    """Return what a text of JSON states, with dots between the names; nothing where it is none.
+
+    >>> _flat('{"env_name": "Lift", "env_kwargs": {"control_freq": 20}}')
+    {'env_name': 'Lift', 'env_kwargs.control_freq': 20}
+    """
+    if not isinstance(text, str) or not text.startswith("{"):
+        return {}
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return dict(_leaves(found))
+
+
+def _leaves(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for name, one in value.items():
+        if isinstance(one, dict) and before.count(".") < DEPTH:
+            yield from _leaves(one, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", one

@@ -1,0 +1,94 @@
+"""When the rows of a stream of arrays were measured: by the array of its stamps, or a rate that the file states."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from tacpipe.formats.arrays.episodes import Episode
+from tacpipe.formats.arrays.parts import Part
+from tacpipe.formats.arrays.tree import Tree
+from tacpipe.formats.containers.container import Time, TimeUnit
+
+RATES = ("rate_hz", "fps", "frequency_hz", "frequency", "control_freq", "sampling_rate", "sample_rate", "rate", "hz")
+UNITS: Mapping[str, TimeUnit] = {
+    **{"s": "s", "sec": "s", "second": "s", "seconds": "s", "ms": "ms", "millisecond": "ms", "milliseconds": "ms"},
+    **{"us": "us", "µs": "us", "microsecond": "us", "microseconds": "us", "ns": "ns", "nanosecond": "ns"},
+    "nanoseconds": "ns",
+}
+SINCE_1970: tuple[tuple[float, TimeUnit], ...] = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns"))
+LEAST = 1e8  # seconds since 1970: what is less counts from the start of a recording
+
+
+def of(tree: Tree, episode: Episode, part: Part) -> Time:
+    """Return where the stamps of a stream come from; an empty `Time` where the file states neither stamps nor a rate."""
+    if part.time is not None:
+        unit, origin = _unit(tree, episode, part)
+        if unit is not None:
+            return Time(column=part.time.name, unit=unit, origin=origin)  # type: ignore[arg-type]
+    rate_hz = _rate_hz(tree, part)
+    return Time() if rate_hz is None else Time(rate_hz=rate_hz)
+
+
+def rows(episode: Episode, part: Part) -> int:
+    """Return how many rows of a stream belong to a recording."""
+    length = part.arrays[0].shape[0]
+    return max((length if episode.stop is None else min(episode.stop, length)) - episode.start, 0)
+
+
+def above(group: str) -> list[str]:
+    """Return a group and those above it, the root first.
+
+    >>> above("data/demo_0")
+    ['', 'data', 'data/demo_0']
+    """
+    names = group.split("/") if group else []
+    return ["/".join(names[:count]) for count in range(len(names) + 1)]
+
+
+def _unit(tree: Tree, episode: Episode, part: Part) -> tuple[TimeUnit | None, str]:
+    """Return the unit of stamps and what they count from, as attributes, the name or their size show it."""
+    assert part.time is not None
+    last = episode.start + rows(episode, part)
+    found = np.asarray(tree.read(part.time, max(last - 1, 0), last)).reshape(-1)
+    size = abs(float(found[0])) if len(found) and np.isfinite(found[0]) else 0.0
+    attributes = part.time.attributes
+    stated = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
+    suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.time.name, re.IGNORECASE)
+    unit = UNITS.get(stated.strip().lower()) or (UNITS.get(suffix[1].lower()) if suffix else None)
+    unit = unit or (next(unit for most, unit in SINCE_1970 if size < most) if size >= LEAST else None)
+    if unit is None:
+        return None, "start"
+    return unit, "unix" if size >= LEAST * {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit] else "start"
+
+
+def _rate_hz(tree: Tree, part: Part) -> float | None:
+    """Return the rate that attributes of the stream's arrays, its group or one above state."""
+    for one in part.arrays:
+        found = _stated(one.attributes)
+        if found is not None:
+            return found
+    for group in reversed(above(part.arrays[0].group)):
+        found = _stated(tree.attributes(group))
+        if found is not None:
+            return found
+    return None
+
+
+def _stated(attributes: Mapping[str, Any]) -> float | None:
+    for name in RATES:
+        value = attributes.get(name)
+        if isinstance(value, int | float | np.number) and np.isfinite(value) and 0 < value <= 1e9:
+            return float(value)
+    environment = attributes.get("env_args")  # of robomimic: a text of JSON
+    if isinstance(environment, str | bytes):
+        try:
+            inner = json.loads(environment)["env_kwargs"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return None
+        return _stated({"control_freq": inner.get("control_freq")}) if isinstance(inner, dict) else None
+    return None

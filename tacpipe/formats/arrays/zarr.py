@@ -1,0 +1,226 @@
+"""Zarr stores as trees of arrays: folders and zip files, format 2 and 3.
+
+Metadata are read as the JSON that they are, values by the library zarr. A chunk that is not there is refused unless that
+was allowed: by the specification it holds fill values alone, and so zarr reads a lost file as zeros without a word.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import math
+import os
+import re
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.arrays.tree import Array
+from tacpipe.io import memory, regular
+from tacpipe.printable import excerpt, plain
+
+ZIP = ".zip"
+MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
+MOST_BYTES = 1 << 26  # of a file of metadata
+BROKEN = (OSError, KeyError, RuntimeError, ValueError, TypeError, NotImplementedError, ImportError, zipfile.BadZipFile)
+_KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
+
+
+@dataclass(frozen=True)
+class ZarrTree:
+    """A Zarr store: ``path`` is a folder or a zip file, ``names`` what a zip file holds, None of a folder."""
+
+    path: Path
+    names: frozenset[str] | None
+    fill_missing: bool = False  # whether a chunk that is not there holds fill values
+
+    def members(self, group: str) -> tuple[list[Array], list[str]]:
+        """Return the arrays in a group and the paths of the groups in it, sorted."""
+        arrays, below = [], []
+        for name in self._below(group):
+            path = f"{group}/{name}" if group else name
+            found = self._node(path)
+            if found is not None and "shape" in found[0]:
+                arrays.append(_array(path, *found))
+            elif found is not None:
+                below.append(path)
+        return arrays, below
+
+    def is_group(self, path: str) -> bool:
+        """Return whether there is a group of this path."""
+        found = self._node(path)
+        return found is not None and "shape" not in found[0]
+
+    def attributes(self, group: str) -> Mapping[str, Any]:
+        """Return the attributes of a group."""
+        found = self._node(group)
+        return found[1] if found is not None else {}
+
+    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+        """Return the rows of an array. Raises `TacpipeError` for what is damaged, and for a chunk that is not there."""
+        import zarr
+
+        stop = min(stop, array.shape[0]) if array.shape else 1
+        memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
+        lost = [] if self.fill_missing else [name for name in self.chunks(array, start, stop) if not self._has(name)]
+        if lost:
+            raise TacpipeError(
+                f"{self.path}: {plain(lost[0], 200)} is missing, a chunk of {plain(array.path, 200)}; so are "
+                f"{len(lost) - 1} others of these rows. Copy the store again; if the program that wrote it leaves out "
+                f"chunks of fill values alone, as zarr 3 does, give --fill-missing-chunks."
+            )
+        try:
+            with self._store() as store:
+                found = zarr.open_array(store, path=array.path, mode="r")
+                return np.asarray(found[() if not array.shape else slice(start, stop)])
+        except BROKEN as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                with regular.failing(self.path):
+                    raise
+            raise TacpipeError(
+                f"{self.path}: {plain(array.path, 200)}, rows {start + 1} to {stop}, cannot be read: "
+                f"{plain(str(error), 200)}. Copy the store again."
+            ) from error
+
+    def chunks(self, array: Array, start: int, stop: int) -> list[str]:
+        """Return the names, within the store, of the files that hold rows of an array."""
+        found = self._node(array.path)
+        assert found is not None
+        shape, key = _grid(found[0])
+        if math.prod(array.shape) == 0 or stop <= start:
+            return []
+        spans = [range(math.ceil(size / step)) for size, step in zip(array.shape, shape, strict=True)]
+        if spans:
+            spans[0] = range(start // shape[0], math.ceil(stop / shape[0]))
+        return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
+
+    def file(self, name: str) -> Path | None:
+        """Return where something of the store lies as a file of its own; None within a zip file."""
+        return self.path / name if self.names is None else None
+
+    def _has(self, name: str) -> bool:
+        return (self.path / name).is_file() if self.names is None else name in self.names
+
+    def _below(self, group: str) -> list[str]:
+        """Return the names of the folders in a group."""
+        if self.names is None:
+            with regular.failing(self.path), os.scandir(self.path / group) as entries:
+                return sorted(one.name for one in entries if one.is_dir(follow_symlinks=False))
+        start = f"{group}/" if group else ""
+        return sorted({name[len(start) :].partition("/")[0] for name in self.names if name.startswith(start) and "/" in name[len(start) :]})
+
+    def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+        """Return metadata and attributes of a group or an array; None where there is neither."""
+        for mark in MARKS:
+            name = f"{path}/{mark}" if path else mark
+            if self._has(name):
+                about = self._json(name)
+                if mark == MARKS[-1]:
+                    attributes = about.get("attributes", {})
+                else:
+                    beside = f"{path}/.zattrs" if path else ".zattrs"
+                    attributes = self._json(beside) if self._has(beside) else {}
+                return about, attributes if isinstance(attributes, dict) else {}
+        return None
+
+    def _json(self, name: str) -> dict[str, Any]:
+        try:
+            found = json.loads(self._content(name))
+        except (ValueError, RecursionError, zipfile.BadZipFile, KeyError) as error:
+            raise TacpipeError(f"{self.path}: {plain(name, 200)} cannot be read: {plain(str(error), 200)}.") from error
+        if not isinstance(found, dict):
+            raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(found)}; it must be a JSON object.")
+        return found
+
+    def _content(self, name: str) -> bytes:
+        if self.names is None:
+            with regular.failing(self.path / name):
+                return regular.content(self.path / name, MOST_BYTES)
+        with regular.opened(self.path) as file, zipfile.ZipFile(file) as archive:
+            if archive.getinfo(name).file_size > MOST_BYTES:
+                raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MOST_BYTES:,} bytes.")
+            return archive.read(name)
+
+    @contextlib.contextmanager
+    def _store(self) -> Iterator[Any]:
+        from zarr import storage
+
+        if self.names is None:
+            yield storage.LocalStore(self.path, read_only=True)
+            return
+        store = storage.ZipStore(self.path, mode="r")
+        try:
+            yield store
+        finally:
+            store.close()
+
+
+def opened(path: Path, fill_missing: bool = False) -> ZarrTree:
+    """Return the tree of a Zarr store, folder or zip file. Raises `TacpipeError` where it is neither."""
+    names = None
+    if not path.is_dir():
+        try:
+            with regular.failing(path), regular.opened(path) as file, zipfile.ZipFile(file) as archive:
+                names = frozenset(archive.namelist())
+        except (zipfile.BadZipFile, ValueError) as error:
+            raise TacpipeError(
+                f"{path} is not a whole zip file: {plain(str(error), 200)}. Its table of contents lies at its end: copy the "
+                f"file again."
+            ) from error
+    found = ZarrTree(path, names, fill_missing)
+    if not found.is_group(""):
+        raise TacpipeError(f"{path} is not a Zarr store: it holds none of {', '.join(MARKS)}.")
+    return found
+
+
+def is_store(path: Path) -> bool:
+    """Return whether a folder or a file looks like a Zarr store, by what it holds or by its name."""
+    if path.is_dir():
+        return any((path / mark).is_file() for mark in MARKS)
+    return path.name.lower().endswith((f".zarr{ZIP}", f".zarr{ZIP}".upper()))
+
+
+def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
+    problem = ""
+    shape = about.get("shape")
+    if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
+        return Array(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is not one")
+    try:
+        kind = _dtype(about)
+    except (TypeError, ValueError, KeyError, AttributeError):
+        kind, problem = np.dtype("V"), f"has the type {excerpt(about.get('dtype', about.get('data_type')))}, which is not read"
+    return Array(path, tuple(shape), kind, attributes, problem)
+
+
+def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
+    if about.get("zarr_format") == 3:
+        kind = about["data_type"]
+        if kind in ("string", "variable_length_utf8"):
+            return np.dtype("O", metadata={"vlen": str})  # type: ignore[call-overload, no-any-return]
+        if not _KINDS.fullmatch(kind):
+            raise TypeError(kind)
+        return np.dtype(kind)
+    kind = about["dtype"]
+    if kind == "|O":
+        texts = [one.get("id") for one in about.get("filters") or ()]
+        return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})  # type: ignore[call-overload, no-any-return]
+    return np.dtype([tuple(one) for one in kind] if isinstance(kind, list) else kind)
+
+
+def _grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
+    """Return the shape of a chunk, and a function from its place in the grid to its name within the array."""
+    if about.get("zarr_format") == 3:
+        encoding = about.get("chunk_key_encoding", {"name": "default"})
+        between = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")
+        before = ["c"] if encoding["name"] == "default" else []
+        shape = about["chunk_grid"]["configuration"]["chunk_shape"]
+        return shape, lambda at: between.join([*before, *map(str, at)]) or "0"
+    between = about.get("dimension_separator") or "."
+    return about["chunks"], lambda at: between.join(map(str, at)) or "0"
