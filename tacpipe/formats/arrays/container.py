@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
-from tacpipe.formats.arrays import columns, episodes, parts, times
+from tacpipe.formats.arrays import columns, episodes, frames, known, parts, times
 from tacpipe.formats.arrays.episodes import Episode
 from tacpipe.formats.arrays.parts import Part
 from tacpipe.formats.arrays.tree import LONGEST_TEXT, Tree, plain_attributes
 from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Contents, SourceStream, Time
+from tacpipe.formats.containers.container import Contents, Share, SourceStream
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
@@ -47,6 +46,28 @@ class ArrayContainer:
         with self.open_tree() as tree:
             return _contents(tree, episodes.named(tree, episode), sources, None)
 
+    def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
+        """Return the chunks that a recording is read from, and what metadata state of it; None of a single file."""
+        with self.open_tree() as tree:
+            one = episodes.named(tree, episode)
+            found = parts.of(tree, one)
+            wanted = [part for part in found.parts if sources is None or part.source in sources]
+            arrays = [*found.scalars, *(array for part in wanted for array in part.all)]
+            files: dict[str, Path] = {}
+            for array in arrays:
+                chunks = tree.files(
+                    array, one.start, array.shape[0] if one.stop is None and array.shape else one.stop or 1
+                )
+                if chunks is None:
+                    return None
+                files |= chunks
+            stated: dict[str, Any] = {array.path: [tree.stated(array), dict(array.attributes)] for array in arrays}
+            attributes = {group: dict(tree.attributes(group)) for group in times.above(one.group)}
+            rows = [one.start, one.stop]
+            return Share(
+                files, {"rows": rows, "arrays": stated, "attributes": attributes, "skipped": dict(found.skipped)}
+            )
+
 
 def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, most: int | None) -> Contents:
     found = parts.of(tree, episode)
@@ -55,18 +76,24 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
     for one in found.scalars:
         attributes |= plain_attributes({episode.inside(one.path).replace("/", "."): tree.read(one, 0, 1)})
     skipped |= long
-    timed = [(part, times.of(tree, episode, part)) for part in found.parts]
+    kept = []
+    for part in found.parts:
+        if part.frames and times.rows(episode, part) and not frames.encoded(tree, part.arrays[0], episode.start):
+            skipped[part.source] = "holds pictures that are not encoded as JPEG, PNG or WebP, which are not read"
+        else:
+            kept.append(part)
+    timed = [(part, times.of(tree, episode, part)) for part in kept]
     chosen = [(part, time) for part, time in timed if (part.source in sources if sources is not None else True)]
     if sources is None and any(time.given for _, time in chosen):
         for part, time in chosen:
             if not time.given:
                 skipped[part.source] = "has no stamps and no rate; a layout that names it gives them"
         chosen = [(part, time) for part, time in chosen if time.given]
-    names = kinds.identifiers([_called(part, tree.path) for part, _ in timed])
+    names = _names(kept)
     streams = [
         SourceStream(
             part.source,
-            names[_called(part, tree.path)],
+            names[part.source],
             time,
             _table(tree, episode, part, most),
             times.rows(episode, part),
@@ -76,11 +103,15 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
     return Contents(streams, attributes, skipped)
 
 
-def _called(part: Part, path: Path) -> str:
-    """Return what a stream is named after: its source, or the array where the recording's own group holds but one."""
-    if part.source != parts.ROOT:
-        return part.source
-    return part.arrays[0].name if len(part.arrays) == 1 else "steps"
+def _names(found: Sequence[Part]) -> dict[str, str]:
+    """Return a name for each stream by its source: the last part of it where no other has the same."""
+    last = [part.source.rpartition("/")[2] for part in found]
+    called = {
+        part.source: "steps" if part.source == parts.ROOT else name if last.count(name) == 1 else part.source
+        for part, name in zip(found, last, strict=True)
+    }
+    names = kinds.identifiers(list(called.values()))
+    return {source: names[name] for source, name in called.items()}
 
 
 def _table(tree: Tree, episode: Episode, part: Part, most: int | None) -> pa.Table:
@@ -88,19 +119,17 @@ def _table(tree: Tree, episode: Episode, part: Part, most: int | None) -> pa.Tab
     stop = stop if most is None else min(stop, start + most)
     fields: list[pa.Field] = []
     values: list[pa.Array] = []
-    aloha = _is_aloha(tree, episode)
-    for array in [*([part.time] if part.time is not None else []), *part.arrays]:
+    is_aloha = tree.is_group(f"{episode.group}/observations".strip("/"))
+    for array in part.all:
         read = tree.read(array, start, stop)
-        for field, column in columns.of(array, read, part.frames, part.source, aloha):
-            fields.append(field)
-            values.append(column)
+        if part.frames and array is not part.time:
+            made = [frames.of(array, read)]
+        else:
+            about = known.aloha(array.name, array.shape[-1]) if is_aloha and len(array.shape) == 2 else None
+            made = list(columns.of(array, read, about))
+        fields += [field for field, _ in made]
+        values += [column for _, column in made]
     return pa.table(values, pa.schema(fields))
-
-
-def _is_aloha(tree: Tree, episode: Episode) -> bool:
-    """Return whether a recording is laid out as ALOHA's are."""
-    group = f"{episode.group}/observations".strip("/")
-    return tree.is_group(group) and any(one.name == "qpos" for one in tree.members(group)[0])
 
 
 def _attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute], dict[str, str]]:

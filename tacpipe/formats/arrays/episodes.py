@@ -10,9 +10,11 @@ import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import Array, Tree
-from tacpipe.printable import listed, plain
+from tacpipe.printable import plain
 
-NUMBERED = re.compile(r"(demo|episode|ep|traj|trajectory|trial|run|recording|rollout|seq|sequence)s?[_-]?\d+", re.IGNORECASE)
+NUMBERED = re.compile(
+    r"(demo|episode|ep|traj|trajectory|trial|run|recording|rollout|seq|sequence)s?[_-]?\d+", re.IGNORECASE
+)
 ENDS = ("meta/episode_ends", "episode_ends")  # arrays with the row behind the last of each recording
 RECORDINGS = "recordings"  # attribute of a group whose groups are a recording each, whatever their names
 
@@ -83,14 +85,16 @@ def _ends(tree: Tree) -> Sequence[int] | None:
 
 def _checked(tree: Tree, array: Array) -> np.ndarray:
     if len(array.shape) != 1 or array.dtype.kind not in "iu":
-        raise TacpipeError(f"{tree.path}: {array.path} must be whole numbers, one a recording; it has the shape {array.shape}.")
+        raise TacpipeError(
+            f"{tree.path}: {array.path} must be whole numbers, one a recording; it has the shape {array.shape}."
+        )
     ends = np.asarray(tree.read(array, 0, array.shape[0]))
     steps = np.diff(ends.astype(np.int64), prepend=0)
     if (steps < 1).any():
         row = int((steps < 1).argmax())
         raise TacpipeError(
-            f"{tree.path}: {array.path} must rise from one recording to the next; it holds {listed(ends[max(row - 1, 0) : row + 1])} "
-            f"at row {row + 1}."
+            f"{tree.path}: {array.path} must rise from one recording to the next; row {row + 1} holds {ends[row]}"
+            f"{f', the one before {ends[row - 1]}' if row else ''}."
         )
     return ends
 

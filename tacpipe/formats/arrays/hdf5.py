@@ -21,7 +21,13 @@ from tacpipe.formats.arrays.tree import Array
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
-BROKEN = (OSError, KeyError, RuntimeError, ValueError, TypeError)  # what h5py raises for bytes that are not as they should
+BROKEN = (
+    OSError,
+    KeyError,
+    RuntimeError,
+    ValueError,
+    TypeError,
+)  # what h5py raises for bytes that are not as they should
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+),.*stored_eof = (\d+)")
 
 
@@ -48,7 +54,8 @@ class Hdf5Tree:
     def is_group(self, path: str) -> bool:
         """Return whether there is a group of this path."""
         with _reading(self.path, path or "its root"):
-            return not path or isinstance(self._file.get(path, getclass=True, getlink=False), type) and issubclass(self._file.get(path, getclass=True), h5py.Group)
+            kind = self._file.get(path, getclass=True) if path else h5py.Group
+            return kind is not None and issubclass(kind, h5py.Group)
 
     def attributes(self, group: str) -> Mapping[str, Any]:
         """Return the attributes of a group, but those that cannot be read."""
@@ -63,6 +70,12 @@ class Hdf5Tree:
             text = h5py.check_string_dtype(found.dtype) is not None
             given = (found.asstr(errors="replace") if text else found)[() if not array.shape else slice(start, stop)]
             return np.asarray(given)
+
+    def files(self, array: Array, start: int, stop: int) -> None:
+        """Return None: all arrays lie in one file."""
+
+    def stated(self, array: Array) -> None:
+        """Return nothing, as the file states it."""
 
     def _addresses(self, group: str) -> set[Any]:
         """Return where a group and those above it lie in the file."""
@@ -114,7 +127,9 @@ def _member(group: h5py.Group, name: str, path: str) -> Array | str:
     """Return an array, the path of a group, or an empty text for what is neither."""
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
-        return Array(path, (), np.dtype("V"), problem=f"lies in another file ({excerpt(link.filename)}), which is not read")
+        return Array(
+            path, (), np.dtype("V"), problem=f"lies in another file ({excerpt(link.filename)}), which is not read"
+        )
     if isinstance(link, h5py.SoftLink) and name not in group:
         return Array(path, (), np.dtype("V"), problem="is a link to what is not there")
     found = group[name]

@@ -31,7 +31,11 @@ _VECTORS: Sequence[tuple[str, int, Sequence[Meaning]]] = (  # a name, a width, a
     (rf"{_ANY}(?:quat|quaternion|orientation|ori)", 4, [Meaning("orientation", "1")] * 4),
     (rf"{_HAND}(?:vel_lin|lin_vel|linear_velocity)", 3, [Meaning("velocity", "m/s", axis) for axis in XYZ]),
     (rf"{_HAND}(?:vel_ang|ang_vel|angular_velocity)", 3, [Meaning("angular_velocity", "rad/s", axis) for axis in XYZ]),
-    (rf"{_ANY}(?:rot_axis_angle|axis_angle|rotation_vector|rotvec)", 3, [Meaning("angle", "rad", axis) for axis in XYZ]),
+    (
+        rf"{_ANY}(?:rot_axis_angle|axis_angle|rotation_vector|rotvec)",
+        3,
+        [Meaning("angle", "rad", axis) for axis in XYZ],
+    ),
     (
         rf"{_HAND}pose|{_ANY}demo_(?:start|end)_pose",
         6,
@@ -47,6 +51,7 @@ _VECTORS: Sequence[tuple[str, int, Sequence[Meaning]]] = (  # a name, a width, a
     ),
 )
 _ANY_WIDTH: Sequence[tuple[str, Meaning]] = (  # a name, whatever its width
+    (rf"{_ANY}gripper_(?:qpos|qvel|pos|position|state|command|action)s?", Meaning("state")),
     (rf"{_ANY}(?:joint_pos|joint_positions?|joint_angles?|qpos)", Meaning("joint_position", "rad")),
     (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", Meaning("joint_velocity", "rad/s")),
     (rf"{_ANY}(?:joint_torques?|tau)", Meaning("joint_torque", "N m")),
@@ -106,7 +111,7 @@ def declared(attributes: Mapping[str, object]) -> dict[str, str]:
     >>> declared({"units": "N", "quantity": "force", "comment": "x", "axis": "z"})
     {'unit': 'N', 'quantity': 'force', 'axis': 'z'}
     """
-    found = {}
+    found: dict[str, str] = {}
     for key in ("unit", "units"):
         if isinstance(attributes.get(key), str) and attributes[key]:
             found.setdefault("unit", str(attributes[key]))

@@ -11,7 +11,8 @@ from tacpipe.formats.arrays.episodes import Episode
 from tacpipe.formats.arrays.tree import Array, Tree, is_frames, left_out, walk
 
 TIME = re.compile(
-    r"(t|time|times|timestamps?|time_?stamps?|stamps?|clock|unix_?time|epoch)(_?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE
+    r"(t|time|times|timestamps?|time_?stamps?|stamps?|clock|unix_?time|epoch)(_?(s|sec|seconds|ms|us|ns))?",
+    re.IGNORECASE,
 )
 LENGTHS = "compress_len"  # of ALOHA's frames before they were padded
 NEXT = "next_obs"  # of robomimic: obs, one step later
@@ -26,6 +27,19 @@ class Part:
     arrays: Sequence[Array]
     time: Array | None
     frames: bool = False  # whether its one array holds encoded pictures
+
+    @property
+    def all(self) -> Sequence[Array]:
+        """The arrays with that of the stamps."""
+        return [*([] if self.time is None else [self.time]), *self.arrays]
+
+    @property
+    def clock(self) -> str:
+        """The column with the stamps: an array, or a field of a compound one; empty where there is none."""
+        if self.time is not None:
+            return self.time.name
+        kind = self.arrays[0].dtype
+        return next((name for name in kind.names or () if TIME.fullmatch(name) and kind[name].kind in "iuf"), "")
 
 
 @dataclass(frozen=True)
@@ -50,9 +64,11 @@ def of(tree: Tree, episode: Episode) -> Found:
         there: list[Array] = []
         for array in every:
             reason = _reason(array, episode)
+            if NEXT in inside.split("/"):
+                continue
             if reason:
                 skipped[episode.inside(array.path)] = reason
-            elif array.path not in episodes.ENDS and NEXT not in inside.split("/"):
+            elif array.path not in episodes.ENDS:
                 (there if _is_column(array, every, episode) else scalars).append(array)
         parts += _split(there, inside or ROOT, episode, stamps)
         stamps += filter(_is_time, there)
@@ -64,7 +80,9 @@ def _reason(array: Array, episode: Episode) -> str:
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
     short = episode.stop is not None and array.path not in episodes.ENDS and array.shape[:1] < (episode.stop,)
-    return left_out(array) or (f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings" if short else "")
+    return left_out(array) or (
+        f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings" if short else ""
+    )
 
 
 def _is_column(array: Array, beside: Sequence[Array], episode: Episode) -> bool:
@@ -85,7 +103,8 @@ def _split(arrays: Sequence[Array], group: str, episode: Episode, above: Sequenc
         time = _stamps(same, above)
         columns = [one for one in same if one is not time]
         if columns:
-            yield Part(episode.inside(columns[0].path) if several else group, columns, time)
+            alone = several or (group == ROOT and len(columns) == 1)
+            yield Part(episode.inside(columns[0].path) if alone else group, columns, time)
     for one in apart:
         time = _stamps(by_length.get(one.shape[0], []), [each for each in above if each.shape[0] == one.shape[0]])
         yield Part(episode.inside(one.path), [one], time, is_frames(one))

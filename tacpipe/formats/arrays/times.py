@@ -26,10 +26,11 @@ LEAST = 1e8  # seconds since 1970: what is less counts from the start of a recor
 
 def of(tree: Tree, episode: Episode, part: Part) -> Time:
     """Return where the stamps of a stream come from; an empty `Time` where the file states neither stamps nor a rate."""
-    if part.time is not None:
-        unit, origin = _unit(tree, episode, part)
+    if part.clock:
+        unit = _unit(part, size := _last(tree, episode, part))
         if unit is not None:
-            return Time(column=part.time.name, unit=unit, origin=origin)  # type: ignore[arg-type]
+            since_1970 = size >= LEAST * 10 ** {"s": 0, "ms": 3, "us": 6, "ns": 9}[unit]
+            return Time(column=part.clock, unit=unit, origin="unix" if since_1970 else "start")
     rate_hz = _rate_hz(tree, part)
     return Time() if rate_hz is None else Time(rate_hz=rate_hz)
 
@@ -50,20 +51,22 @@ def above(group: str) -> list[str]:
     return ["/".join(names[:count]) for count in range(len(names) + 1)]
 
 
-def _unit(tree: Tree, episode: Episode, part: Part) -> tuple[TimeUnit | None, str]:
-    """Return the unit of stamps and what they count from, as attributes, the name or their size show it."""
-    assert part.time is not None
+def _last(tree: Tree, episode: Episode, part: Part) -> float:
+    """Return the last stamp of a stream as its file holds it, without sign; 0 where there is none."""
+    array = part.time or part.arrays[0]
     last = episode.start + rows(episode, part)
-    found = np.asarray(tree.read(part.time, max(last - 1, 0), last)).reshape(-1)
-    size = abs(float(found[0])) if len(found) and np.isfinite(found[0]) else 0.0
-    attributes = part.time.attributes
+    found = np.asarray(tree.read(array, max(last - 1, 0), last))
+    values = (found if part.time is not None else found[part.clock]).reshape(-1)
+    return abs(float(values[0])) if len(values) and np.isfinite(values[0]) else 0.0
+
+
+def _unit(part: Part, size: float) -> TimeUnit | None:
+    """Return the unit of stamps, as an attribute, the name or their size shows it; None where nothing does."""
+    attributes = part.time.attributes if part.time is not None else {}
     stated = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
-    suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.time.name, re.IGNORECASE)
+    suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.clock, re.IGNORECASE)
     unit = UNITS.get(stated.strip().lower()) or (UNITS.get(suffix[1].lower()) if suffix else None)
-    unit = unit or (next(unit for most, unit in SINCE_1970 if size < most) if size >= LEAST else None)
-    if unit is None:
-        return None, "start"
-    return unit, "unix" if size >= LEAST * {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit] else "start"
+    return unit or (next(unit for most, unit in SINCE_1970 if size < most) if size >= LEAST else None)
 
 
 def _rate_hz(tree: Tree, part: Part) -> float | None:

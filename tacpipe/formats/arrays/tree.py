@@ -64,6 +64,12 @@ class Tree(Protocol):
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """The rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
 
+    def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
+        """The files that hold rows of an array, by path within the store; None where all lies in one file."""
+
+    def stated(self, array: Array) -> Any:
+        """How the rows of an array are encoded, as JSON, without how many there are."""
+
 
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
     """Yield each group below a group, itself first, with the arrays in it."""
@@ -76,7 +82,9 @@ def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
 def is_frames(array: Array) -> bool:
     """Return whether an array may hold an encoded picture a row: bytes without fixed length, or padded with zeros."""
     if array.dtype.kind == "O":
-        return array.dtype.metadata is not None and array.dtype.metadata.get("vlen") == np.uint8 and len(array.shape) == 1
+        return (
+            array.dtype.metadata is not None and array.dtype.metadata.get("vlen") == np.uint8 and len(array.shape) == 1
+        )
     return array.dtype == np.uint8 and len(array.shape) == 2 and _named_as_image(array.path)
 
 
@@ -105,7 +113,7 @@ def left_out(array: Array) -> str:
         return array.problem
     if is_image(array):
         return f"holds decoded pictures ({' x '.join(map(str, array.shape[1:]))}), which are not read"
-    if array.dtype.kind not in "biufSUOTV" or array.dtype.itemsize > 8 and array.dtype.kind == "f":
+    if array.dtype.kind not in "biufSUOTV" or (array.dtype.itemsize > 8 and array.dtype.kind == "f"):
         return f"has the type {array.dtype}, which is not read"
     if array.dtype.kind == "O" and not is_text(array) and not is_frames(array):
         return "has elements of no fixed length, which are not read"
@@ -116,8 +124,8 @@ def left_out(array: Array) -> str:
 
 def is_text(array: Array) -> bool:
     """Return whether an array holds text."""
-    about = array.dtype.metadata or {}
-    return array.dtype.kind in "SUT" or (array.dtype.kind == "O" and about.get("vlen") in (str, bytes))
+    about = array.dtype.metadata
+    return array.dtype.kind in "SUT" or (about is not None and about.get("vlen") in (str, bytes))
 
 
 def plain_attributes(found: Mapping[str, Any]) -> dict[str, str | int | float | bool]:

@@ -14,6 +14,7 @@ import os
 import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,12 @@ from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import Array
 from tacpipe.io import memory, regular
-from tacpipe.printable import excerpt, plain
+from tacpipe.printable import excerpt, listed, plain
 
-ZIP = ".zip"
 MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
 MOST_BYTES = 1 << 26  # of a file of metadata
 BROKEN = (OSError, KeyError, RuntimeError, ValueError, TypeError, NotImplementedError, ImportError, zipfile.BadZipFile)
+_filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether a chunk that is not there holds fill values
 _KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
@@ -39,7 +40,6 @@ class ZarrTree:
 
     path: Path
     names: frozenset[str] | None
-    fill_missing: bool = False  # whether a chunk that is not there holds fill values
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it, sorted."""
@@ -69,12 +69,12 @@ class ZarrTree:
 
         stop = min(stop, array.shape[0]) if array.shape else 1
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
-        lost = [] if self.fill_missing else [name for name in self.chunks(array, start, stop) if not self._has(name)]
+        lost = [] if _filled.get() else [name for name in self.chunks(array, start, stop) if not self._has(name)]
         if lost:
             raise TacpipeError(
-                f"{self.path}: {plain(lost[0], 200)} is missing, a chunk of {plain(array.path, 200)}; so are "
-                f"{len(lost) - 1} others of these rows. Copy the store again; if the program that wrote it leaves out "
-                f"chunks of fill values alone, as zarr 3 does, give --fill-missing-chunks."
+                f"{self.path} lacks {listed(lost, 2)}, which hold{'s' * (len(lost) == 1)} rows of {plain(array.path, 200)}. "
+                f"Copy the store again; if the program that wrote it leaves out chunks of fill values alone, as zarr 3 "
+                f"does, give --fill-missing-chunks."
             )
         try:
             with self._store() as store:
@@ -101,9 +101,16 @@ class ZarrTree:
             spans[0] = range(start // shape[0], math.ceil(stop / shape[0]))
         return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
 
-    def file(self, name: str) -> Path | None:
-        """Return where something of the store lies as a file of its own; None within a zip file."""
-        return self.path / name if self.names is None else None
+    def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
+        """Return the files that hold rows of an array; None of a zip file."""
+        if self.names is not None:
+            return None
+        return {name: self.path / name for name in self.chunks(array, start, stop) if self._has(name)}
+
+    def stated(self, array: Array) -> Any:
+        """Return the metadata of an array but for its shape, which grows with each recording that is added."""
+        found = self._node(array.path)
+        return {key: value for key, value in found[0].items() if key != "shape"} if found is not None else None
 
     def _has(self, name: str) -> bool:
         return (self.path / name).is_file() if self.names is None else name in self.names
@@ -114,7 +121,13 @@ class ZarrTree:
             with regular.failing(self.path), os.scandir(self.path / group) as entries:
                 return sorted(one.name for one in entries if one.is_dir(follow_symlinks=False))
         start = f"{group}/" if group else ""
-        return sorted({name[len(start) :].partition("/")[0] for name in self.names if name.startswith(start) and "/" in name[len(start) :]})
+        return sorted(
+            {
+                name[len(start) :].partition("/")[0]
+                for name in self.names
+                if name.startswith(start) and "/" in name[len(start) :]
+            }
+        )
 
     def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
         """Return metadata and attributes of a group or an array; None where there is neither."""
@@ -162,8 +175,19 @@ class ZarrTree:
             store.close()
 
 
-def opened(path: Path, fill_missing: bool = False) -> ZarrTree:
-    """Return the tree of a Zarr store, folder or zip file. Raises `TacpipeError` where it is neither."""
+@contextlib.contextmanager
+def missing_chunks(*, filled: bool) -> Iterator[None]:
+    """Have chunks that are not there read as fill values in the block, or refused, as they are without it."""
+    before = _filled.set(filled)
+    try:
+        yield
+    finally:
+        _filled.reset(before)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[ZarrTree]:
+    """Open a Zarr store, folder or zip file. Raises `TacpipeError` where it is neither."""
     names = None
     if not path.is_dir():
         try:
@@ -174,17 +198,10 @@ def opened(path: Path, fill_missing: bool = False) -> ZarrTree:
                 f"{path} is not a whole zip file: {plain(str(error), 200)}. Its table of contents lies at its end: copy the "
                 f"file again."
             ) from error
-    found = ZarrTree(path, names, fill_missing)
+    found = ZarrTree(path, names)
     if not found.is_group(""):
-        raise TacpipeError(f"{path} is not a Zarr store: it holds none of {', '.join(MARKS)}.")
-    return found
-
-
-def is_store(path: Path) -> bool:
-    """Return whether a folder or a file looks like a Zarr store, by what it holds or by its name."""
-    if path.is_dir():
-        return any((path / mark).is_file() for mark in MARKS)
-    return path.name.lower().endswith((f".zarr{ZIP}", f".zarr{ZIP}".upper()))
+        raise TacpipeError(f"{path} is not a Zarr group: it has no .zgroup or zarr.json of one at its top.")
+    yield found
 
 
 def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
@@ -195,7 +212,10 @@ def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -
     try:
         kind = _dtype(about)
     except (TypeError, ValueError, KeyError, AttributeError):
-        kind, problem = np.dtype("V"), f"has the type {excerpt(about.get('dtype', about.get('data_type')))}, which is not read"
+        kind, problem = (
+            np.dtype("V"),
+            f"has the type {excerpt(about.get('dtype', about.get('data_type')))}, which is not read",
+        )
     return Array(path, tuple(shape), kind, attributes, problem)
 
 
@@ -203,15 +223,16 @@ def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
     if about.get("zarr_format") == 3:
         kind = about["data_type"]
         if kind in ("string", "variable_length_utf8"):
-            return np.dtype("O", metadata={"vlen": str})  # type: ignore[call-overload, no-any-return]
+            return np.dtype("O", metadata={"vlen": str})
         if not _KINDS.fullmatch(kind):
             raise TypeError(kind)
         return np.dtype(kind)
-    kind = about["dtype"]
+    kind: Any = about["dtype"]
     if kind == "|O":
         texts = [one.get("id") for one in about.get("filters") or ()]
-        return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})  # type: ignore[call-overload, no-any-return]
-    return np.dtype([tuple(one) for one in kind] if isinstance(kind, list) else kind)
+        return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})
+    found: np.dtype[Any] = np.dtype([tuple(one) for one in kind] if isinstance(kind, list) else kind)
+    return found
 
 
 def _grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:

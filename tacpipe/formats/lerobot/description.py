@@ -25,7 +25,13 @@ DATA_PATHS = {  # where versions keep the frames, if info.json does not say
     "v2": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
-OWN = ("stats/", "data/", "videos/", "meta/", "dataset_")  # how columns of meta/episodes begin that say where things are
+OWN = (
+    "stats/",
+    "data/",
+    "videos/",
+    "meta/",
+    "dataset_",
+)  # how columns of meta/episodes begin that say where things are
 NAME = "tacpipe.recording"  # the column with the name that an episode had before it was exported
 _PLACE = re.compile(r"\{(\w+)(?::(\d+)d)?\}")
 
@@ -77,16 +83,6 @@ class Description:
         found = self._of_parquet() if self.version == "v3.0" else self._of_lines()
         return sorted(found, key=lambda one: one.index)
 
-    def tasks(self) -> dict[int, str]:
-        """Return the text of each task by its number."""
-        if self.version != "v3.0":
-            return {int(one["task_index"]): str(one["task"]) for one in _lines(self.root / "meta/tasks.jsonl")}
-        found = _table(self.root / "meta/tasks.parquet")
-        text = next((name for name in ("task", "__index_level_0__") if name in found.column_names), None)
-        if text is None or "task_index" not in found.column_names:
-            raise TacpipeError(f"{self.root / 'meta/tasks.parquet'} has no columns task and task_index.")
-        return dict(zip(found["task_index"].to_pylist(), map(str, found[text].to_pylist()), strict=True))
-
     def _of_lines(self) -> Iterator[Episode]:
         path = self.root / "meta/episodes.jsonl"
         for one in _lines(path):
@@ -108,7 +104,9 @@ class Description:
     def _of_parquet(self) -> Iterator[Episode]:
         paths = sorted((self.root / "meta/episodes").glob("**/*.parquet"))
         if not paths:
-            raise TacpipeError(f"{self.root / 'meta/episodes'} holds no Parquet file; a dataset of version 3.0 has one.")
+            raise TacpipeError(
+                f"{self.root / 'meta/episodes'} holds no Parquet file; a dataset of version 3.0 has one."
+            )
         for path in paths:
             names = [name for name in _schema(path) if not name.startswith("stats/")]
             for one in _table(path, names).to_pylist():
@@ -134,7 +132,9 @@ class Description:
             if None not in at.values():
                 videos[key] = self._place("video_path", "", {**at, "video_key": key})
         file = self._place("data_path", DATA_PATHS["v3"], values)
-        return Episode(_name(index, others), index, file, length, tuple(map(str, one.get("tasks") or ())), videos, _plain(others))
+        return Episode(
+            _name(index, others), index, file, length, tuple(map(str, one.get("tasks") or ())), videos, _plain(others)
+        )
 
     @property
     def _videos(self) -> list[str]:
@@ -147,7 +147,8 @@ class Description:
             found = _PLACE.sub(lambda one: _filled(values[one[1]], one[2]), pattern)
         except (KeyError, ValueError) as error:
             raise TacpipeError(
-                f"{self.root / INFO}: {key} is {excerpt(pattern)}, which names {plain(str(error))}; there are {', '.join(values)}."
+                f"{self.root / INFO}: {key} is {excerpt(pattern)}, which names {plain(str(error))}; there are "
+                f"{', '.join(values)}."
             ) from error
         parts = PurePosixPath(found)
         if parts.is_absolute() or ".." in parts.parts or "\\" in found or "\0" in found:
@@ -162,7 +163,8 @@ def read(root: Path) -> Description:
     version, fps = info.get("codebase_version"), info.get("fps")
     if version not in VERSIONS:
         raise TacpipeError(
-            f"{path}: codebase_version is {excerpt(version)}; {', '.join(VERSIONS)} are read. Convert it with LeRobot's own script."
+            f"{path}: codebase_version is {excerpt(version)}; {', '.join(VERSIONS)} are read. Convert it with LeRobot's own "
+            f"script."
         )
     if not isinstance(fps, int | float) or not 0 < fps <= 1e6:
         raise TacpipeError(f"{path}: fps is {excerpt(fps)}; it must be a number above 0.")

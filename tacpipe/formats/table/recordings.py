@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import recording_names
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError, UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.table import pattern, reading
 from tacpipe.formats.table.layout import FILE, Format, Layout, Stream
@@ -84,7 +84,7 @@ def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
     for path, stem in kinds.names(paths, source).items():
         stem = os.fsencode(stem).decode(errors="replace")
         files = {one.name: path for one in layout.streams} or {CONTAINER: path}
-        for episode in kinds.opened(kind, path).episodes() or (None,):
+        for episode in _episodes(kind, path):
             values = {FILE: stem, **({} if episode is None else {"recording": episode})}
             plain_name = stem if episode is None else f"{stem}-{episode}"
             name = recording_names.valid(pattern.filled(layout.name, values) if layout.name else plain_name)
@@ -93,6 +93,19 @@ def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
             sources.append(Source(name, files, {}, episode))
     recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
     return sorted(sources, key=lambda one: one.name)
+
+
+def _episodes(kind: str, path: Path) -> Sequence[str | None]:
+    """Return the recordings in a container, [None] where it is one.
+
+    A container that cannot be read is one: reading it says what is wrong, and others are not kept from being read.
+    """
+    try:
+        return kinds.opened(kind, path).episodes() or [None]
+    except TacpipeError as error:
+        if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+            raise
+        return [None]
 
 
 def _every(layout: Layout, folder: Path) -> list[Path]:
@@ -152,7 +165,7 @@ def _within(path: Path, stream: Stream) -> set[str] | None:
     import pyarrow.compute as pc
 
     if stream.contained:
-        return set(kinds.opened(str(stream.format), path).episodes()) or None
+        return {one for one in _episodes(str(stream.format), path) if one is not None} or None
     file = reading.opened(path, stream)
     if stream.recording not in file.names():
         raise TacpipeError(
