@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray
-from tacpipe.formats.arrays import known
+from tacpipe.formats.arrays import frames, known
 from tacpipe.formats.arrays.known import Meaning
-from tacpipe.formats.arrays.tree import Array, is_text
+from tacpipe.formats.arrays.tree import Array, is_frames, is_text
 
 AXES = ("x", "y", "z")
 
@@ -26,7 +26,7 @@ def of(array: Array, values: AnyArray, meanings: list[Meaning] | None = None) ->
     if array.dtype.names is not None:
         yield from _compound("", values, array)
         return
-    yield from _columns(array.name, values, array, meanings)
+    yield from _columns(array.name, values, array, array.path, meanings)
 
 
 def _compound(before: str, values: AnyArray, array: Array) -> Iterator[tuple[pa.Field, pa.Array]]:
@@ -35,25 +35,29 @@ def _compound(before: str, values: AnyArray, array: Array) -> Iterator[tuple[pa.
         if inner.dtype.names is not None:
             yield from _compound(f"{before}{name}.", inner, array)
         else:
-            yield from _columns(f"{before}{name}", inner, array, None)
+            yield from _columns(f"{before}{name}", inner, array, f"{array.path}/{before}{name}", None)
 
 
 def _columns(
-    name: str, values: AnyArray, array: Array, meanings: list[Meaning] | None
+    name: str, values: AnyArray, array: Array, path: str, meanings: list[Meaning] | None
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
     shape = values.shape[1:]
     width = int(np.prod(shape, dtype=np.int64))
-    about = meanings or known.meanings(name, width, values.dtype.kind in "iub")
-    components = [one.component for one in about]
     stated = known.declared(array.attributes)
+    about = meanings or known.meanings(path, width, values.dtype.kind in "iub")
+    if "quantity" in stated:  # then what is not stated is not so
+        about = [known.NOTHING] * width
+    components = [one.component for one in about]
+    names, units = known.listed(array.attributes, "columns", width), known.listed(array.attributes, "units", width)
     flat = _native(values.reshape(len(values), width), array).T
     for position, at in enumerate(np.ndindex(*shape)):
         one = about[position]
         metadata = {"quantity": one.quantity, "unit": one.unit, "component": one.component} | stated
+        metadata |= {"unit": units[position]} if units else {}
         metadata |= _place(metadata["quantity"], shape, at)
         suffix = one.component if all(components) and len(set(components)) == width > 1 else "_".join(map(str, at))
-        called = f"{name}_{suffix}" if width > 1 else name
-        column = _array(flat[position])
+        called = names[position] if names else f"{name}_{suffix}" if width > 1 else name
+        column = _array(flat[position], array)
         yield pa.field(called, column.type, metadata={key: value for key, value in metadata.items() if value}), column
 
 
@@ -72,6 +76,8 @@ def _place(quantity: str, shape: tuple[int, ...], at: tuple[int, ...]) -> dict[s
 
 def _native(values: AnyArray, array: Array) -> AnyArray:
     """Return values as one of the types that a column has."""
+    if is_frames(array) and values.dtype.kind == "O":
+        return values
     if is_text(array) or values.dtype.kind in "SUOT":
         return values
     if values.dtype == np.float16:
@@ -79,7 +85,9 @@ def _native(values: AnyArray, array: Array) -> AnyArray:
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
-def _array(values: Any) -> pa.Array:
+def _array(values: Any, array: Array) -> pa.Array:
+    if values.dtype.kind == "O" and is_frames(array):
+        return frames.binary(array, values)
     if values.dtype.kind in "SUOT":
         texts = [one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in values.tolist()]
         return pa.array(texts, pa.string())

@@ -62,7 +62,7 @@ class ArrayContainer:
                     return None
                 files |= chunks
             stated: dict[str, Any] = {array.path: [tree.stated(array), dict(array.attributes)] for array in arrays}
-            attributes = {group: dict(tree.attributes(group)) for group in times.above(one.group)}
+            attributes: dict[str, Any] = {group: dict(tree.attributes(group)) for group in times.above(one.group)}
             rows = [one.start, one.stop]
             return Share(
                 files, {"rows": rows, "arrays": stated, "attributes": attributes, "skipped": dict(found.skipped)}
@@ -74,7 +74,10 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
     skipped = dict(found.skipped)
     attributes, long = _attributes(tree, episode)
     for one in found.scalars:
-        attributes |= plain_attributes({episode.inside(one.path).replace("/", "."): tree.read(one, 0, 1)})
+        row = episode.number if one.shape else 0
+        name = one.name if one.group == episode.beside else episode.inside(one.path).replace("/", ".")
+        attributes |= plain_attributes({name: tree.read(one, row, row + 1)})
+    attributes |= plain_attributes(episode.labels)
     skipped |= long
     kept = []
     for part in found.parts:

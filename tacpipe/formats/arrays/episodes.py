@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import Array, Tree
 from tacpipe.printable import plain
@@ -16,17 +18,21 @@ NUMBERED = re.compile(
     r"(demo|episode|ep|traj|trajectory|trial|run|recording|rollout|seq|sequence)s?[_-]?\d+", re.IGNORECASE
 )
 ENDS = ("meta/episode_ends", "episode_ends")  # arrays with the row behind the last of each recording
-RECORDINGS = "recordings"  # attribute of a group whose groups are a recording each, whatever their names
+NAMES, LABELS = "recordings", "labels"  # attributes of their group: the name of each, and its labels by name
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording within a tree: its group, and its rows where arrays hold those of several."""
+    """One recording within a tree: its group, or its rows where arrays hold those of several."""
 
     name: str | None  # None: the tree is one recording
     group: str = ""
     start: int = 0
     stop: int | None = None  # None: to the end of each array
+    number: int = 0  # among those that share arrays, of which there are ``count``
+    count: int = 0
+    beside: str | None = None  # the group of the array that says where they end
+    labels: Mapping[str, Any] = field(default_factory=dict)
 
     def inside(self, path: str) -> str:
         """Return the path of a group or an array within the recording's group."""
@@ -35,14 +41,12 @@ class Episode:
 
 def found(tree: Tree) -> list[Episode]:
     """Return the recordings of a tree, in order: by number where names have one. Raises `TacpipeError`."""
-    ends = _ends(tree)
-    if ends is not None:
-        return [Episode(_named(number), "", *_rows(ends, number)) for number in range(len(ends))]
+    cut = _cut(tree)
+    if cut:
+        return cut
     for group in _above(tree):
         below = tree.members(group)[1]
-        names = [one.rpartition("/")[2] for one in below]
-        marked = tree.attributes(group).get("kind") == RECORDINGS
-        chosen = [one for one, name in zip(below, names, strict=True) if marked or NUMBERED.fullmatch(name)]
+        chosen = [one for one in below if NUMBERED.fullmatch(one.rpartition("/")[2])]
         if chosen:
             return [Episode(one.rpartition("/")[2], one) for one in sorted(chosen, key=_order)]
     return [Episode(None)]
@@ -52,12 +56,11 @@ def named(tree: Tree, name: str | None) -> Episode:
     """Return the recording of this name, without a look at the others. Raises `TacpipeError` where there is none."""
     if name is None:
         return Episode(None)
-    ends = _ends(tree)
-    if ends is not None:
-        number = int(name.rpartition("_")[2]) if re.fullmatch(r"episode_\d+", name) else len(ends)
-        if number < len(ends):
-            return Episode(name, "", *_rows(ends, number))
-    for group in _above(tree) if ends is None else ():
+    cut = _cut(tree)
+    for one in cut:
+        if one.name == name:
+            return one
+    for group in _above(tree) if not cut else ():
         path = f"{group}/{name}" if group else name
         if tree.is_group(path):
             return Episode(name, path)
@@ -69,21 +72,33 @@ def _above(tree: Tree) -> list[str]:
     return ["", *tree.members("")[1]]
 
 
-def _ends(tree: Tree) -> Sequence[int] | None:
-    """Return the row behind the last of each recording, None where the tree does not state them."""
+def _cut(tree: Tree) -> list[Episode]:
+    """Return the recordings that an array cuts all others into; none where there is no such array."""
     for path in ENDS:
         group = path.rpartition("/")[0]
-        if not tree.is_group(group):
-            continue
-        array = next((one for one in tree.members(group)[0] if one.path == path), None)
-        if array is None:
-            continue
-        ends = _checked(tree, array)
-        return [int(end) for end in ends]
-    return None
+        array = (
+            next((one for one in tree.members(group)[0] if one.path == path), None) if tree.is_group(group) else None
+        )
+        if array is not None:
+            ends = [int(end) for end in _checked(tree, array)]
+            about = tree.attributes(group)
+            names = about.get(NAMES)
+            if not isinstance(names, list) or len({str(one) for one in names}) != len(ends):
+                names = [f"episode_{number:06d}" for number in range(len(ends))]  # as LeRobot counts them
+            labels = about.get(LABELS)
+            return [
+                Episode(str(name), "", start, stop, number, len(ends), group, _of(labels, str(name)))
+                for number, (name, start, stop) in enumerate(zip(names, [0, *ends], ends, strict=False))
+            ]
+    return []
 
 
-def _checked(tree: Tree, array: Array) -> np.ndarray:
+def _of(labels: Any, name: str) -> Mapping[str, Any]:
+    own = labels.get(name) if isinstance(labels, dict) else None
+    return own if isinstance(own, dict) else {}
+
+
+def _checked(tree: Tree, array: Array) -> AnyArray:
     if len(array.shape) != 1 or array.dtype.kind not in "iu":
         raise TacpipeError(
             f"{tree.path}: {array.path} must be whole numbers, one a recording; it has the shape {array.shape}."
@@ -97,14 +112,6 @@ def _checked(tree: Tree, array: Array) -> np.ndarray:
             f"{f', the one before {ends[row - 1]}' if row else ''}."
         )
     return ends
-
-
-def _rows(ends: Sequence[int], number: int) -> tuple[int, int]:
-    return (ends[number - 1] if number else 0), ends[number]
-
-
-def _named(number: int) -> str:
-    return f"episode_{number:06d}"  # as LeRobot counts them; a recording that is added changes no other's name
 
 
 def _order(path: str) -> list[int | str]:

@@ -27,12 +27,18 @@ def encoded(tree: Tree, array: Array, row: int) -> bool:
 
 def of(array: Array, values: AnyArray) -> tuple[pa.Field, pa.Array]:
     """Return field and values of the column of pictures: bytes as they were written, without the zeros behind them."""
+    found = binary(array, values)
+    kind = next(filter(None, (encoding(one.as_py()) for one in found)), "")
+    about = {"quantity": "image", **({"encoding": kind} if kind else {})}
+    return pa.field(NAME, pa.binary(), metadata=about), found
+
+
+def binary(array: Array, values: AnyArray) -> pa.Array:
+    """Return rows of bytes, without the zeros behind those that are padded."""
     rows = _bytes(values)
     if array.dtype.kind != "O":
         rows = [one.rstrip(b"\0") for one in rows]  # a JPEG ends in FF D9, a PNG in its check sum of IEND
-    kind = next(filter(None, map(encoding, rows)), "")
-    about = {"quantity": "image", **({"encoding": kind} if kind else {})}
-    return pa.field(NAME, pa.binary(), metadata=about), pa.array(rows, pa.binary())
+    return pa.array(rows, pa.binary())
 
 
 def _bytes(values: AnyArray) -> list[bytes]:

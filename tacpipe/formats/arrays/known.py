@@ -23,7 +23,7 @@ class Meaning:
 
 
 NOTHING = Meaning()
-_HAND = r"(?:.*[_./])?(?:eef?|ee|tcp|end_effector|hand|wrist|tool)_?"
+_HAND = r"(?:.*[_./])?(?:eef?|ee|tcp|end_effector|hand|wrist|tool|robot|arm)[_./]?"
 _ANY = r"(?:.*[_./])?"
 _VECTORS: Sequence[tuple[str, int, Sequence[Meaning]]] = (  # a name, a width, and what each column is
     (rf"{_HAND}(?:pos|position|translation|xyz|trans)", 3, [Meaning("position", "m", axis) for axis in XYZ]),
@@ -51,17 +51,16 @@ _VECTORS: Sequence[tuple[str, int, Sequence[Meaning]]] = (  # a name, a width, a
     ),
 )
 _ANY_WIDTH: Sequence[tuple[str, Meaning]] = (  # a name, whatever its width
-    (rf"{_ANY}gripper_(?:qpos|qvel|pos|position|state|command|action)s?", Meaning("state")),
+    (rf"{_ANY}gripper[_./](?:qpos|qvel|pos|position|state|command|action)s?", Meaning("state")),
     (rf"{_ANY}(?:joint_pos|joint_positions?|joint_angles?|qpos)", Meaning("joint_position", "rad")),
     (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", Meaning("joint_velocity", "rad/s")),
     (rf"{_ANY}(?:joint_torques?|tau)", Meaning("joint_torque", "N m")),
-    (rf"{_ANY}(?:gripper|finger)_(?:width|opening)", Meaning("finger_width", "m")),
+    (rf"{_ANY}(?:gripper|finger)s?[_./](?:width|opening)", Meaning("finger_width", "m")),
     (rf"{_ANY}(?:tactile|taxels?|skin|touch|uskin|xela|digit|reskin|anyskin)\w*", Meaning("tactile")),
     (rf"{_ANY}(?:dones?|terminals?|terminated|truncated|success|timeouts?)", Meaning("label", "1")),
     (rf"{_ANY}(?:rewards?)", Meaning("score", "1")),
 )
 _UNREAL = ("sin", "cos")  # of an angle: no angle
-LAYOUT = ("taxel", "axis", "component", "finger", "electrode", "triangle", "offset_ns")  # keys of docs/format.md
 
 
 def meanings(name: str, width: int, whole: bool = False) -> list[Meaning]:
@@ -108,14 +107,26 @@ def aloha(name: str, width: int) -> list[Meaning] | None:
 def declared(attributes: Mapping[str, object]) -> dict[str, str]:
     """Return what attributes of an array state of its columns, as metadata of fields.
 
-    >>> declared({"units": "N", "quantity": "force", "comment": "x", "axis": "z"})
-    {'unit': 'N', 'quantity': 'force', 'axis': 'z'}
+    Where a quantity is among them all texts count, as in files that tacpipe writes.
+
+    >>> declared({"units": "N", "comment": "x"}), declared({"unit": "count", "quantity": "tactile", "taxel": "7"})
+    ({'unit': 'N'}, {'unit': 'count', 'quantity': 'tactile', 'taxel': '7'})
     """
-    found: dict[str, str] = {}
-    for key in ("unit", "units"):
-        if isinstance(attributes.get(key), str) and attributes[key]:
-            found.setdefault("unit", str(attributes[key]))
-    for key in ("quantity", *LAYOUT):
-        if isinstance(attributes.get(key), str | int) and attributes[key] != "":
-            found[key] = str(attributes[key])
-    return found
+    texts = {key: value for key, value in attributes.items() if isinstance(value, str) and value}
+    if "quantity" in texts:
+        return texts
+    found = texts.get("unit") or texts.get("units")
+    return {"unit": found} if found else {}
+
+
+def listed(attributes: Mapping[str, object], key: str, count: int) -> list[str]:
+    """Return the text that an attribute states for each of ``count`` columns, nothing where it states another number.
+
+    >>> listed({"columns": ["a", "b"]}, "columns", 2), listed({"columns": ["a"]}, "columns", 2)
+    (['a', 'b'], [])
+    """
+    value = attributes.get(key)
+    if value is None or isinstance(value, str | bytes) or not hasattr(value, "__iter__"):
+        return []
+    found = [one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in value]
+    return found if len(found) == count else []

@@ -68,7 +68,9 @@ def of(tree: Tree, episode: Episode) -> Found:
                 continue
             if reason:
                 skipped[episode.inside(array.path)] = reason
-            elif array.path not in episodes.ENDS:
+            elif group == episode.beside and array.shape == (episode.count,):
+                scalars += [array] if array.path not in episodes.ENDS else []
+            else:
                 (there if _is_column(array, every, episode) else scalars).append(array)
         parts += _split(there, inside or ROOT, episode, stamps)
         stamps += filter(_is_time, there)
@@ -79,7 +81,8 @@ def _reason(array: Array, episode: Episode) -> str:
     """Return why an array is left out; empty where it is not."""
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
-    short = episode.stop is not None and array.path not in episodes.ENDS and array.shape[:1] < (episode.stop,)
+    one_each = array.group == episode.beside and array.shape == (episode.count,)
+    short = episode.stop is not None and not one_each and array.shape[:1] < (episode.stop,)
     return left_out(array) or (
         f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings" if short else ""
     )
@@ -93,7 +96,7 @@ def _is_column(array: Array, beside: Sequence[Array], episode: Episode) -> bool:
 
 def _split(arrays: Sequence[Array], group: str, episode: Episode, above: Sequence[Array]) -> Iterator[Part]:
     """Yield the streams of one group's arrays, named by the group where it holds one, else by the first array of each."""
-    apart = [one for one in arrays if one.dtype.kind == "V" or is_frames(one)]
+    apart = [one for one in arrays if one.dtype.kind == "V" or (is_frames(one) and "quantity" not in one.attributes)]
     by_length: dict[int, list[Array]] = {}
     for one in arrays:
         if one not in apart:

@@ -29,10 +29,11 @@ def of(tree: Tree, episode: Episode, part: Part) -> Time:
     if part.clock:
         unit = _unit(part, size := _last(tree, episode, part))
         if unit is not None:
-            since_1970 = size >= LEAST * 10 ** {"s": 0, "ms": 3, "us": 6, "ns": 9}[unit]
+            declared = part.time is not None and part.time.attributes.get("quantity") == "time"
+            since_1970 = declared or size >= LEAST * 10 ** {"s": 0, "ms": 3, "us": 6, "ns": 9}[unit]
             return Time(column=part.clock, unit=unit, origin="unix" if since_1970 else "start")
-    rate_hz = _rate_hz(tree, part)
-    return Time() if rate_hz is None else Time(rate_hz=rate_hz)
+    rate = rate_hz(tree, episode, part)
+    return Time() if rate is None else Time(rate_hz=rate)
 
 
 def rows(episode: Episode, part: Part) -> int:
@@ -69,17 +70,13 @@ def _unit(part: Part, size: float) -> TimeUnit | None:
     return unit or (next(unit for most, unit in SINCE_1970 if size < most) if size >= LEAST else None)
 
 
-def _rate_hz(tree: Tree, part: Part) -> float | None:
-    """Return the rate that attributes of the stream's arrays, its group or one above state."""
-    for one in part.arrays:
-        found = _stated(one.attributes)
-        if found is not None:
-            return found
-    for group in reversed(above(part.arrays[0].group)):
-        found = _stated(tree.attributes(group))
-        if found is not None:
-            return found
-    return None
+def rate_hz(tree: Tree, episode: Episode, part: Part | None) -> float | None:
+    """Return the rate that attributes of a stream's arrays, its group or one above state, or that all recordings have."""
+    arrays = part.arrays if part is not None else ()
+    groups = [*reversed(above(arrays[0].group))] if arrays else []
+    stated = [*(one.attributes for one in arrays), *map(tree.attributes, groups)]
+    stated += [tree.attributes(episode.beside)] if episode.beside is not None else []
+    return next((found for one in stated if (found := _stated(one)) is not None), None)
 
 
 def _stated(attributes: Mapping[str, Any]) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,7 +143,7 @@ def plain_attributes(found: Mapping[str, Any]) -> dict[str, str | int | float | 
             value = value.item()
         if isinstance(value, bytes):
             value = value.decode(errors="replace")
-        finite = not isinstance(value, float) or abs(value) < float("inf")
+        finite = not isinstance(value, float) or math.isfinite(value)
         if isinstance(value, str | int | float | bool) and finite and len(str(value)) <= LONGEST_TEXT:
             made[plain(str(name))] = value
     return made

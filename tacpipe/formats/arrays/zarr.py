@@ -221,12 +221,12 @@ def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -
 
 def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
     if about.get("zarr_format") == 3:
-        kind = about["data_type"]
-        if kind in ("string", "variable_length_utf8"):
+        called = about["data_type"]
+        if called in ("string", "variable_length_utf8"):
             return np.dtype("O", metadata={"vlen": str})
-        if not _KINDS.fullmatch(kind):
-            raise TypeError(kind)
-        return np.dtype(kind)
+        if not _KINDS.fullmatch(called):
+            raise TypeError(called)
+        return np.dtype(str(called))
     kind: Any = about["dtype"]
     if kind == "|O":
         texts = [one.get("id") for one in about.get("filters") or ()]

@@ -7,8 +7,8 @@ nanosecond; else they are the column's own float32 seconds. The metadata of ``t_
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,8 @@ NATIVE = "tacpipe"  # the folder with the streams that a dataset was exported fr
 TOLERANCE_S = 1e-4  # as LeRobot's own
 INDEX, FRAME, STAMP = "episode_index", "frame_index", "timestamp"
 OWN = (INDEX, FRAME, STAMP, "index", "task_index")  # features that count frames
-STEP = "next"  # the stream of features of one value a step, as next.reward
+TOGETHER = ("next", NATIVE)  # features that begin so are one stream, as next.reward and next.done
+EXACT = f"{NATIVE}.t_ns"  # the feature with the stamps in ns, of datasets that tacpipe exported
 CLOCK = Time(column="t_ns", unit="ns", origin="start")
 FROM_RATE, FROM_STAMPS = "frame_index / fps", "timestamp, float32 seconds"
 
@@ -80,22 +81,24 @@ class LeRobotContainer:
         return self._episodes[name]
 
     def _native(self, episode: Episode) -> dict[str, Path]:
-        """Return the files of the streams that an episode was exported from, by stream."""
-        folder = self.path / NATIVE / episode.name
-        return {path.stem: path for path in sorted(folder.glob("*.parquet"))} if folder.is_dir() else {}
+        """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
+        folder, file = self.path / NATIVE / episode.name, self.path / NATIVE / f"{episode.name}.parquet"
+        found = {path.stem: path for path in sorted(folder.glob("*.parquet"))} if folder.is_dir() else {}
+        return {"": file} if file.is_file() and not found else found
 
     def _contents(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> Contents:
+        native = self._native(episode)
+        if native:
+            streams = [self._exact(name, path) for name, path in native.items() if _wanted(name, sources)]
+            return Contents(streams, episode.original or {})
         attributes: dict[str, Attribute] = {**episode.attributes, "episode_index": episode.index}
+        attributes |= episode.original or {}
         if episode.tasks:
             attributes["task"] = "; ".join(episode.tasks)
         if self._about.robot:
             attributes["robot_type"] = self._about.robot
         skipped = {key: f"is a video, {path}, which is not read" for key, path in episode.videos.items()}
         attributes |= {f"video.{key}": path for key, path in episode.videos.items()}
-        native = self._native(episode)
-        if native:
-            streams = [self._exact(name, path) for name, path in native.items() if _wanted(name, sources)]
-            return Contents(streams, attributes, skipped)
         streams = self._streams(episode, sources, rows=rows)
         return Contents(streams, attributes | {"fps": self._about.fps}, skipped)
 
@@ -110,13 +113,19 @@ class LeRobotContainer:
     def _streams(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> list[SourceStream]:
         by_source: dict[str, list[Feature]] = {}
         for feature in self._about.features.values():
-            if feature.key not in OWN and feature.dtype != "video":
-                by_source.setdefault(STEP if feature.key.startswith(f"{STEP}.") else feature.key, []).append(feature)
+            if feature.key not in (*OWN, EXACT) and feature.dtype != "video":
+                first = feature.key.partition(".")[0]
+                by_source.setdefault(first if first in TOGETHER else feature.key, []).append(feature)
         names = kinds.identifiers([_called(source) for source in by_source])
         chosen = {source: features for source, features in by_source.items() if _wanted(source, sources)}
-        frames = self._frames(episode, [one.key for features in chosen.values() for one in features])
-        t_ns, made = _stamps(frames, self._about.fps, self.path / episode.file)
-        clock = pa.field(CLOCK.column, pa.int64(), metadata={"made": made})
+        exact = [EXACT] if EXACT in self._about.features else []
+        frames = self._frames(episode, [*exact, *(one.key for features in chosen.values() for one in features)])
+        if exact:
+            t_ns, made = frames.column(EXACT).to_numpy(), {}
+        else:
+            t_ns, how = _stamps(frames, self._about.fps, self.path / episode.file)
+            made = {"made": how}
+        clock = pa.field(CLOCK.column, pa.int64(), metadata=made)
         frames = frames if rows else frames.slice(0, 0)
         found = []
         for source, features in chosen.items():
@@ -124,7 +133,8 @@ class LeRobotContainer:
             for feature in features:
                 columns += self._columns(episode, feature, frames.column(feature.key))
             table = pa.table([values for _, values in columns], pa.schema([field for field, _ in columns]))
-            found.append(SourceStream(source, names[_called(source)], CLOCK, table, episode.length))
+            time = replace(CLOCK, origin="unix") if exact else CLOCK
+            found.append(SourceStream(source, names[_called(source)], time, table, episode.length))
         return found
 
     def _frames(self, episode: Episode, keys: Sequence[str]) -> pa.Table:
@@ -152,14 +162,16 @@ class LeRobotContainer:
     ) -> list[tuple[pa.Field, pa.Array | pa.ChunkedArray]]:
         if feature.dtype == "image":
             return [(pa.field("frame", pa.binary(), metadata={"quantity": "image"}), _pictures(values))]
-        whole = feature.dtype.startswith(("int", "uint", "bool"))
-        about = known.meanings(feature.key.rpartition(".")[2], feature.width, whole)
         last = feature.key.rpartition(".")[2]
+        about = known.meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
         names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])
         found: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
-        for name, one, column in zip(names, about, self._flat(episode, feature, values), strict=True):
+        for at, column in enumerate(self._flat(episode, feature, values)):
+            one = about[at]
             metadata = {"quantity": one.quantity, "unit": one.unit, "component": one.component}
-            found.append((pa.field(name, column.type, metadata={k: v for k, v in metadata.items() if v}), column))
+            if feature.quantities:
+                metadata = {"quantity": feature.quantities[at], "unit": feature.units[at] if feature.units else ""}
+            found.append((pa.field(names[at], column.type, metadata={k: v for k, v in metadata.items() if v}), column))
         return found
 
     def _flat(
@@ -208,18 +220,11 @@ def _called(source: str) -> str:
 def _groups(file: pq.ParquetFile, episode: int) -> list[int]:
     """Return the row groups that may hold an episode, by the statistics of its index."""
     metadata = file.metadata
-    at = file.schema_arrow.names.index(INDEX)
-    column = (
-        [metadata.schema.column(one).path for one in range(metadata.num_columns)].index(INDEX)
-        if metadata.num_columns
-        else at
-    )
-    found = []
-    for group in range(metadata.num_row_groups):
-        about = metadata.row_group(group).column(column).statistics
-        if about is None or not about.has_min_max or about.min <= episode <= about.max:
-            found.append(group)
-    return found
+    column = [metadata.schema.column(one).path for one in range(metadata.num_columns)].index(INDEX)
+    about = [metadata.row_group(group).column(column).statistics for group in range(metadata.num_row_groups)]
+    return [
+        group for group, one in enumerate(about) if one is None or not one.has_min_max or one.min <= episode <= one.max
+    ]
 
 
 def _stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
@@ -229,25 +234,20 @@ def _stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
     if not np.isfinite(seconds).all():
         row = int((~np.isfinite(seconds)).argmax())
         raise TacpipeError(f"{path}: {STAMP} of frame {row + 1} is {seconds[row]}; it must be a number of seconds.")
-    if len(index) and np.abs(index / fps - seconds).max() <= TOLERANCE_S:
-        return np.rint(index * (1e9 / fps)).astype(np.int64) if not _whole(fps) else _quotient(
-            index, int(fps)
-        ), FROM_RATE
+    allowed_s = TOLERANCE_S + np.spacing(np.abs(seconds).astype(np.float32))  # what float32 cannot state
+    if (np.abs(index / fps - seconds) <= allowed_s).all():
+        return _quotients(index, fps), FROM_RATE
     return np.rint(seconds * 1e9).astype(np.int64), FROM_STAMPS
 
 
-def _whole(fps: float) -> bool:
-    return math.floor(fps) == fps
+def _quotients(index: Int64s, fps: float) -> Int64s:
+    """Return ``index / fps`` in ns (frame,), rounded, in whole numbers: ``fps`` is exactly a quotient of two.
 
-
-def _quotient(index: Int64s, fps: int) -> Int64s:
-    """Return ``index / fps`` in ns, rounded half up, in whole numbers.
-
-    >>> _quotient(np.array([1, 2, 3]), 30).tolist()
+    >>> _quotients(np.array([1, 2, 3]), 30.0).tolist()
     [33333333, 66666667, 100000000]
     """
-    found: Int64s = (index * 10**9 * 2 + fps) // (2 * fps)
-    return found
+    above, below = fps.as_integer_ratio()
+    return np.array([(2 * int(one) * 10**9 * below + above) // (2 * above) for one in index], np.int64)
 
 
 def _pictures(values: pa.ChunkedArray) -> pa.ChunkedArray:

@@ -6,13 +6,14 @@ import contextlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.arrays.tree import plain_attributes
 from tacpipe.io import regular
 from tacpipe.io.parquet import BROKEN
 from tacpipe.plugins.stage import Attribute
@@ -32,7 +33,8 @@ OWN = (
     "meta/",
     "dataset_",
 )  # how columns of meta/episodes begin that say where things are
-NAME = "tacpipe.recording"  # the column with the name that an episode had before it was exported
+NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with what an episode was before its export
+ABOUT = "meta/tacpipe.json"  # the name, unit and quantity of each value of a feature, of exported datasets
 _PLACE = re.compile(r"\{(\w+)(?::(\d+)d)?\}")
 
 
@@ -44,6 +46,8 @@ class Feature:
     dtype: str
     shape: tuple[int, ...]
     names: tuple[str, ...] = ()  # of its values; empty: none are given, or not as many as there are values
+    units: tuple[str, ...] = ()
+    quantities: tuple[str, ...] = ()
 
     @property
     def width(self) -> int:
@@ -56,7 +60,10 @@ class Feature:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: what it is called, the file with its frames, tasks, and what else is stated of it."""
+    """One episode: what it is called, the file with its frames, tasks, and what else is stated of it.
+
+    ``original`` are the attributes of the recording that it was exported from, None where it was not.
+    """
 
     name: str
     index: int
@@ -65,6 +72,7 @@ class Episode:
     tasks: tuple[str, ...] = ()
     videos: Mapping[str, str] = field(default_factory=dict)  # by feature: the path within the dataset
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    original: Mapping[str, Attribute] | None = None
 
 
 @dataclass(frozen=True)
@@ -132,9 +140,9 @@ class Description:
             if None not in at.values():
                 videos[key] = self._place("video_path", "", {**at, "video_key": key})
         file = self._place("data_path", DATA_PATHS["v3"], values)
-        return Episode(
-            _name(index, others), index, file, length, tuple(map(str, one.get("tasks") or ())), videos, _plain(others)
-        )
+        tasks = tuple(map(str, one.get("tasks") or ()))
+        original = _original(path, one.get(ATTRIBUTES))
+        return Episode(_name(index, others), index, file, length, tasks, videos, _plain(others), original)
 
     @property
     def _videos(self) -> list[str]:
@@ -171,7 +179,9 @@ def read(root: Path) -> Description:
     features = info.get("features")
     if not isinstance(features, dict) or not features:
         raise TacpipeError(f"{path}: features is {excerpt(features)}; it must name the columns of the frames.")
-    made = {str(key): _feature(path, str(key), value) for key, value in features.items()}
+    about = _json(root / ABOUT).get("features") if (root / ABOUT).is_file() else None
+    about = about if isinstance(about, dict) else {}
+    made = {str(key): _feature(path, str(key), value, about.get(key)) for key, value in features.items()}
     return Description(root, version, float(fps), str(info.get("robot_type") or ""), made, info)
 
 
@@ -191,14 +201,19 @@ def parquet_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _feature(path: Path, key: str, value: Any) -> Feature:
+def _feature(path: Path, key: str, value: Any, about: Any) -> Feature:
     shape = value.get("shape") if isinstance(value, dict) else None
     if not isinstance(value, dict) or not isinstance(shape, list) or not all(isinstance(one, int) for one in shape):
         raise TacpipeError(f"{path}: the feature {plain(key)} is {excerpt(value)}; it must have dtype and shape.")
     made = Feature(key, str(value.get("dtype")), tuple(shape))
-    names = _leaves(value.get("names"))
-    whole = len(names) == made.width and len(set(names)) == len(names)
-    return Feature(key, made.dtype, made.shape, tuple(names) if whole else ())
+    about = about if isinstance(about, dict) else {}
+
+    def each(found: Any) -> tuple[str, ...]:
+        return tuple(leaves) if len(leaves := _leaves(found)) == made.width else ()
+
+    names = each(about.get("columns")) or each(value.get("names"))
+    unique = names if len(set(names)) == len(names) else ()
+    return replace(made, names=unique, units=each(about.get("units")), quantities=each(about.get("quantities")))
 
 
 def _leaves(names: Any) -> list[str]:
@@ -219,11 +234,19 @@ def _name(index: int, others: Mapping[str, Any]) -> str:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Attribute]:
-    return {
-        plain(key): value
-        for key, value in values.items()
-        if key != NAME and isinstance(value, str | int | float | bool) and len(str(value)) <= 200 and value == value
-    }
+    others = {key: value for key, value in values.items() if key not in (NAME, ATTRIBUTES)}
+    return dict(plain_attributes(others))
+
+
+def _original(path: Path, text: Any) -> dict[str, Attribute] | None:
+    if not isinstance(text, str):
+        return None
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise TacpipeError(f"{path}: {ATTRIBUTES} holds {excerpt(text)}, which is not JSON.") from error
+    values = found.items() if isinstance(found, dict) else ()
+    return {str(key): value for key, value in values if value is None or isinstance(value, str | int | float | bool)}
 
 
 def _filled(value: object, width: str | None) -> str:
