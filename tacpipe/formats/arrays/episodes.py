@@ -31,6 +31,7 @@ class Episode:
     stop: int | None = None  # None: to the end of each array
     number: int = 0  # among those that share arrays, of which there are ``count``
     count: int = 0
+    total: int = 0  # rows of all of them
     beside: str | None = None  # the group of the array that says where they end
     labels: Mapping[str, Any] = field(default_factory=dict)
 
@@ -55,7 +56,10 @@ def found(tree: Tree) -> list[Episode]:
 def named(tree: Tree, name: str | None) -> Episode:
     """Return the recording of this name, without a look at the others. Raises `TacpipeError` where there is none."""
     if name is None:
-        return Episode(None)
+        (*several, one) = found(tree)
+        if several or one.name is not None:
+            raise TacpipeError(f"{tree.path} holds {len(several) + 1} recordings. Name one of them.")
+        return one
     cut = _cut(tree)
     for one in cut:
         if one.name == name:
@@ -87,7 +91,7 @@ def _cut(tree: Tree) -> list[Episode]:
                 names = [f"episode_{number:06d}" for number in range(len(ends))]  # as LeRobot counts them
             labels = about.get(LABELS)
             return [
-                Episode(str(name), "", start, stop, number, len(ends), group, _of(labels, str(name)))
+                Episode(str(name), "", start, stop, number, len(ends), ends[-1], group, _of(labels, str(name)))
                 for number, (name, start, stop) in enumerate(zip(names, [0, *ends], ends, strict=False))
             ]
     return []

@@ -82,7 +82,7 @@ def _reason(array: Array, episode: Episode) -> str:
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
     one_each = array.group == episode.beside and array.shape == (episode.count,)
-    short = episode.stop is not None and not one_each and array.shape[:1] < (episode.stop,)
+    short = episode.stop is not None and not one_each and array.shape[:1] < (episode.total,)
     return left_out(array) or (
         f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings" if short else ""
     )
