@@ -45,6 +45,8 @@ def _columns(
     width = int(np.prod(shape, dtype=np.int64))
     stated = known.declared(array.attributes)
     about = meanings or known.meanings(path, width, values.dtype.kind in "iub")
+    if width == 1 and about == [known.NOTHING]:
+        about = [known.of_name(name, values.dtype.name)]
     if "quantity" in stated:  # then what is not stated is not so
         about = [known.NOTHING] * width
     components = [one.component for one in about]

@@ -10,6 +10,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from tacpipe.formats.table import guess
+from tacpipe.formats.table.layout import UNKNOWN
+
 XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
 
 
@@ -84,6 +87,16 @@ def meanings(name: str, width: int, whole: bool = False) -> list[Meaning]:
             counted = one.quantity == "tactile" and whole
             return [Meaning("tactile", "count") if counted else one] * width
     return [NOTHING] * width
+
+
+def of_name(name: str, kind: str) -> Meaning:
+    """Return what a column of one value holds where its name says both quantity and unit.
+
+    >>> of_name("joint1_rad", "float32"), of_name("fx", "float64")
+    (Meaning(quantity='joint_position', unit='rad', component=''), Meaning(quantity='', unit='', component=''))
+    """
+    quantity, unit = guess.meaning(name, kind)
+    return NOTHING if UNKNOWN in (quantity, unit) else Meaning(quantity, unit)
 
 
 def aloha(name: str, width: int) -> list[Meaning] | None:

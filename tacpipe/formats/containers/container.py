@@ -75,6 +75,15 @@ class Sharing(Protocol):
         """Return what these streams of an episode, or all, are read from; None: all files of the container."""
 
 
+@runtime_checkable
+class Naming(Protocol):
+    """A container that may hold recordings which have had their names before, in a dataset that it was exported from."""
+
+    @property
+    def names_itself(self) -> bool:
+        """Whether its episodes are named without the container's name before theirs."""
+
+
 class Container(Protocol):
     """An open container. Its methods raise `TacpipeError`, naming the file, for what is not of its format."""
 

@@ -56,6 +56,11 @@ class LeRobotContainer:
         """Return the streams of an episode, all or those of some features."""
         return self._contents(self._named(episode), sources, rows=True)
 
+    @property
+    def names_itself(self) -> bool:
+        """Whether the episodes have the names of the recordings that they were exported from."""
+        return all(one.original is not None for one in self._episodes.values())
+
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share:
         """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
         one = self._named(episode)
@@ -167,7 +172,7 @@ class LeRobotContainer:
         names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])
         found: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
         for at, column in enumerate(self._flat(episode, feature, values)):
-            one = about[at]
+            one = about[at] if about[at] != known.NOTHING else known.of_name(names[at], feature.dtype)
             metadata = {"quantity": one.quantity, "unit": one.unit, "component": one.component}
             if feature.quantities:
                 metadata = {"quantity": feature.quantities[at], "unit": feature.units[at] if feature.units else ""}

@@ -163,16 +163,19 @@ def test_a_changed_chunk_costs_the_recordings_that_lie_in_it(stores: Lab) -> Non
     )
 
 
-def test_an_episode_that_is_added_costs_itself_and_the_one_in_its_first_chunk(stores: Lab) -> None:
-    counts(stores)
+@pytest.mark.parametrize(("ends", "cost"), [((30, 45, 80), (1, 3)), ((30, 45, 70), (2, 2))])
+def test_an_episode_that_is_added_costs_itself_and_the_one_in_its_first_chunk(
+    stores: Lab, ends: tuple[int, ...], cost: tuple[int, int]
+) -> None:
     shutil.rmtree(stores.folder / "stores" / "replay.zarr")
-    files.replay(stores.folder / "stores" / "replay.zarr", ends=(30, 45, 80))
+    files.replay(stores.folder / "stores" / "replay.zarr", ends=ends)
+    counts(stores)
     group = files.zarr.open_group(str(stores.folder / "stores" / "replay.zarr"), mode="a")
     for name in ("data/robot0_eef_pos", "data/robot0_gripper_width"):
         array = group[name]
         array.append(np.ones((20, array.shape[1]), np.float32))
-    group["meta/episode_ends"].append(np.array([100]))
-    assert counts(stores) == (1, 3)
+    group["meta/episode_ends"].append(np.array([ends[-1] + 20]))
+    assert counts(stores, "--replace") == cost
 
 
 def test_a_missing_chunk_ends_with_one_and_the_others_are_read_with_skip_bad(stores: Lab) -> None:
