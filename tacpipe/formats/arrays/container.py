@@ -103,7 +103,7 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
         )
         for part, time in chosen
     ]
-    return Contents(streams, attributes, skipped)
+    return Contents(streams, attributes, skipped, tree.notes)
 
 
 def _names(found: Sequence[Part]) -> dict[str, str]:

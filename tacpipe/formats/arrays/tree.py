@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -52,6 +52,10 @@ class Tree(Protocol):
     @property
     def path(self) -> Path:
         """Where it lies."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What is missing of a file that is cut short, in sentences."""
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """The arrays in a group, and the paths of the groups in it."""

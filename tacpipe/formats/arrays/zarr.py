@@ -7,12 +7,14 @@ was allowed: by the specification it holds fill values alone, and so zarr reads 
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import json
 import math
 import os
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -29,7 +31,11 @@ from tacpipe.printable import excerpt, listed, plain
 
 MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
 MOST_BYTES = 1 << 26  # of a file of metadata
-BROKEN = (OSError, KeyError, RuntimeError, ValueError, TypeError, NotImplementedError, ImportError, zipfile.BadZipFile)
+BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
+BROKEN = (  # what zarr and its codecs raise for bytes that are not as they should be
+    *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
+    SystemError,  # of blosc
+)
 _filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether a chunk that is not there holds fill values
 _KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
@@ -40,6 +46,7 @@ class ZarrTree:
 
     path: Path
     names: frozenset[str] | None
+    notes: Sequence[str] = ()
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it, sorted."""
@@ -146,7 +153,7 @@ class ZarrTree:
     def _json(self, name: str) -> dict[str, Any]:
         try:
             found = json.loads(self._content(name))
-        except (ValueError, RecursionError, zipfile.BadZipFile, KeyError) as error:
+        except (*BROKEN_ZIP, RecursionError) as error:
             raise TacpipeError(f"{self.path}: {plain(name, 200)} cannot be read: {plain(str(error), 200)}.") from error
         if not isinstance(found, dict):
             raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(found)}; it must be a JSON object.")
@@ -156,7 +163,7 @@ class ZarrTree:
         if self.names is None:
             with regular.failing(self.path / name):
                 return regular.content(self.path / name, MOST_BYTES)
-        with regular.opened(self.path) as file, zipfile.ZipFile(file) as archive:
+        with _archive(self.path) as archive:
             if archive.getinfo(name).file_size > MOST_BYTES:
                 raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MOST_BYTES:,} bytes.")
             return archive.read(name)
@@ -191,9 +198,9 @@ def opened(path: Path) -> Iterator[ZarrTree]:
     names = None
     if not path.is_dir():
         try:
-            with regular.failing(path), regular.opened(path) as file, zipfile.ZipFile(file) as archive:
+            with _archive(path) as archive:
                 names = frozenset(archive.namelist())
-        except (zipfile.BadZipFile, ValueError) as error:
+        except BROKEN_ZIP as error:
             raise TacpipeError(
                 f"{path} is not a whole zip file: {plain(str(error), 200)}. Its table of contents lies at its end: copy the "
                 f"file again."
@@ -204,19 +211,37 @@ def opened(path: Path) -> Iterator[ZarrTree]:
     yield found
 
 
+@contextlib.contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    with regular.failing(path):
+        file = regular.opened(path)
+    with file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                yield archive
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # a place before the file's first byte, where its table is wrong
+                with regular.failing(path):
+                    raise
+            raise zipfile.BadZipFile("its table of contents leads out of the file") from error
+
+
 def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
     problem = ""
     shape = about.get("shape")
     if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
-        return Array(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is not one")
+        return Array(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is none")
     try:
         kind = _dtype(about)
-    except (TypeError, ValueError, KeyError, AttributeError):
-        kind, problem = (
-            np.dtype("V"),
-            f"has the type {excerpt(about.get('dtype', about.get('data_type')))}, which is not read",
-        )
-    return Array(path, tuple(shape), kind, attributes, problem)
+    except (TypeError, ValueError, LookupError, AttributeError):
+        kind, problem = np.dtype("V"), f"has the type {excerpt(about.get('dtype', about.get('data_type')))}"
+    try:
+        steps, _ = _grid(about)
+    except (TypeError, ValueError, LookupError, AttributeError):
+        steps = []
+    if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
+        problem = "has chunks of no known shape"
+    return Array(path, tuple(shape), kind, attributes, f"{problem}, which is not read" if problem else "")
 
 
 def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
@@ -242,6 +267,6 @@ def _grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
         between = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")
         before = ["c"] if encoding["name"] == "default" else []
         shape = about["chunk_grid"]["configuration"]["chunk_shape"]
-        return shape, lambda at: between.join([*before, *map(str, at)]) or "0"
+        return list(shape), lambda at: between.join([*before, *map(str, at)]) or "0"
     between = about.get("dimension_separator") or "."
-    return about["chunks"], lambda at: between.join(map(str, at)) or "0"
+    return list(about["chunks"]), lambda at: between.join(map(str, at)) or "0"

@@ -13,17 +13,18 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import hdf5
+from tacpipe.formats.table.contained import Params
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.arrays import files
 
-NONE = hdf5.Params()
+NONE = Params()
 
 
-def given(text: str) -> hdf5.Params:
-    return hdf5.Params(json.dumps(tomllib.loads(text)))
+def given(text: str) -> Params:
+    return Params(json.dumps(tomllib.loads(text)))
 
 
-def read(folder: Path, params: hdf5.Params = NONE) -> dict[str, RecordingOutput]:
+def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
     found = hdf5.COMMAND.discover(params, folder)
     return {name: hdf5.hdf5(params, one.files, one.values) for name, one in found.items()}
 
@@ -198,7 +199,7 @@ def test_a_group_within_itself_ends(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "parts"),
     [
-        (lambda content: content[: len(content) // 2], ("cut short", "bytes")),
+        (lambda content: content[: len(content) // 2], ("cut short",)),
         (lambda content: b"", ("empty",)),
         (lambda content: b"time,x\n" * 100, ("not an HDF5 file",)),
     ],
@@ -215,6 +216,27 @@ def test_a_damaged_file_is_one_sentence_and_keeps_no_other_from_being_read(
     with pytest.raises(TacpipeError, match=r"bad\.h5") as raised:
         hdf5.hdf5(NONE, found["bad"].files, found["bad"].values)
     assert all(part in str(raised.value) for part in parts)
+
+
+def test_of_a_file_that_is_cut_short_all_is_read_whose_bytes_are_there_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "lift.hdf5"
+    files.robomimic(path, demos=40)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 6 // 10])
+    found = hdf5.COMMAND.discover(NONE, tmp_path)
+    whole = 0
+    for name, one in found.items():
+        number = int(name.rpartition("_")[2])
+        try:
+            made = hdf5.hdf5(NONE, one.files, one.values)
+        except TacpipeError as error:
+            assert "lift.hdf5" in str(error)
+            continue
+        expected = files.values(10 + number, 3, seed=number)
+        assert made.streams["obs"].column("robot0_eef_pos_x").to_pylist() == expected[:, 0].tolist()
+        assert f"{len(content) * 6 // 10:,} bytes" in " ".join(made.notes)
+        whole += 1
+    assert 10 < whole < 30
 
 
 def test_a_damaged_array_is_named_and_costs_its_own_recording(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from zarr import open_group
 
 import tacpipe
 from tacpipe.errors import TacpipeError
@@ -170,7 +171,7 @@ def test_an_episode_that_is_added_costs_itself_and_the_one_in_its_first_chunk(
     shutil.rmtree(stores.folder / "stores" / "replay.zarr")
     files.replay(stores.folder / "stores" / "replay.zarr", ends=ends)
     counts(stores)
-    group = files.zarr.open_group(str(stores.folder / "stores" / "replay.zarr"), mode="a")
+    group = open_group(str(stores.folder / "stores" / "replay.zarr"), mode="a")
     for name in ("data/robot0_eef_pos", "data/robot0_gripper_width"):
         array = group[name]
         array.append(np.ones((20, array.shape[1]), np.float32))
