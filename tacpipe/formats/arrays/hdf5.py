@@ -104,9 +104,8 @@ class Hdf5Tree:
                 with regular.failing(self.path):
                     raise
             if self._left is not None:
-                raise TacpipeError(
-                    f"{self.path} is cut short after {self._left:,} bytes, and {plain(what, 200)} lies behind. Copy it again."
-                ) from error
+                cut = f"{self.path} is cut short after {self._left:,} bytes"
+                raise TacpipeError(f"{cut}, and {plain(what, 200)} lies behind. Copy it again.") from error
             why = plain(str(error.args[0] if error.args else error), 200)
             raise TacpipeError(
                 f"{self.path}: {plain(what, 200)} cannot be read: {why}. Copy the file again."

@@ -76,8 +76,13 @@ class ZarrTree:
 
         stop = min(stop, array.shape[0]) if array.shape else 1
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
-        lost = [] if _filled.get() else [name for name in self.chunks(array, start, stop) if not self._has(name)]
-        if lost:
+        chunks = self.chunks(array, start, stop)
+        lost = [name for name in chunks if not self._has(name)]
+        for name in chunks if self.names is None else ():
+            if name not in lost:
+                with regular.failing(self.path / name):
+                    regular.require(self.path / name, (self.path / name).stat().st_mode)  # zarr would wait for a pipe
+        if lost and not _filled.get():
             raise TacpipeError(
                 f"{self.path} lacks {listed(lost, 2)}, which hold{'s' * (len(lost) == 1)} rows of {plain(array.path, 200)}. "
                 f"Copy the store again; if the program that wrote it leaves out chunks of fill values alone, as zarr 3 "
@@ -120,7 +125,7 @@ class ZarrTree:
         return {key: value for key, value in found[0].items() if key != "shape"} if found is not None else None
 
     def _has(self, name: str) -> bool:
-        return (self.path / name).is_file() if self.names is None else name in self.names
+        return os.path.lexists(self.path / name) if self.names is None else name in self.names
 
     def _below(self, group: str) -> list[str]:
         """Return the names of the folders in a group."""

@@ -36,7 +36,8 @@ def robomimic(path: Path, demos: int = 3, rate_hz: int | None = RATE_HZ) -> None
             for group in ("obs", "next_obs"):
                 demo[f"{group}/robot0_eef_pos"] = values(rows, 3, seed=number)
                 demo[f"{group}/robot0_gripper_qpos"] = values(rows, 2, seed=number)
-                demo[f"{group}/agentview_image"] = np.zeros((rows, 84, 84, 3), np.uint8)
+                pixels = np.zeros((rows, 84, 84, 3), np.uint8)
+                demo.create_dataset(f"{group}/agentview_image", data=pixels, compression="gzip")
             demo["obs/tactile"] = np.arange(rows * 12, dtype=np.uint16).reshape(rows, 4, 3)
 
 
