@@ -53,8 +53,7 @@ class Bag:
             files, messages_compressed, notes = _files(self.path, stack)
             reading = _Reading(sources, messages_compressed)
             for number, file in enumerate(files):
-                left = None if most is None else max(most - reading.count, 1)
-                reading.take(READERS[file.suffix.lower()](file), number, left)
+                reading.take(READERS[file.suffix.lower()](file), number, most)
         contents = reading.contents()
         return Contents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
 
@@ -126,7 +125,6 @@ class _Reading:
 
     sources: Collection[str] | None
     compressed: bool
-    count: int = 0
     topics: dict[str, Topic] = field(default_factory=dict)
     types: dict[str, str] = field(default_factory=dict)  # of each topic
     skipped: dict[str, str] = field(default_factory=dict)
@@ -139,7 +137,6 @@ class _Reading:
         for record in records:
             if isinstance(record, Message):
                 self._message(record, file)
-                self.count += 1
                 if most is not None and (most := most - 1) <= 0:
                     return
             elif isinstance(record, Channel):
@@ -170,9 +167,9 @@ class _Reading:
         topic = self.topics.get(self._channels.get((file, message.channel), ""))
         if topic is None:
             return
-        content = bytes(message.content)  # a view would keep the whole of its chunk in memory
         try:
-            topic.add(_unzipped(content) if self.compressed else content, message.log_ns, message.publish_ns)
+            content = _unzipped(message.content) if self.compressed else message.content
+            topic.add(content, message.log_ns, message.publish_ns)
         except TopicError as error:
             self._skip(self._channels[file, message.channel], str(error))
 

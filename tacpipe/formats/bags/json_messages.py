@@ -24,7 +24,7 @@ class Json:
 
     schema: str
 
-    def blocks(self, messages: Sequence[bytes | memoryview]) -> Iterator[Block]:
+    def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages; raises `TopicError` where one is not a JSON object."""
         encoded = self._encoded()
         rows: list[dict[str, Any]] = []

@@ -68,16 +68,13 @@ class _Reader:
 
     def record(self, kind: int, content: memoryview) -> Iterator[Record]:
         """Yield what a record is, if it is one that counts."""
+        if kind == MESSAGE:
+            yield _message(content, 0, len(content))
+            return
         from mcap import records as mcap_records
         from mcap.data_stream import ReadDataStream
         from mcap.exceptions import EndOfFile
 
-        if kind == MESSAGE:
-            if len(content) < _MESSAGE.size:
-                raise _BrokenError("a message record is too short")
-            number, _, log_ns, publish_ns = _MESSAGE.unpack_from(content)
-            yield Message(number, log_ns, publish_ns, content[_MESSAGE.size :])
-            return
         stream = ReadDataStream(io.BytesIO(content))
         try:
             if kind == SCHEMA:
@@ -117,9 +114,18 @@ class _Reader:
             at += _RECORD.size
             if at + length > len(view):
                 break
-            if kind in (SCHEMA, CHANNEL, MESSAGE):
+            if kind == MESSAGE:
+                yield _message(view, at, length)
+            elif kind in (SCHEMA, CHANNEL):
                 yield from self.record(kind, view[at : at + length])
             at += length
+
+
+def _message(view: memoryview, at: int, length: int) -> Message:
+    if length < _MESSAGE.size:
+        raise _BrokenError("a message record is too short")
+    number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, at)
+    return Message(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
 
 
 def _decompressed(compression: str, content: bytes, size: int) -> bytes:

@@ -7,7 +7,7 @@ Units follow REP 103 (SI). Types are recognised wherever they stand inside a mes
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tacpipe.formats.bags.wire import TEXT, Leaf, Path, Shape
@@ -163,21 +163,40 @@ _JOINT = {  # name of the column, quantity, unit of a joint that turns
 _SLIDES = re.compile(r"finger|prismatic|slid|linear|rail|lift", re.IGNORECASE)
 
 
-def _joints(shape: Shape) -> list[Part]:
-    """Return a JointState: a column a joint, named by its number, with its name in the metadata."""
-    names = [shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "name"]
-    made = part([leaf for leaf in shape.leaves if leaf.path[0] == "header"])
-    for leaf in shape.leaves:
-        if leaf.path[0] not in _JOINT:
-            continue
-        for index in range(leaf.count or 0):
-            joint = names[index] if index < len(names) else ""
-            name, quantity, unit = _JOINT[str(leaf.path[0])]
-            if _SLIDES.search(joint):  # its unit would be m; a message does not say which joints slide
-                name, unit = f"joint{{}}_{leaf.path[0]}", ""
-            about = _about(quantity, unit, joint=joint)
-            made.columns.append(Column(name.format(index + 1), leaf, index, about))
-    return [made]
+class _Joints:
+    """JointStates of one topic: a column a joint, numbered as the first message has them, with its name in the metadata.
+
+    Several drivers may write to the topic, each its own joints: each set of joints is a stream. A driver may write them in
+    another order each time.
+    """
+
+    def __init__(self) -> None:
+        self._orders: dict[frozenset[str], list[str]] = {}
+
+    def __call__(self, shape: Shape) -> list[Part]:
+        names = [shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "name"]
+        order = self._orders.setdefault(frozenset(names), names)
+        first = order is next(iter(self._orders.values()))
+        made = part(
+            [leaf for leaf in shape.leaves if leaf.path[0] == "header"], 0, "" if first or not names else order[0]
+        )
+        for leaf in shape.leaves:
+            if leaf.path[0] not in _JOINT or not leaf.count:
+                continue
+            by_name = dict(zip(names, range(leaf.count), strict=False))
+            for number, joint in enumerate(order if len(by_name) == len(names) == leaf.count else names, 1):
+                if joint in by_name:
+                    made.columns.append(_joint(leaf, by_name[joint], number, joint))
+            for index in range(len(names), leaf.count):
+                made.columns.append(_joint(leaf, index, index + 1, ""))
+        return [made]
+
+
+def _joint(leaf: Leaf, index: int, number: int, joint: str) -> Column:
+    name, quantity, unit = _JOINT[str(leaf.path[0])]
+    if _SLIDES.search(joint):  # its unit would be m; a message does not say which joints slide
+        name, unit = f"joint{{}}_{leaf.path[0]}", ""
+    return Column(name.format(number), leaf, index, _about(quantity, unit, joint=joint))
 
 
 def _transforms(shape: Shape) -> list[Part]:
@@ -239,17 +258,16 @@ def _xela(shape: Shape) -> list[Part]:
     return made
 
 
-MEANINGS = {
-    "sensor_msgs/msg/JointState": Meaning(_joints, lambda leaf: leaf.path[0] == "name"),
-    "tf2_msgs/msg/TFMessage": Meaning(_transforms, lambda leaf: leaf.kind == TEXT),
-    "tf/msg/tfMessage": Meaning(_transforms, lambda leaf: leaf.kind == TEXT),
-    "geometry_msgs/msg/TransformStamped": Meaning(_transform, lambda leaf: leaf.path == ("child_frame_id",)),
-    "tactile_msgs/msg/TactileState": Meaning(_tactile_state, lambda leaf: leaf.kind == TEXT),
-    "xela_server_ros2/msg/SensStream": Meaning(_xela),
+_MEANINGS: Mapping[str, Callable[[], Meaning]] = {
+    "sensor_msgs/msg/JointState": lambda: Meaning(_Joints(), lambda leaf: leaf.path[0] == "name"),
+    "tf2_msgs/msg/TFMessage": lambda: Meaning(_transforms, lambda leaf: leaf.kind == TEXT),
+    "tf/msg/tfMessage": lambda: Meaning(_transforms, lambda leaf: leaf.kind == TEXT),
+    "geometry_msgs/msg/TransformStamped": lambda: Meaning(_transform, lambda leaf: leaf.path == ("child_frame_id",)),
+    "tactile_msgs/msg/TactileState": lambda: Meaning(_tactile_state, lambda leaf: leaf.kind == TEXT),
+    "xela_server_ros2/msg/SensStream": lambda: Meaning(_xela),
 }
-PLAIN = Meaning(plain_parts)
 
 
 def of(name: str) -> Meaning:
-    """Return the meaning of a message type."""
-    return MEANINGS.get(name, PLAIN)
+    """Return the meaning of the messages of one topic, whose type has this name."""
+    return _MEANINGS.get(name, lambda: Meaning(plain_parts))()

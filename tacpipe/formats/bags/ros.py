@@ -76,11 +76,12 @@ class Ros:
     name: str  # of the message type
     types: Types
     cdr: bool
+    _meaning: meanings.Meaning | None = None
     _shapes: dict[bytes, list[Shape]] = field(default_factory=dict)  # by the first bytes, which say the byte order
 
-    def blocks(self, messages: Sequence[bytes | memoryview]) -> Iterator[Block]:
+    def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages, those of one shape together; raises `TopicError` where they are not of the type."""
-        meaning = meanings.of(self.name)
+        self._meaning = meaning = self._meaning or meanings.of(self.name)
         marks = np.array([bytes(one[:2]) for one in messages] if self.cdr else [b""] * len(messages))
         try:
             for mark in np.unique(marks):

@@ -38,7 +38,7 @@ class Block:
 class Decoder(Protocol):
     """What turns the messages of a topic into columns."""
 
-    def blocks(self, messages: Sequence[bytes | memoryview]) -> Iterator[Block]:
+    def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages; raises `TopicError` where they cannot be decoded."""
 
 
@@ -57,7 +57,7 @@ class Topic:
 
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder
-        self._messages: list[bytes | memoryview] = []
+        self._messages: list[bytes] = []
         self._log_ns: list[int] = []
         self._publish_ns: list[int] = []
         self._bytes = 0
@@ -65,7 +65,7 @@ class Topic:
         self._about: dict[str, dict[str, Mapping[str, str]]] = {}
         self.count = 0
 
-    def add(self, message: bytes | memoryview, log_ns: int, publish_ns: int) -> None:
+    def add(self, message: bytes, log_ns: int, publish_ns: int) -> None:
         """Take a message in. Raises `TopicError` where those so far cannot be decoded."""
         self._messages.append(message)
         self._log_ns.append(log_ns)

@@ -57,7 +57,7 @@ class Encoding:
 ROS1 = Encoding()
 
 
-def encoding_of(message: bytes | memoryview) -> Encoding:
+def encoding_of(message: bytes) -> Encoding:
     """Return how a CDR message is written. Raises `WireError` for an encapsulation that ROS 2 does not write."""
     kind = bytes(message[:2])
     if kind not in (b"\x00\x00", b"\x00\x01"):
@@ -83,9 +83,9 @@ class Shape:
         """Return a number (message,), an array of numbers (message, position), or stamps (message,) in nanoseconds."""
         order = self.encoding.order
         if leaf.kind == "stamp":
-            words = _view(matrix, leaf.offset, 2, f"{order}i4")
-            # ROS 1 has unsigned seconds, and an unset stamp of ROS 2 may be negative: both fit 32 bits until 2038
-            return words[:, 0].astype(np.int64) * 10**9 + words[:, 1].view(np.uint32).astype(np.int64)
+            # ROS 1 has unsigned seconds, an unset stamp of ROS 2 may be negative: both fit 32 bits until 2038
+            seconds = _view(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
+            return seconds * 10**9 + _view(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
         kind = np.dtype(f"{order}{NUMBERS[leaf.kind]}")
         values = _view(matrix, leaf.offset, 1 if leaf.count is None else leaf.count, kind)
         values = values.astype(kind.newbyteorder("="), copy=False)
@@ -100,14 +100,15 @@ def _view(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) -> npt.N
 
 
 def shapes(
-    messages: Sequence[bytes | memoryview], types: Types, name: str, encoding: Encoding, known: list[Shape]
+    messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, known: list[Shape]
 ) -> Iterator[tuple[Shape, npt.NDArray[np.int64], Matrix]]:
     """Yield the messages of each shape: the shape, which messages (message,), and their bytes (message, byte).
 
     ``known`` are shapes of messages before; new ones are added. Raises `WireError` where a message is not of its type.
     """
     sizes = np.fromiter(map(len, messages), np.int64, len(messages))
-    for size in np.unique(sizes):
+    different, first = np.unique(sizes, return_index=True)
+    for size in different[np.argsort(first)]:
         rows = np.flatnonzero(sizes == size)
         content = messages[int(rows[0])] if len(rows) == 1 else b"".join([messages[row] for row in rows.tolist()])
         matrix = np.frombuffer(content, np.uint8).reshape(len(rows), int(size))
