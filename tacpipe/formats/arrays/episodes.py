@@ -103,6 +103,8 @@ def _of(labels: Any, name: str) -> Mapping[str, Any]:
 
 
 def _checked(tree: Tree, array: Array) -> AnyArray:
+    if array.problem:
+        raise TacpipeError(f"{tree.path}: {array.path} {array.problem}.")
     if len(array.shape) != 1 or array.dtype.kind not in "iu":
         raise TacpipeError(
             f"{tree.path}: {array.path} must be whole numbers, one a recording; it has the shape {array.shape}."

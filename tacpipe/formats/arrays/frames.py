@@ -7,7 +7,7 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray
 from tacpipe.formats.arrays.tree import Array, Tree
 
-NAME = "frame"  # of the column
+NAME = "data"  # of the column, as messages of images have it
 MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # how pictures begin
 
 

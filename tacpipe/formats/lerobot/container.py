@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays import known
+from tacpipe.formats.arrays.frames import NAME as PICTURE
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
@@ -167,7 +168,7 @@ class LeRobotContainer:
         self, episode: Episode, feature: Feature, values: pa.ChunkedArray
     ) -> list[tuple[pa.Field, pa.Array | pa.ChunkedArray]]:
         if feature.dtype == "image":
-            return [(pa.field("frame", pa.binary(), metadata={"quantity": "image"}), _pictures(values))]
+            return [(pa.field(PICTURE, pa.binary(), metadata={"quantity": "image"}), _pictures(values))]
         last = feature.key.rpartition(".")[2]
         about = known.meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
         names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])

@@ -68,8 +68,8 @@ def test_frames_of_aloha_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
     time = { rate_hz = 50 }
     """
     (found,) = read(tmp_path, given(layout)).values()
-    assert found.streams["camera"].column("frame").to_pylist() == files.pictures(8)
-    assert about(found.streams["camera"], "frame") == {"quantity": "image", "encoding": "jpeg"}
+    assert found.streams["camera"].column("data").to_pylist() == files.pictures(8)
+    assert about(found.streams["camera"], "data") == {"quantity": "image", "encoding": "jpeg"}
     assert about(found.streams["arms"], "qpos_5") == {"quantity": "joint_position", "unit": "rad"}
     assert about(found.streams["arms"], "qpos_6") == {"quantity": "state", "unit": "1"}
     assert found.streams["arms"].column("t_ns").to_pylist()[1] == 20_000_000
@@ -89,7 +89,7 @@ def test_frames_of_their_own_length_are_kept(tmp_path: Path) -> None:
         for row, frame in enumerate(files.pictures(3)):
             made[row] = np.frombuffer(frame, np.uint8)
     (found,) = read(tmp_path).values()
-    assert found.streams["cam"].column("frame").to_pylist() == files.pictures(3)
+    assert found.streams["cam"].column("data").to_pylist() == files.pictures(3)
     assert found.streams["cam"].column("t_ns").to_pylist() == [files.START_NS + row for row in range(3)]
 
 

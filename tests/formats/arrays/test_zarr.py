@@ -102,7 +102,8 @@ def test_a_zip_file_that_was_cut_is_one_sentence(tmp_path: Path, part: float) ->
     [
         ("data/robot0_eef_pos/0.0", b"\x02\x01", ("data/robot0_eef_pos", "rows 1 to 30")),
         ("data/robot0_eef_pos/.zarray", b"{", ("data/robot0_eef_pos/.zarray",)),
-        ("meta/episode_ends/.zarray", b'{"shape": [3, 1], "dtype": "<i8"}', ("meta/episode_ends",)),
+        ("meta/episode_ends/.zarray", b'{"shape": [3], "dtype": "<i8"}', ("meta/episode_ends", "chunks")),
+        ("meta/episode_ends/.zarray", b'{"shape": [3, 1], "chunks": [3, 1], "dtype": "<i8"}', ("meta/episode_ends",)),
     ],
 )
 def test_damage_is_one_sentence_with_its_place(
@@ -171,7 +172,7 @@ def test_an_episode_that_is_added_costs_itself_and_the_one_in_its_first_chunk(
     shutil.rmtree(stores.folder / "stores" / "replay.zarr")
     files.replay(stores.folder / "stores" / "replay.zarr", ends=ends)
     counts(stores)
-    group = open_group(str(stores.folder / "stores" / "replay.zarr"), mode="a")
+    group: Any = open_group(str(stores.folder / "stores" / "replay.zarr"), mode="a")
     for name in ("data/robot0_eef_pos", "data/robot0_gripper_width"):
         array = group[name]
         array.append(np.ones((20, array.shape[1]), np.float32))

@@ -111,7 +111,7 @@ def test_images_in_the_frames_are_kept_as_they_were_encoded(tmp_path: Path) -> N
     table = files.frames(0).append_column("observation.images.top", structs)
     pq.write_table(table, tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet")
     (found,) = read(tmp_path).values()
-    assert found.streams["top"].column("frame").to_pylist() == pictures
+    assert found.streams["top"].column("data").to_pylist() == pictures
 
 
 def test_a_layout_renames_and_adds_what_the_dataset_does_not_state(tmp_path: Path) -> None:
