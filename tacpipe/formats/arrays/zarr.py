@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import itertools
 import json
 import math
+import multiprocessing
 import os
 import re
 import zipfile
@@ -72,8 +74,7 @@ class ZarrTree:
 
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """Return the rows of an array. Raises `TacpipeError` for what is damaged, and for a chunk that is not there."""
-        import zarr
-
+        zarr = _library()
         stop = min(stop, array.shape[0]) if array.shape else 1
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
         chunks = self.chunks(array, start, stop)
@@ -175,8 +176,7 @@ class ZarrTree:
 
     @contextlib.contextmanager
     def _store(self) -> Iterator[Any]:
-        from zarr import storage
-
+        storage = _library().storage
         if self.names is None:
             yield storage.LocalStore(self.path, read_only=True)
             return
@@ -214,6 +214,26 @@ def opened(path: Path) -> Iterator[ZarrTree]:
     if not found.is_group(""):
         raise TacpipeError(f"{path} is not a Zarr group: it has no .zgroup or zarr.json of one at its top.")
     yield found
+
+
+@functools.cache
+def _library() -> Any:
+    """Return the library zarr.
+
+    Its codecs have a lock between processes, which is made here as for processes that are forked: it has no name in the
+    system then. A worker of ours ends at once, and would leave the name behind, which Python complains about.
+    """
+    import zarr
+    import zarr.storage
+    from numcodecs import blosc
+
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("fork", force=True)
+    try:
+        blosc.get_mutex()
+    finally:
+        multiprocessing.set_start_method(before, force=True)
+    return zarr
 
 
 @contextlib.contextmanager

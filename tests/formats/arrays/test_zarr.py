@@ -17,6 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats import zarr
 from tacpipe.plugins.stage import RecordingOutput
 from tests.conftest import Lab
+from tests.conftest import tacpipe as in_a_process
 from tests.formats.arrays import files
 
 LAYOUT = '[streams.hand]\nsource = "data"\ntime = { rate_hz = 60 }'
@@ -178,6 +179,12 @@ def test_an_episode_that_is_added_costs_itself_and_the_one_in_its_first_chunk(
         array.append(np.ones((20, array.shape[1]), np.float32))
     group["meta/episode_ends"].append(np.array([ends[-1] + 20]))
     assert counts(stores, "--replace") == cost
+
+
+@pytest.mark.long
+def test_workers_leave_nothing_behind_that_python_complains_about(stores: Lab) -> None:
+    done = in_a_process(stores.folder, f"{INGEST} --jobs 2")
+    assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
 
 
 def test_a_missing_chunk_ends_with_one_and_the_others_are_read_with_skip_bad(stores: Lab) -> None:
