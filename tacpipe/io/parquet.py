@@ -45,7 +45,9 @@ def to_parquet(table: pa.Table) -> bytes:
     held = _held_share(table) > HELD_SHARE
     encoding, compression_level = {}, {}
     compression = dict.fromkeys(table.column_names, "zstd")
-    value_bytes = max([_mean_bytes(table.column(field.name)) for field in table.schema if _holds_bytes(field)], default=0)
+    value_bytes = max(
+        [_mean_bytes(table.column(field.name)) for field in table.schema if _holds_bytes(field)], default=0
+    )
     for field in table.schema:
         if _holds_bytes(field) and _compressed_already(table.column(field.name)):
             compression[field.name] = "none"

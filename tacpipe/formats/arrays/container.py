@@ -36,6 +36,12 @@ class ArrayContainer:
         with self.open_tree() as tree:
             return [one.name for one in episodes.found(tree) if one.name is not None]
 
+    @property
+    def names_itself(self) -> bool:
+        """Whether the file states the names of its recordings."""
+        with self.open_tree() as tree:
+            return all(one.stated for one in episodes.found(tree))
+
     def look(self, episode: str | None) -> Contents:
         """Return the streams of a recording with their first rows."""
         with self.open_tree() as tree:

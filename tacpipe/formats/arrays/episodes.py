@@ -34,6 +34,7 @@ class Episode:
     total: int = 0  # rows of all of them
     beside: str | None = None  # the group of the array that says where they end
     labels: Mapping[str, Any] = field(default_factory=dict)
+    stated: bool = False  # whether its name is one that the file states
 
     def inside(self, path: str) -> str:
         """Return the path of a group or an array within the recording's group."""
@@ -86,12 +87,13 @@ def _cut(tree: Tree) -> list[Episode]:
         if array is not None:
             ends = [int(end) for end in _checked(tree, array)]
             about = tree.attributes(group)
-            names = about.get(NAMES)
+            names, stated = about.get(NAMES), True
             if not isinstance(names, list) or len({str(one) for one in names}) != len(ends):
                 names = [f"episode_{number:06d}" for number in range(len(ends))]  # as LeRobot counts them
+                stated = False
             labels = about.get(LABELS)
             return [
-                Episode(str(name), "", start, stop, number, len(ends), ends[-1], group, _of(labels, str(name)))
+                Episode(str(name), "", start, stop, number, len(ends), ends[-1], group, _of(labels, str(name)), stated)
                 for number, (name, start, stop) in enumerate(zip(names, [0, *ends], ends, strict=False))
             ]
     return []

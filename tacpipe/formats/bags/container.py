@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags import bag_file, json_messages, mcap_file, ros, sqlite_file
+from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, ros, sqlite_file
+from tacpipe.formats.bags.own import Own
 from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
 from tacpipe.formats.bags.topics import Decoder, Topic, TopicError
 from tacpipe.formats.containers import kinds
@@ -129,6 +131,7 @@ class _Reading:
     types: dict[str, str] = field(default_factory=dict)  # of each topic
     skipped: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Attribute] = field(default_factory=dict)
+    own: dict[str, Own] = field(default_factory=dict)  # topics that tacpipe itself exported
     notes: list[str] = field(default_factory=list)
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
 
@@ -148,6 +151,10 @@ class _Reading:
 
     def _channel(self, channel: Channel, file: int) -> None:
         topic = channel.topic
+        if (found := own.described(channel.metadata)) is not None:
+            if found.derived:
+                return
+            self.own[topic] = found
         if self.sources is not None and all(one.split(OF)[0] != topic for one in self.sources):
             return
         self._channels[file, channel.number] = topic
@@ -178,6 +185,9 @@ class _Reading:
             if found.values.get("ros_distro"):
                 self.attributes["ros_distro"] = found.values["ros_distro"]
             return
+        if found.name == own.KEY:
+            self.attributes |= own.attributes(found.values)
+            return
         from tacpipe.formats.table.labels import plain_value
 
         for name, value in found.values.items():
@@ -189,7 +199,7 @@ class _Reading:
 
     def contents(self) -> Contents:
         """Return what was read."""
-        found: dict[tuple[str, str], SourceStream] = {}
+        found: list[tuple[Own | None, SourceStream]] = []
         for topic, reading in list(self.topics.items()):
             if not reading.count:
                 continue
@@ -204,13 +214,18 @@ class _Reading:
                 source = f"{topic}{OF}{one.suffix}" if one.suffix else topic
                 if self.sources is not None and source not in self.sources:
                     continue
-                found[topic, one.suffix] = SourceStream(source, "", one.time, one.table, one.table.num_rows)
+                before = self.own.get(topic)
+                name = before.stream if before is not None and before.stream else source
+                found.append((before, SourceStream(source, name, one.time, one.table, one.table.num_rows)))
                 if one.note:
                     self.notes.append(f"{plain(source)}: {one.note}; its log times are used.")
         if not found and not self.skipped:
             self.skipped = dict.fromkeys(self.topics, "it has no messages")
-        names = kinds.identifiers([one.source for one in found.values()])
-        streams = [SourceStream(one.source, names[one.source], one.time, one.table, one.rows) for one in found.values()]
+        streams = [stream if before is None else own.restored(stream, before) for before, stream in found]
+        known = Counter(stream.name for stream in streams)
+        streams = [stream if known[stream.name] == 1 else replace(stream, name=stream.source) for stream in streams]
+        names = kinds.identifiers([stream.name for stream in streams])
+        streams = [replace(stream, name=names[stream.name]) for stream in streams]
         return Contents(streams, self.attributes, self.skipped, self.notes)
 
 

@@ -138,6 +138,8 @@ def is_bytes(leaf: Leaf) -> bool:
     """Return whether an array is bytes, as those of an image, rather than channels."""
     if leaf.kind not in ("uint8", "byte", "char", "int8") or leaf.count is None:
         return False
+    if leaf.within[-1][1].startswith("tacpipe_msgs/"):  # what an export writes has no other arrays
+        return True
     arrays = "MultiArray" in leaf.within[-1][1]
     return leaf.count > MOST_COLUMNS or (not arrays and leaf.path[-1] == "data")
 

@@ -255,3 +255,33 @@ def test_what_is_not_an_mcap_file_is_refused_in_one_sentence(tmp_path: Path) -> 
         path.write_bytes(content)
         with pytest.raises(TacpipeError, match=r"a\.mcap"):
             opened(path).read(None, None)
+
+
+def test_a_file_that_tacpipe_exported_comes_back_with_its_names_and_metadata(tmp_path: Path) -> None:
+    definition = "std_msgs/Header header\nuint16 force_x\nuint8[] frame\n" + "=" * 80 + "\nMSG: std_msgs/Header\n"
+    definition += "builtin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80 + "\nMSG: builtin_interfaces/Time\n"
+    definition += "int32 sec\nuint32 nanosec\n"
+    columns = [
+        {"field": "force_x", "name": "Force X", "about": {"unit": "count", "quantity": "tactile"}},
+        {"field": "frame", "name": "frame", "about": {}},
+    ]
+    own = {"tacpipe": json.dumps({"stream": "skin", "columns": columns, "time": {"unit": "ns", "quantity": "time"}})}
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        writer.add_metadata("tacpipe", {"recording": "a", "attributes": '{"material": "cork", "n": 3}'})
+        schema = writer.register_schema("tacpipe_msgs/msg/Skin", "ros2msg", definition.encode())
+        channel = writer.register_channel("/skin_x", "cdr", schema, own)
+        derived = writer.register_channel("/skin_x/pose", "cdr", schema, {"tacpipe": '{"derived_from": "/skin_x"}'})
+        seconds = (START_NS // 10**9).to_bytes(4, "little")
+        content = b"\0\1\0\0" + seconds + bytes(4) + b"\1\0\0\0\0\0" + (7).to_bytes(2, "little") + b"\2\0\0\0ab"
+        for one in (channel, derived):
+            writer.add_message(one, START_NS, content, START_NS)
+        writer.finish()  # type: ignore[no-untyped-call]
+    contents = read(path)
+    (stream,) = contents.streams
+    assert stream.name == "skin"
+    assert stream.table.to_pylist() == [{"t_header_ns": START_NS, "Force X": 7, "frame": b"ab"}]
+    assert stream.table.schema.field("Force X").metadata == {b"unit": b"count", b"quantity": b"tactile"}
+    assert contents.attributes == {"material": "cork", "n": 3}
