@@ -1,4 +1,4 @@
-"""Read HDF5 files: robomimic's, ALOHA's, and groups of arrays of one length.
+"""Read HDF5 files of robomimic, ALOHA or a lab's own.
 
 Each group of arrays of one length is a stream, with the stamps that lie beside them or a rate that an attribute states.
 
@@ -32,7 +32,7 @@ def opened(path: Path) -> ArrayContainer:
 
 @stage(version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess)
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
-    """Read HDF5 files: robomimic's, ALOHA's, and groups of arrays of one length.
+    """Read HDF5 files of robomimic, ALOHA or a lab's own.
 
     A group such as demo_0 is a recording, else the file is one. A group of arrays of one length is a stream, with the stamps
     that lie next to them or a rate that an attribute states. ``--guess`` prints what the files declare as a layout file,

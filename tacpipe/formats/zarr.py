@@ -1,4 +1,4 @@
-"""Read Zarr stores: replay buffers of UMI and diffusion policy, and groups of arrays of one length.
+"""Read Zarr stores, as replay buffers of UMI.
 
 Example: tacpipe ingest zarr replay.zarr.zip --layout layout.toml -o data/recordings
 """
@@ -45,7 +45,7 @@ def preview(params: Params, source: Path) -> str:
 
 @stage(version=1, discover=COMMAND.discover, preview=preview, guess=COMMAND.guess)
 def zarr(params: Params, files: Files, values: Values) -> RecordingOutput:
-    """Read Zarr stores: replay buffers of UMI and diffusion policy, and groups of arrays of one length.
+    """Read Zarr stores, as replay buffers of UMI.
 
     Folders and .zarr.zip files, format 2 and 3. Where meta/episode_ends cuts the arrays into episodes each is a recording,
     else the store is one. The rate, which replay buffers do not hold, comes from a layout file; ``--guess`` prints one.
