@@ -83,6 +83,9 @@ LACK = {  # and for each that does need one, with that extra
     "ingest zarr stores --layout rate.toml --dry-run": "zarr",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
+    "ingest mcap bags -o {o}": "ros",
+    "ingest rosbag bags -o {o}": "ros",
+    "ingest rosbag bags --guess": "ros",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
@@ -140,6 +143,8 @@ def prepare(folder: Path) -> None:
     array_files.replay(folder / "stores" / "replay.zarr")
     (folder / "rate.toml").write_text('[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n')
     lerobot_files.write_v2(folder / "sets" / "pick", episodes=1)
+    (folder / "bags").mkdir()
+    (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
 
