@@ -41,8 +41,8 @@ from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xela_files
 from tests.formats.arrays import files as array_files
-from tests.formats.lerobot import files as lerobot_files
 from tests.formats.bags import writers
+from tests.formats.lerobot import files as lerobot_files
 from tests.promises import decoding
 from tests.sensors.test_every_sensor import CASES
 
