@@ -11,16 +11,18 @@ from typing import Any
 
 import pyarrow as pa
 
+from tacpipe.arrays import AnyArray
 from tacpipe.formats.arrays import columns, episodes, frames, known, parts, times
 from tacpipe.formats.arrays.episodes import Episode
 from tacpipe.formats.arrays.parts import Part
-from tacpipe.formats.arrays.tree import LONGEST_TEXT, Tree, plain_attributes
+from tacpipe.formats.arrays.tree import LONGEST_TEXT, Tree, is_text, plain_attributes
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, Share, SourceStream
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
 ROWS = 3  # that a look reads
+MASK = "mask"  # the group of robomimic's lists
 DEPTH = 4  # of texts of JSON in attributes
 
 
@@ -83,7 +85,7 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
         row = episode.number if one.shape else 0
         name = one.name if one.group == episode.beside else episode.inside(one.path).replace("/", ".")
         attributes |= plain_attributes({name: tree.read(one, row, row + 1)})
-    attributes |= plain_attributes(episode.labels)
+    attributes |= {**plain_attributes(episode.labels), **_masks(tree, episode)}
     skipped |= long
     kept = []
     for part in found.parts:
@@ -110,6 +112,18 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
         for part, time in chosen
     ]
     return Contents(streams, attributes, skipped, tree.notes)
+
+
+def _masks(tree: Tree, episode: Episode) -> dict[str, Attribute]:
+    """Return in which lists of recordings (``mask/train``, ``mask/valid`` of robomimic) one is, by name."""
+    if not episode.group or not tree.is_group(MASK):
+        return {}
+    lists = [one for one in tree.members(MASK)[0] if is_text(one) and len(one.shape) == 1]
+    return {f"{MASK}.{one.name}": episode.name in _texts(tree.read(one, 0, one.shape[0])) for one in lists}
+
+
+def _texts(values: AnyArray) -> set[str]:
+    return {one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in values.tolist()}
 
 
 def _names(found: Sequence[Part]) -> dict[str, str]:

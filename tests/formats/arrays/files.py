@@ -27,6 +27,7 @@ def robomimic(path: Path, demos: int = 3, rate_hz: int | None = RATE_HZ) -> None
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs["env_args"] = json.dumps(environment)
+        file["mask/train"] = np.array([f"demo_{number}" for number in range(0, demos, 2)], dtype="S")
         for number in range(demos):
             rows, demo = 10 + number, data.create_group(f"demo_{number}")
             demo.attrs["num_samples"] = rows

@@ -47,6 +47,7 @@ def test_each_demonstration_of_robomimic_is_a_recording_at_the_rate_of_its_contr
     assert "unit" not in about(obs, "robot0_gripper_qpos_0")
     assert found["lift-demo_10"].attributes["env_args.env_name"] == "Lift"
     assert found["lift-demo_10"].attributes["num_samples"] == 20
+    assert [found[f"lift-demo_{number}"].attributes["mask.train"] for number in (9, 10)] == [False, True]
 
 
 def test_what_is_left_out_is_named_with_its_reason(tmp_path: Path) -> None:
