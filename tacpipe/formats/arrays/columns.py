@@ -11,22 +11,44 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray
 from tacpipe.formats.arrays import frames, known
 from tacpipe.formats.arrays.known import Meaning
-from tacpipe.formats.arrays.tree import Array, is_frames, is_text
+from tacpipe.formats.arrays.tree import Array, Tree, is_frames, is_text
+from tacpipe.io import memory
+from tacpipe.printable import plain
 
 AXES = ("x", "y", "z")
+BLOCK_BYTES = 1 << 20  # that are transposed at once
 
 
-def of(array: Array, values: AnyArray, meanings: list[Meaning] | None = None) -> Iterator[tuple[pa.Field, pa.Array]]:
-    """Yield field and values of each column of an array, of which ``values`` are the rows that were read.
+def of(
+    tree: Tree, array: Array, start: int, stop: int, meanings: list[Meaning] | None = None
+) -> Iterator[tuple[pa.Field, pa.Array]]:
+    """Yield field and values of each column of an array, the rows from ``start`` up to ``stop``.
 
     An array (time,) or (time, 1) is a column NAME, one (time, n) is n columns NAME_0, NAME_1, …, or NAME_x, … of a vector
     whose components are known; more dimensions have an index each. A compound array has a column a field.
     ``meanings`` replaces what names show.
     """
     if array.dtype.names is not None:
-        yield from _compound("", values, array)
+        yield from _compound("", tree.read(array, start, stop), array)
         return
-    yield from _columns(array.name, values, array, array.path, meanings)
+    flat = transposed(tree, array, start, stop)
+    yield from _columns(array.name, flat, array.shape[1:], array, array.path, meanings)
+
+
+def transposed(tree: Tree, array: Array, start: int, stop: int) -> AnyArray:
+    """Return the rows of an array as (value, row): in blocks that a processor's cache holds, of whole chunks."""
+    width = int(np.prod(array.shape[1:], dtype=np.int64))
+    if width == 1 or array.dtype.hasobject:
+        values = tree.read(array, start, stop)
+        return values.reshape(len(values), width).T
+    memory.require(array.row_bytes * (stop - start), f"{tree.path}, {plain(array.path, 200)},")
+    found = np.empty((width, stop - start), array.dtype.newbyteorder("="))
+    rows = max(1, BLOCK_BYTES // array.row_bytes)
+    rows = -(-rows // array.chunk_rows) * array.chunk_rows if array.chunk_rows else rows
+    for begin in range(start // rows * rows, stop, rows):
+        first, last = max(begin, start), min(begin + rows, stop)
+        found[:, first - start : last - start] = tree.read(array, first, last).reshape(last - first, width).T
+    return found
 
 
 def _compound(before: str, values: AnyArray, array: Array) -> Iterator[tuple[pa.Field, pa.Array]]:
@@ -35,23 +57,24 @@ def _compound(before: str, values: AnyArray, array: Array) -> Iterator[tuple[pa.
         if inner.dtype.names is not None:
             yield from _compound(f"{before}{name}.", inner, array)
         else:
-            yield from _columns(f"{before}{name}", inner, array, f"{array.path}/{before}{name}", None)
+            flat = inner.reshape(len(inner), -1).T if inner.size else inner.reshape(int(np.prod(inner.shape[1:])), 0)
+            yield from _columns(f"{before}{name}", flat, inner.shape[1:], array, f"{array.path}/{before}{name}", None)
 
 
 def _columns(
-    name: str, values: AnyArray, array: Array, path: str, meanings: list[Meaning] | None
+    name: str, flat: AnyArray, shape: tuple[int, ...], array: Array, path: str, meanings: list[Meaning] | None
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
-    shape = values.shape[1:]
-    width = int(np.prod(shape, dtype=np.int64))
+    """Yield the columns of values (value, row) that have this shape in a row."""
+    width = len(flat)
     stated = known.declared(array.attributes)
-    about = meanings or known.meanings(path, width, values.dtype.kind in "iub")
+    about = meanings or known.meanings(path, width, flat.dtype.kind in "iub")
     if width == 1 and about == [known.NOTHING]:
-        about = [known.of_name(name, values.dtype.name)]
+        about = [known.of_name(name, flat.dtype.name)]
     if "quantity" in stated:  # then what is not stated is not so
         about = [known.NOTHING] * width
     components = [one.component for one in about]
     names, units = known.listed(array.attributes, "columns", width), known.listed(array.attributes, "units", width)
-    flat = _native(values.reshape(len(values), width), array).T
+    flat = _native(flat, array)
     for position, at in enumerate(np.ndindex(*shape)):
         one = about[position]
         metadata = {"quantity": one.quantity, "unit": one.unit, "component": one.component} | stated

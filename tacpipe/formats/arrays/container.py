@@ -144,12 +144,11 @@ def _table(tree: Tree, episode: Episode, part: Part, most: int | None) -> pa.Tab
     values: list[pa.Array] = []
     is_aloha = tree.is_group(f"{episode.group}/observations".strip("/"))
     for array in part.all:
-        read = tree.read(array, start, stop)
         if part.frames and array is not part.time:
-            made = [frames.of(array, read)]
+            made = [frames.of(array, tree.read(array, start, stop))]
         else:
             about = known.aloha(array.name, array.shape[-1]) if is_aloha and len(array.shape) == 2 else None
-            made = list(columns.of(array, read, about))
+            made = list(columns.of(tree, array, start, stop, about))
         fields += [field for field, _ in made]
         values += [column for _, column in made]
     return pa.table(values, pa.schema(fields))

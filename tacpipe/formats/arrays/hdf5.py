@@ -229,7 +229,8 @@ def _member(group: h5py.Group, name: str, path: str) -> Array | str:
         problem = "has its values in another file, which is not read"
     elif found.shape is None:
         problem = "holds nothing"
-    return Array(path, found.shape or (), found.dtype, _attributes(found), problem)
+    chunk_rows = found.chunks[0] if found.chunks else 0
+    return Array(path, found.shape or (), found.dtype, _attributes(found), chunk_rows, problem)
 
 
 def _address(group: h5py.Group) -> Any:

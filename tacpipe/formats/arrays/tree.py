@@ -28,6 +28,7 @@ class Array:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    chunk_rows: int = 0  # rows of a chunk, 0 where the file has none
     problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
 
     @property

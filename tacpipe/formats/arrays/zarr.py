@@ -265,8 +265,9 @@ def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -
     except (TypeError, ValueError, LookupError, AttributeError):
         steps = []
     if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
-        problem = "has chunks of no known shape"
-    return Array(path, tuple(shape), kind, attributes, f"{problem}, which is not read" if problem else "")
+        problem, steps = "has chunks of no known shape", []
+    reason = f"{problem}, which is not read" if problem else ""
+    return Array(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
 
 
 def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
