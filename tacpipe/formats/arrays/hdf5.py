@@ -37,6 +37,8 @@ class Hdf5Tree:
 
     def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
         self.path, self._file, self._left = path, file, bytes_left
+        self._members: dict[str, tuple[list[Array], list[str]]] = {}  # of groups that were listed
+        self._stated: dict[str, dict[str, Any]] = {}  # attributes of groups
 
     @property
     def notes(self) -> list[str]:
@@ -47,6 +49,8 @@ class Hdf5Tree:
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it; a group within itself is left out."""
+        if group in self._members:
+            return self._members[group]
         arrays, below = [], []
         with self._reading(group or "its root"):
             found = self._file[group or "/"]
@@ -64,6 +68,7 @@ class Hdf5Tree:
                     arrays.append(one)
                 elif one and not again:
                     below.append(one)
+        self._members[group] = arrays, below
         return arrays, below
 
     def is_group(self, path: str) -> bool:
@@ -75,7 +80,9 @@ class Hdf5Tree:
     def attributes(self, group: str) -> Mapping[str, Any]:
         """Return the attributes of a group, but those that cannot be read."""
         with self._reading(group or "its root"):
-            return _attributes(self._file[group or "/"])
+            if group not in self._stated:
+                self._stated[group] = _attributes(self._file[group or "/"])
+            return self._stated[group]
 
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""

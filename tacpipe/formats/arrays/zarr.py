@@ -19,7 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ class ZarrTree:
     path: Path
     names: frozenset[str] | None
     notes: Sequence[str] = ()
+    _found: dict[str, tuple[dict[str, Any], dict[str, Any]] | None] = field(default_factory=dict)  # metadata by path
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it, sorted."""
@@ -144,6 +145,11 @@ class ZarrTree:
 
     def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
         """Return metadata and attributes of a group or an array; None where there is neither."""
+        if path not in self._found:
+            self._found[path] = self._looked_up(path)
+        return self._found[path]
+
+    def _looked_up(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
         for mark in MARKS:
             name = f"{path}/{mark}" if path else mark
             if self._has(name):
