@@ -55,7 +55,7 @@ _VECTORS: Sequence[tuple[str, int, Sequence[Meaning]]] = (  # a name, a width, a
 )
 _ANY_WIDTH: Sequence[tuple[str, Meaning]] = (  # a name, whatever its width
     (rf"{_ANY}gripper[_./](?:qpos|qvel|pos|position|state|command|action)s?", Meaning("state")),
-    (rf"{_ANY}(?:joint_pos|joint_positions?|joint_angles?|qpos)", Meaning("joint_position", "rad")),
+    (rf"{_ANY}(?:joint_pos|joint_positions?|joint_angles?|joint_states?|qpos)", Meaning("joint_position", "rad")),
     (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", Meaning("joint_velocity", "rad/s")),
     (rf"{_ANY}(?:joint_torques?|tau)", Meaning("joint_torque", "N m")),
     (rf"{_ANY}(?:gripper|finger)s?[_./](?:width|opening)", Meaning("finger_width", "m")),

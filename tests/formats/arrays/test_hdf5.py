@@ -13,7 +13,9 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import hdf5
+from tacpipe.formats.table import layout, reading
 from tacpipe.formats.table.contained import Params
+from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.arrays import files
 
@@ -180,9 +182,9 @@ def test_nothing_of_another_file_is_read(tmp_path: Path) -> None:
         file.attrs["rate_hz"] = 10
         file["y"] = np.arange(4.0)
         file["linked"] = h5py.ExternalLink(str(tmp_path / "secret.bin"), "/x")
-        layout = h5py.VirtualLayout(shape=(4,), dtype="f8")
-        layout[:] = h5py.VirtualSource(str(tmp_path / "secret.bin"), "x", shape=(4,))
-        file.create_virtual_dataset("virtual", layout)
+        made = h5py.VirtualLayout(shape=(4,), dtype="f8")
+        made[:] = h5py.VirtualSource(str(tmp_path / "secret.bin"), "x", shape=(4,))
+        file.create_virtual_dataset("virtual", made)
     (found,) = read(tmp_path).values()
     assert found.streams["y"].column_names == ["t_ns", "y"]
     assert "linked" in " ".join(found.notes) and "virtual" in " ".join(found.notes)
@@ -268,3 +270,29 @@ def test_the_layout_that_a_guess_prints_reads_the_same(tmp_path: Path) -> None:
 def test_a_guess_marks_a_rate_that_no_file_states(tmp_path: Path) -> None:
     files.aloha(tmp_path / "episode_0.hdf5")
     assert 'rate_hz = "?"' in hdf5.COMMAND.guess(tmp_path)
+
+
+def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    t_ns, taxels, force = (
+        files.START_NS + np.arange(40) * 7_000_000,
+        rng.integers(0, 4096, (40, 4)),
+        rng.normal(size=40),
+    )
+    rows = [",".join(["t_ns", *(f"taxel_{at}" for at in range(4)), "fx"])]
+    rows += [
+        f"{t},{','.join(map(str, some))},{one!r}" for t, some, one in zip(t_ns, taxels, force.tolist(), strict=True)
+    ]
+    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["skin/t_ns"], file["skin/taxel"], file["skin/fx"] = t_ns, taxels.astype(np.uint16), force
+    columns = """
+    time = { column = "t_ns", unit = "ns" }
+    columns = [
+        { match = "taxel_{taxel}", quantity = "tactile", unit = "count", type = "uint16" },
+        { match = "fx", quantity = "force", unit = "N", component = "x" },
+    ]
+    """
+    text = reading.table(tmp_path / "run.csv", layout.parse(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0])
+    (found,) = read(tmp_path, given(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
+    assert to_parquet(found.streams["skin"].select(text.column_names)) == to_parquet(text)
