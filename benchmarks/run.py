@@ -31,6 +31,7 @@ MODULES = (
     "touch_training",
     "chain",
     "sizes",
+    "array_files",
 )
 RESULTS = Path(__file__).with_name("results.md")
 

@@ -25,6 +25,8 @@ from tests.clouds import shapes
 from tests.commands import run as run_all
 from tests.conftest import Lab, forget
 from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats.arrays import files as array_files
+from tests.formats.lerobot import files as lerobot_files
 from tests.promises.warm import Warm, serving
 from tests.recording.live import stream
 
@@ -44,6 +46,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "ingest vision2tactile grasps -o {o}",
     "ingest table tables --layout tables/layout.toml -o {o}",
     "ingest table tables --guess",
+    "ingest lerobot sets -o {o}",
     "version",
     "synchronize data/recordings -o {o} --rate-hz 20",
     "segment contacts data/synced -o {o} --pad-s 0.4",
@@ -75,6 +78,10 @@ LACK = {  # and for each that does need one, with that extra
     "evaluate models/forward data/latents --rerun -o {o}": "learn",
     "predict models/forward data/latents -o {o}": "learn",
     "report results/forward -o {o}.html --traces 1": "learn",
+    "ingest hdf5 arrays -o {o}": "hdf5",
+    "ingest hdf5 arrays --guess": "hdf5",
+    "ingest zarr stores --layout rate.toml -o {o}": "zarr",
+    "ingest zarr stores --layout rate.toml --dry-run": "zarr",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
     "ingest mcap bags -o {o}": "ros",
@@ -129,6 +136,12 @@ def prepare(folder: Path) -> None:
     (folder / "tables" / "a.csv").write_text("time,x\n0,1\n1,2\n")
     layout = '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "time" }\ncolumns = [{ match = "x" }]\n'
     (folder / "tables" / "layout.toml").write_text(layout)
+    for name in ("arrays", "stores"):
+        (folder / name).mkdir()
+    array_files.lab(folder / "arrays" / "run.h5")
+    array_files.replay(folder / "stores" / "replay.zarr")
+    (folder / "rate.toml").write_text('[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n')
+    lerobot_files.write_v2(folder / "sets" / "pick", episodes=1)
     (folder / "bags").mkdir()
     (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
