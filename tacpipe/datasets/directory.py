@@ -91,7 +91,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         sweep(directory, shards=bool(stale))
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
-                place(store, objects[path], directory / path, copy=manifest.recorded)
+                place(store, objects[path], directory / path, copy=manifest.copied)
         _remove(directory, gone)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))

@@ -80,7 +80,7 @@ def chosen(stream: Stream, names: Sequence[str], path: Path) -> list[Chosen]:
 
 def _field(rule: Column, name: str, values: dict[str, str]) -> pa.Field:
     made = pattern.filled(rule.name, values) if rule.name else name.strip()
-    about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values}
+    about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
     return pa.field(made, TYPES[rule.type], metadata={key: value for key, value in about.items() if value})
 
 
