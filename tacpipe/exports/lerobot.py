@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 VERSION = "v3.0"
 ORIGINALS = "tacpipe"
+RECORDING = "tacpipe.recording"  # column of the episodes
 STATS = "stats"  # table of a part
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
@@ -364,6 +365,7 @@ def _episodes(
     import pyarrow.parquet as pq
 
     order = _task_order(tasks)
+    labels = _labels(every)
     rows = []
     for episode, one in enumerate(every):
         chunk, file = places[one.name]
@@ -377,8 +379,8 @@ def _episodes(
             "dataset_to_index": starts[one.name] + lengths[one.name],
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
-            "tacpipe/recording": one.name,
-            "tacpipe/attributes": json.dumps(dict(one.attributes), sort_keys=True),
+            RECORDING: one.name,
+            **labels[one.name],
         }
         stats = _episode_stats(parts[one.name], lengths[one.name])
         stats |= _index_stats(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
@@ -387,6 +389,21 @@ def _episodes(
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
     return bytes(sink.getvalue().to_pybytes())
+
+
+def _labels(every: Sequence[Recording]) -> dict[str, dict[str, Any]]:
+    """Return the attributes of each recording for columns of one type: all text where they are of several."""
+    taken = {"tasks", "length", "episode_index", "dataset_from_index", "dataset_to_index"}
+    found: dict[str, dict[str, Any]] = {one.name: {} for one in every}
+    for name in dict.fromkeys(name for one in every for name in one.attributes):
+        values = {one.name: one.attributes.get(name) for one in every}
+        kinds = {type(value) for value in values.values() if value is not None}
+        alike = len(kinds) <= 1 or kinds == {int, float}
+        column = f"{ORIGINALS}.{name}" if name in taken or "/" in name else name
+        for recording, value in values.items() if kinds else ():
+            text = value if alike or value is None else str(value)
+            found[recording][column] = float(text) if kinds == {int, float} and text is not None else text
+    return found
 
 
 Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
