@@ -202,7 +202,10 @@ def _add_summaries(program: typer.Typer, names: dict[str, str], groups: set[str]
             program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
 
 
-ORDER = ("ingest", "simulate", "synchronize", "segment", "split", "compress", "train", "evaluate", "predict", "report", "export")
+ORDER = (
+    *("ingest", "simulate", "synchronize", "segment", "split", "compress"),
+    *("train", "evaluate", "predict", "report", "export"),
+)
 
 
 def _first(names: dict[str, str], group: str) -> str:

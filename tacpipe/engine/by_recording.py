@@ -99,7 +99,8 @@ class ByRecording:
     ) -> dict[str, Mapping[str, Any]]:
         results: dict[str, Mapping[str, Any]] = {}
         bad: dict[str, Done] = {}
-        preload = ["tacpipe.io.parquet", "tacpipe.engine.execution", registry.stages()[registry.whole(name)].partition(":")[0]]
+        module = registry.stages()[registry.whole(name)].partition(":")[0]
+        preload = ["tacpipe.io.parquet", "tacpipe.engine.execution", module]
         with progress.bar(registry.whole(name), len(tasks)) as advance:
             for done in executors.run(execution.compute, tasks, self.request.jobs, preload):
                 advance(note=done.recording)
@@ -131,7 +132,8 @@ class ByRecording:
         advice = "fix these." if others else "fix these, or leave them out with --skip-bad."
         raise error(
             max(done.exit_code for done in bad.values()),
-            f"{registry.whole(name)} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; {advice}",
+            f"{registry.whole(name)} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; "
+            f"{advice}",
         )
 
 

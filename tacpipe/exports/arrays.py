@@ -1,4 +1,4 @@
-"""Synchronized recordings as arrays (frame, channel), one a stream and quantity, as replay buffers and robomimic have them."""
+"""Synchronized recordings as arrays (frame, channel), one a stream and quantity, as replay buffers have them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.arrays import AnyArray
+from tacpipe.channels.masks import GRID
 from tacpipe.channels.streams import TRUTH
 from tacpipe.exports import frames
 from tacpipe.exports.contents import TIME
@@ -58,8 +59,8 @@ def losses(recording: Recording) -> Iterator[str]:
     for one in frames.channels(table):
         if one.type == "string":
             yield f"column {one.name}: arrays hold numbers"
-    if recording.attributes[frames.GRID] != "uniform":
-        yield f"one distance between frames: the grid is {recording.attributes[frames.GRID]}; {TIME} has the times"
+    if recording.attributes[GRID] != "uniform":
+        yield f"one distance between frames: the grid is {recording.attributes[GRID]}; {TIME} has the times"
 
 
 def _name(one: frames.Channel) -> str:

@@ -1,8 +1,8 @@
 """Write a dataset card: Parquet files that any tool opens, a README.md and Croissant metadata.
 
 The folder can be uploaded as it is: ``README.md`` is a card of the Hugging Face Hub with one configuration a stream,
-``croissant.json`` describes the columns. ``data/STREAM/RECORDING.parquet`` has the rows with native rates and types and a column
-``recording``, ``labels.parquet`` a row a recording.
+``croissant.json`` describes the columns. ``data/STREAM/RECORDING.parquet`` has the rows with native rates and types and a
+column ``recording``, ``labels.parquet`` a row a recording.
 
 Example: tacpipe export card data/recordings -o exports/card --license cc-by-4.0 --title "Slides over twenty materials"
 """
@@ -52,7 +52,9 @@ def part(params: Params, recording: Recording, name: Name) -> Result:
     """Return the Parquet files of one recording, with its name in each row."""
     from tacpipe.io.parquet import to_parquet
 
-    files = {f"data/{shown(one)}/{name}.parquet": to_parquet(_named(recording.table(one), name)) for one in recording.streams}
+    files = {
+        f"data/{shown(one)}/{name}.parquet": to_parquet(_named(recording.table(one), name)) for one in recording.streams
+    }
     return Result({"": RecordingOutput(contents.part(recording))}, files)
 
 
@@ -81,8 +83,8 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
         f"{LABELS}.parquet": _labels(recordings),
     }
     differing = [
-        f"not alike: stream {shown(one.name)} has other columns in {len(one.others)} recordings than in the first one, so readers "
-        f"of all files at once need to unite schemas"
+        f"not alike: stream {shown(one.name)} has other columns in {len(one.others)} recordings than in the first one, so "
+        f"readers of all files at once need to unite schemas"
         for one in found.streams.values()
         if one.others
     ]
@@ -113,7 +115,13 @@ def _labels(recordings: Dataset) -> bytes:
 
 def _readme(params: Params, recordings: Dataset, found: Contents, patterns: dict[str, str]) -> bytes:
     front = "\n".join(["---", *_front(params, patterns), "---"])
-    parts = [front, f"# {plain(params.title, 200)}", params.description, _opening(found), *readme.sections(recordings, found)]
+    parts = [
+        front,
+        f"# {plain(params.title, 200)}",
+        params.description,
+        _opening(found),
+        *readme.sections(recordings, found),
+    ]
     return "\n\n".join(filter(None, parts)).encode() + b"\n"
 
 

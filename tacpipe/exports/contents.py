@@ -53,6 +53,7 @@ class Stream:
     rows: int
     rates_hz: Sequence[float]  # lowest and highest; empty without stamps
     others: Sequence[str] = ()  # recordings in which it has other columns
+    shared: Sequence[str] = ()  # columns that it has in all of its recordings, of one type
     nan: bool = False  # whether a float is NaN somewhere
 
 
@@ -114,12 +115,15 @@ def of_parts(parts: Dataset) -> Contents:
         for row in one.table(STREAMS).to_pylist():
             name = row["stream"]
             mine = columns.setdefault(name, known[key][name])
-            kept = found.setdefault(name, {"recordings": [], "rows": 0, "rates": [], "others": [], "nan": False})
+            kept = found.setdefault(name, {**_none(), "shared": mine})
             kept["recordings"].append(one.name)
             kept["rows"] += row["rows"]
             kept["nan"] |= row["nan"]
             kept["rates"] += [row["rate_hz"]] if row["rate_hz"] else []
-            kept["others"] += [one.name] if known[key][name] != mine else []
+            if known[key][name] != mine:
+                kept["others"].append(one.name)
+                alike = {(column.name, column.type) for column in known[key][name]}
+                kept["shared"] = [column for column in kept["shared"] if (column.name, column.type) in alike]
         stamps = [row for row in one.table(STREAMS).to_pylist() if row["first_ns"] is not None]
         if stamps:
             starts.append(min(row["first_ns"] for row in stamps))
@@ -134,11 +138,16 @@ def of_parts(parts: Dataset) -> Contents:
             kept["rows"],
             [min(kept["rates"]), max(kept["rates"])] if kept["rates"] else [],
             kept["others"],
+            [column.name for column in kept["shared"]],
             kept["nan"],
         )
         for name, kept in sorted(found.items())
     }
     return Contents(made, seconds, min(starts, default=None), losses)
+
+
+def _none() -> dict[str, Any]:
+    return {"recordings": [], "rows": 0, "rates": [], "others": [], "nan": False}
 
 
 def about(field: pa.Field) -> dict[str, str]:

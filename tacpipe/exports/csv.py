@@ -30,8 +30,8 @@ LAYOUT, LABELS = "layout.toml", "labels.json"
 TYPES = {"float": "float32", "double": "float64", "string": "text"}  # of arrow, where the layout's name differs
 READ = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float", "double", "bool", "string")
 _OPENING = f"""
-One CSV file a stream, in a folder a recording. `{TIME}` is the time in nanoseconds of UTC. tacpipe reads them back with types, units
-and labels:
+One CSV file a stream, in a folder a recording. `{TIME}` is the time in nanoseconds of UTC. tacpipe reads them back with
+types, units and labels:
 
 ```sh
 tacpipe ingest table EXPORT --layout EXPORT/{LAYOUT} -o data/recordings
@@ -132,7 +132,9 @@ def _written(column: pa.ChunkedArray) -> pa.ChunkedArray:
     import pyarrow as pa
 
     if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
-        return pa.chunked_array([pa.array([None if one is None else one.hex() for one in column.to_pylist()], pa.string())])
+        return pa.chunked_array(
+            [pa.array([None if one is None else one.hex() for one in column.to_pylist()], pa.string())]
+        )
     if pa.types.is_nested(column.type):
         return pa.chunked_array([pa.array([json.dumps(one) for one in column.to_pylist()], pa.string())])
     return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from tacpipe.arrays import AnyArray
 from tacpipe.channels.masks import GRID
 from tacpipe.channels.streams import TRUTH
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.exports.contents import TIME, about
+from tacpipe.exports.contents import TIME, Contents, about
 from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
@@ -50,14 +50,45 @@ class Channel:
         return bool(self.stream) and number and self.quantity not in CLOCKS and not self.name.startswith(TRUTH)
 
 
+def synchronized(rate_hz: float | None, master: str) -> dict[str, dict[str, Any]]:
+    """Return the stage that gives recordings one rate, with its params; none without a rate."""
+    if rate_hz is None:
+        return {}
+    return {SYNCHRONIZE: {"rate_hz": rate_hz, **({"master": master} if master else {})}}
+
+
 def table(recording: Recording) -> pa.Table:
     """Return the table of a synchronized recording. Raises `UsageError` for one that is not."""
     if set(recording.streams) != {""} or GRID not in recording.attributes:
         raise UsageError(
-            f"Recording {recording.name} is not synchronized, and the format has one rate for all streams. Give --rate-hz, or "
-            f"the output of `tacpipe {SYNCHRONIZE}`."
+            f"Recording {recording.name} is not synchronized, and the format has one rate for all streams. Give "
+            f"--rate-hz, or the output of `tacpipe {SYNCHRONIZE}`."
         )
     return recording.table()
+
+
+def columns(found: Contents, *, common: bool) -> tuple[list[str], Contents]:
+    """Return the columns of the frames, and what the recordings hold with what of it is left out.
+
+    Recordings whose columns differ are refused, or, where ``common``, those that all have are kept. Raises `UsageError`.
+    """
+    (stream,) = found.streams.values()
+    if not stream.others:
+        return list(stream.shared), found
+    lost = [one.name for one in stream.columns if one.name not in stream.shared]
+    if not common:
+        what = f"lacks {listed(lost, 3)}" if lost else "has more columns than"
+        raise UsageError(
+            f"Recording {stream.others[0]} {what}{', unlike' if lost else ''} the first one ({len(stream.others)} of "
+            f"{len(stream.recordings)} recordings differ), and the format has the same in all. Export recordings of one rig "
+            f"at a time, or give --common to leave out what not all of them have."
+        )
+    what = (
+        f"columns that not all recordings have, as {listed(lost, 3)}"
+        if lost
+        else "columns that not all recordings have"
+    )
+    return list(stream.shared), replace(found, losses={**found.losses, what: list(stream.recordings)})
 
 
 def channels(table: pa.Table) -> list[Channel]:

@@ -1,8 +1,8 @@
 """Write recordings as HDF5 files: a group a stream at its own rate, or one file of demonstrations as robomimic reads them.
 
 By default one file a recording: a group a stream, a dataset a column in its own type, unit and quantity as attributes,
-labels as attributes of the file. ``--structure robomimic`` writes one file ``demos.hdf5`` from synchronized recordings, or any
-with ``--rate-hz``: ``data/demo_0/obs/STREAM_QUANTITY`` and, with ``--actions``, ``actions``.
+labels as attributes of the file. ``--structure robomimic`` writes one file ``demos.hdf5`` from synchronized recordings, or
+any with ``--rate-hz``: ``data/demo_0/obs/STREAM_QUANTITY`` and, with ``--actions``, ``actions``.
 
 Example: tacpipe export hdf5 data/recordings -o exports/hdf5
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,14 +26,17 @@ if TYPE_CHECKING:
     import h5py
     import pyarrow as pa
 
+    from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Dataset, Recording
 
     Parts = Dataset
 
 DEMOS = "demos.hdf5"
+VERSION = ("v110", "v110")  # of HDF5, from 2016: many small columns take half of what they take in older ones
+CHUNK_ROWS = 1 << 16
 LEVEL = 4  # of gzip; higher ones take twice the time for 1 %
 _STREAMS = f"""
-One HDF5 file a recording: the group `STREAM` has a dataset a column, compressed with gzip; `{TIME}` is the time in nanoseconds of UTC.
+One HDF5 file a recording: the group `STREAM` has a dataset a column; `{TIME}` is the time in nanoseconds of UTC.
 Attributes of a dataset are its unit and quantity, attributes of the file the labels:
 
 ```python
@@ -46,8 +49,9 @@ with h5py.File("EXPORT/RECORDING.h5") as file:
 tacpipe reads them back with `tacpipe ingest hdf5`.
 """
 _DEMOS = f"""
-One file of demonstrations, `{DEMOS}`, as robomimic reads them: `data/demo_0/obs/STREAM_QUANTITY` has the shape (frame, channel); the
-attribute `columns` names its channels, `units` their units. `data/demo_0` has the recording's name and labels as attributes.
+One file of demonstrations, `{DEMOS}`, as robomimic reads them: `data/demo_0/obs/STREAM_QUANTITY` has the shape
+(frame, channel); the attribute `columns` names its channels, `units` their units. `data/demo_0` has the recording's name and
+labels as attributes.
 """
 
 
@@ -55,21 +59,27 @@ attribute `columns` names its channels, `units` their units. `data/demo_0` has t
 class Params:
     """How the files are structured."""
 
-    structure: Literal["streams", "robomimic"] = "streams"  # a file a recording at native rates, or one of demonstrations
+    structure: Literal["streams", "robomimic"] = (
+        "streams"  # a file a recording at native rates, or one of demonstrations
+    )
     rate_hz: Rate | None = None  # robomimic: synchronize to this rate first
+    master: str = ""  # robomimic: stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # robomimic: stream of the actions: its targets, else its state one frame later
+    common: bool = False  # robomimic: leave out columns that not all recordings have
 
     def check(self) -> None:
         """Raise `UsageError` for an option that has no effect on streams."""
-        if self.structure == "streams" and (self.rate_hz is not None or self.actions):
-            raise UsageError("rate_hz and actions belong to --structure robomimic; streams are written as they are.")
+        if self.structure == "streams" and (self.rate_hz is not None or self.actions or self.master or self.common):
+            raise UsageError(
+                "rate_hz, master, actions and common belong to --structure robomimic; streams are written as they are."
+            )
 
 
 def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
-    return {} if params.rate_hz is None else {frames.SYNCHRONIZE: {"rate_hz": params.rate_hz}}
+    return frames.synchronized(params.rate_hz, params.master)
 
 
 @stage(version=1, reads=ALL)
@@ -93,8 +103,13 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts) -> Result:
     Example: tacpipe export hdf5 data/recordings -o exports/hdf5
     """
     found = contents.of_parts(parts)
-    opening = _STREAMS if params.structure == "streams" else _DEMOS
-    files: dict[str, Content] = {} if params.structure == "streams" else {DEMOS: lambda: _demos(params, recordings)}
+    files: dict[str, Content] = {}
+    opening = _STREAMS
+    if params.structure == "robomimic":
+        from tacpipe.exports import frames
+
+        columns, found = frames.columns(found, common=params.common)
+        opening, files[DEMOS] = _DEMOS, lambda: _demos(params, recordings, columns)
     files[readme.NAME] = readme.text("Tactile recordings as HDF5", opening, recordings, found)
     return Result(files=Files(files), notes=readme.notes(recordings, found))
 
@@ -103,7 +118,7 @@ def _recording(recording: Recording, losses: list[str]) -> bytes:
     import h5py
 
     sink = io.BytesIO()
-    with h5py.File(sink, "w", track_order=True) as file:
+    with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         losses += _attributes(file, recording.attributes)
         for stream in recording.streams:
             group = file.create_group(shown(stream), track_order=True)
@@ -140,12 +155,8 @@ def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream:
     elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
         from tacpipe.exports import ros
 
-        if len(column):
-            made = group.create_dataset(
-                field.name, data=ros.numbers(column), compression="gzip", compression_opts=LEVEL, shuffle=True
-            )
-        else:
-            made = group.create_dataset(field.name, data=ros.numbers(column))
+        values = ros.numbers(column)
+        made = group.create_dataset(field.name, data=values, **_storage(values))
     else:
         yield f"{where}: HDF5 has no type for {kind}"
         return
@@ -155,7 +166,15 @@ def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream:
         yield f"missing values in {where}: they are written as NaN, 0 or empty text"
 
 
-def _demos(params: Params, recordings: Dataset) -> bytes:
+def _storage(values: AnyArray) -> dict[str, Any]:
+    """Return how an array is stored: in compressed chunks, but for one without rows, which has none."""
+    if not len(values):
+        return {}
+    chunks = (min(len(values), CHUNK_ROWS), *values.shape[1:])
+    return {"chunks": chunks, "compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
+
+
+def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> bytes:
     import h5py
 
     from tacpipe.exports import arrays, frames
@@ -163,16 +182,16 @@ def _demos(params: Params, recordings: Dataset) -> bytes:
     every = list(recordings)
     rate_hz = frames.rate_hz(every)
     sink = io.BytesIO()
-    with h5py.File(sink, "w", track_order=True) as file:
+    with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         data = file.create_group("data", track_order=True)
         total = 0
         for number, one in enumerate(every):
             demo = data.create_group(f"demo_{number}", track_order=True)
-            table = frames.table(one)
+            table = frames.table(one).select(columns)
             for array in arrays.of(table, params.actions):
                 # robomimic reads actions next to obs
                 name = array.name if array.name in ("actions", TIME) else f"obs/{array.name}"
-                made = demo.create_dataset(name, data=array.values, compression="gzip", compression_opts=LEVEL, shuffle=True)
+                made = demo.create_dataset(name, data=array.values, **_storage(array.values))
                 made.attrs["columns"], made.attrs["units"] = list(array.columns), list(array.units)
             demo.attrs["num_samples"] = table.num_rows
             demo.attrs["recording"] = one.name

@@ -14,9 +14,11 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from tacpipe.channels.masks import GRID
+from tacpipe.channels.streams import TRUTH
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 VERSION = "v3.0"
 ORIGINALS = "tacpipe"
 RECORDING = "tacpipe.recording"  # column of the episodes
+ACTION = "action"
 STATS = "stats"  # table of a part
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
@@ -51,9 +54,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 dataset = LeRobotDataset("tacpipe/export", root="EXPORT")
 ```
 
-`observation.state` is the robot, `observation.tactile.STREAM` a tactile sensor in its unit. `tacpipe.t_ns` is the time of a frame in
-nanoseconds of UTC, `tacpipe.held.STREAM` and `tacpipe.gap.STREAM` mark frames in which a sensor repeated its last value or sent nothing,
-`tacpipe.dt_ns.STREAM` is the distance to the nearest sample. `meta/tacpipe.json` has the unit and quantity of each column.
+`observation.state` is the robot, `observation.tactile.STREAM` a tactile sensor in its unit. `tacpipe.t_ns` is the time of a
+frame in nanoseconds of UTC, `tacpipe.held.STREAM` and `tacpipe.gap.STREAM` mark frames in which a sensor repeated its last
+value or sent nothing, `tacpipe.dt_ns.STREAM` is the distance to the nearest sample. `meta/tacpipe.json` has unit and quantity of
+each column.
 """
 
 
@@ -62,9 +66,11 @@ class Params:
     """What the frames are made of."""
 
     rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
+    master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
     state: Names = ""  # streams of observation.state; without it those with joints or a pose
     tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read nothing else
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
+    common: bool = False  # leave out columns that not all recordings have
     task: str = "touch"  # text of the task; {label} stands for the recording's label
     robot_type: str = ""  # what info.json states as the robot
     originals: bool = True  # put the shards as they were given under tacpipe/
@@ -77,6 +83,7 @@ class Feature:
     name: str
     values: AnyArray
     names: Sequence[str]
+    columns: Sequence[str]  # of the synchronized table
     units: Sequence[str] = ()
     quantities: Sequence[str] = ()
 
@@ -95,7 +102,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
-    return {} if params.rate_hz is None else {frames.SYNCHRONIZE: {"rate_hz": params.rate_hz}}
+    return frames.synchronized(params.rate_hz, params.master)
 
 
 def originals(params: Params) -> str:
@@ -111,10 +118,13 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.exports import frames
 
     table = frames.table(recording)
-    losses = list(_losses(params, table, str(recording.attributes[frames.GRID])))
-    rows = [(one.name, channel, *values) for one in features(params, table) for channel, values in _statistics(one)]
+    losses = list(_losses(params, table, str(recording.attributes[GRID])))
+    params = params if not params.actions or _has(table, params.actions) else replace(params, actions="")
+    rows = [
+        (one.name == ACTION, column, *values) for one in features(params, table) for column, values in _statistics(one)
+    ]
     columns = list(zip(*rows, strict=True))
-    names = ["feature", "channel", *STATISTICS]
+    names = [ACTION, "column", *STATISTICS]
     made = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
     return RecordingOutput({**contents.part(recording, losses), STATS: made})
 
@@ -132,8 +142,8 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts) -> Result:
     every = list(recordings)
     fps = frames.rate_hz(every)
     found = contents.of_parts(parts)
-    made = features(params, frames.table(every[0]).slice(0, 2))
-    _refuse_different(parts, made)
+    columns, found = frames.columns(found, common=params.common)
+    made = features(params, frames.table(every[0]).select(columns).slice(0, 2))
     tasks = _tasks(params, every)
     lengths = {one.name: _rows(parts, one.name) for one in every}
     bundles = list(_bundles(every, lengths, sum(one.values[:1].nbytes for one in made)))
@@ -146,9 +156,13 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts) -> Result:
         for one in bundle:
             starts[one.name], places[one.name] = start, (chunk, file)
             start += lengths[one.name]
-        files[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = _data(params, bundle, number, starts, tasks, fps)
+        files[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = _data(
+            params, columns, bundle, number, starts, tasks, fps
+        )
         number += len(bundle)
-    files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(every, parts, starts, places, lengths, tasks, fps)
+    files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
+        made, every, parts, starts, places, lengths, tasks, fps
+    )
     files["meta/tasks.parquet"] = _task_table(tasks)
     files["meta/info.json"] = _json(_info(params, made, lengths, tasks, fps))
     files["meta/stats.json"] = _json(_all_stats(parts, made, starts, lengths, tasks, fps))
@@ -173,13 +187,20 @@ def features(params: Params, table: pa.Table) -> list[Feature]:
         several = {one.stream for one in chosen}
         names = [one.short if len(several) == 1 else one.name for one in chosen]
         flat = values[:, 0] if values.shape[1] == 1 else values
-        return Feature(name, flat, names, [one.unit for one in chosen], [one.quantity for one in chosen])
+        return Feature(
+            name,
+            flat,
+            names,
+            [one.name for one in chosen],
+            [one.unit for one in chosen],
+            [one.quantity for one in chosen],
+        )
 
     found: list[Feature] = []
     whole = [*state, *taxels] if params.tactile_in_state else state
     found += [vector("observation.state", whole)] if whole else []
     if params.actions:
-        found.append(vector("action", *frames.action_of(table, every, params.actions)))
+        found.append(vector(ACTION, *frames.action_of(table, every, params.actions)))
     rest = [one for one in every if one.signal and one not in state]
     for stream in dict.fromkeys(one.stream for one in rest):
         touch = [one for one in rest if one.stream == stream and one in taxels]
@@ -188,15 +209,16 @@ def features(params: Params, table: pa.Table) -> list[Feature]:
         found += [vector(f"observation.{stream}", other)] if other else []
     latents = [one for one in every if one.quantity == "latent"]
     found += [vector("observation.latents", latents)] if latents else []
-    truth = [one for one in every if one.name.startswith(frames.TRUTH) and one.type in ("float", "double")]
+    truth = [one for one in every if one.name.startswith(TRUTH) and one.type in ("float", "double")]
     found += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
-    found.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], ["ns"], ["time"]))
+    found.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
     taken = {one.name for one in (*state, *rest, *latents, *truth)}
     for one in every:
         if one.name not in taken:
             name = f"{one.short}.{one.stream}" if one.stream else one.short
             values = table.column(one.name).to_numpy()
-            found.append(Feature(f"{ORIGINALS}.{name.replace('/', '_')}", values, [one.name], [one.unit], [one.quantity]))
+            name = f"{ORIGINALS}.{name.replace('/', '_')}"
+            found.append(Feature(name, values, [one.name], [one.name], [one.unit], [one.quantity]))
     return found
 
 
@@ -215,15 +237,21 @@ def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[str]:
         yield f"digits beyond float32 of stream {stream}{kept}"
 
 
-def _statistics(one: Feature) -> Iterator[tuple[int, tuple[float, ...]]]:
-    """Yield each channel of a feature with its statistics; none of text, and NaN where nothing was measured."""
+def _has(table: pa.Table, stream: str) -> bool:
+    from tacpipe.exports import frames
+
+    return any(one.stream == stream for one in frames.channels(table))
+
+
+def _statistics(one: Feature) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Yield each column of a feature with its statistics; none of text, and NaN where nothing was measured."""
     import numpy as np
 
     if one.dtype == "string":
         return
     values = one.values.reshape(len(one.values), -1).astype(np.float64)
-    for channel in range(values.shape[1]):
-        yield channel, _numbers(values[:, channel])
+    for channel, column in enumerate(one.columns):
+        yield column, _numbers(values[:, channel])
 
 
 def _numbers(values: Floats) -> tuple[float, ...]:
@@ -238,20 +266,6 @@ def _numbers(values: Floats) -> tuple[float, ...]:
 
 def _rows(parts: Dataset, name: str) -> int:
     return int(parts[name].table(contents.STREAMS)["rows"][0].as_py())
-
-
-def _refuse_different(parts: Dataset, made: Sequence[Feature]) -> None:
-    """Raise `UsageError` where a recording has other features than the first: a LeRobot dataset has the same in all."""
-    wanted = [(one.name, channel) for one in made if one.dtype != "string" for channel in range(one.shape[0])]
-    for part in parts:
-        table = part.table(STATS, ["feature", "channel"])
-        found = list(zip(table["feature"].to_pylist(), table["channel"].to_pylist(), strict=True))
-        if found != wanted:
-            odd = sorted({name for name, _ in set(found) ^ set(wanted)})
-            raise UsageError(
-                f"Recording {part.name} has other channels than the first one ({listed(odd, 4)}), and all episodes of a LeRobot "
-                f"dataset have the same. Export recordings of one rig at a time."
-            )
 
 
 def _tasks(params: Params, every: Sequence[Recording]) -> dict[str, str]:
@@ -284,6 +298,7 @@ def _bundles(every: Sequence[Recording], lengths: Mapping[str, int], row_bytes: 
 
 def _data(
     params: Params,
+    columns: Sequence[str],
     bundle: Sequence[Recording],
     number: int,
     starts: Mapping[str, int],
@@ -302,10 +317,10 @@ def _data(
         sink = pa.BufferOutputStream()
         writer = None
         for episode, one in enumerate(bundle, start=number):
-            made = features(params, frames.table(one))
-            columns = {feature.name: _arrow(feature) for feature in made}
-            columns |= _index(len(made[0].values), episode, starts[one.name], order[tasks[one.name]], fps)
-            table = pa.table(columns)
+            made = features(params, frames.table(one).select(columns))
+            arrays = {feature.name: _arrow(feature) for feature in made}
+            arrays |= _index(len(made[0].values), episode, starts[one.name], order[tasks[one.name]], fps)
+            table = pa.table(arrays)
             writer = writer or pq.ParquetWriter(sink, table.schema, compression="zstd")
             writer.write_table(table, row_group_size=max(1, table.num_rows))
         assert writer is not None
@@ -353,6 +368,7 @@ def _task_table(tasks: Mapping[str, str]) -> bytes:
 
 
 def _episodes(
+    made: Sequence[Feature],
     every: Sequence[Recording],
     parts: Dataset,
     starts: Mapping[str, int],
@@ -382,7 +398,7 @@ def _episodes(
             RECORDING: one.name,
             **labels[one.name],
         }
-        stats = _episode_stats(parts[one.name], lengths[one.name])
+        stats = _episode_stats(made, parts[one.name], lengths[one.name])
         stats |= _index_stats(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
         row |= {f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()}
         rows.append(row)
@@ -409,14 +425,14 @@ def _labels(every: Sequence[Recording]) -> dict[str, dict[str, Any]]:
 Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
 
 
-def _episode_stats(part: Recording, rows: int) -> Stats:
-    table = part.table(STATS)
+def _episode_stats(made: Sequence[Feature], part: Recording, rows: int) -> Stats:
+    known = {(row[ACTION], row["column"]): row for row in part.table(STATS).to_pylist()}
     found: Stats = {}
-    for row in table.to_pylist():
-        one = found.setdefault(row["feature"], {name: [] for name in STATISTICS})
-        for name in STATISTICS:
-            one[name].append(row[name])
-    return {name: {**values, "count": [rows]} for name, values in found.items()}
+    for one in made:
+        if one.dtype != "string":
+            mine = [known[one.name == ACTION, column] for column in one.columns]
+            found[one.name] = {**{name: [row[name] for row in mine] for name in STATISTICS}, "count": [rows]}
+    return found
 
 
 def _index_stats(rows: int, episode: int, start: int, task: int, fps: float) -> Stats:
@@ -449,7 +465,10 @@ def _all_stats(
 
     order = _task_order(tasks)
     every = [
-        {**_episode_stats(parts[name], rows), **_index_stats(rows, episode, starts[name], order[tasks[name]], fps)}
+        {
+            **_episode_stats(made, parts[name], rows),
+            **_index_stats(rows, episode, starts[name], order[tasks[name]], fps),
+        }
         for episode, (name, rows) in enumerate(lengths.items())
     ]
     weights = np.array(list(lengths.values()), float)[:, None] / sum(lengths.values())
@@ -500,7 +519,7 @@ def _about(made: Sequence[Feature], found: contents.Contents) -> dict[str, Any]:
     """Return units and quantities of each feature, and the columns of the synchronized table."""
     return {
         "features": {
-            one.name: {"columns": list(one.names), "units": list(one.units), "quantities": list(one.quantities)}
+            one.name: {"columns": list(one.columns), "units": list(one.units), "quantities": list(one.quantities)}
             for one in made
         },
         "columns": {

@@ -36,9 +36,9 @@ _OPENING = """
 One MCAP file a recording (profile `ros2`, messages in CDR with their definitions): open it in Foxglove, play it with
 `ros2 bag play FILE.mcap`, or read it in Python with `rosbags` or `mcap`.
 
-The topic `/STREAM` has messages of the type `tacpipe_msgs/msg/Stream`, a field a column; the metadata of its channel name stream,
-columns and units (`tacpipe`, JSON). Topics below it (`/STREAM/pose`) repeat some columns as usual messages. Labels are in the
-metadata record `tacpipe`. tacpipe reads the files back with `tacpipe ingest mcap`.
+The topic `/STREAM` has messages of the type `tacpipe_msgs/msg/Stream`, a field a column; the metadata of its channel name
+stream, columns and units (`tacpipe`, JSON). Topics below it (`/STREAM/pose`) repeat some columns as usual messages. Labels
+are in the metadata record `tacpipe`. tacpipe reads the files back with `tacpipe ingest mcap`.
 """
 
 
@@ -82,7 +82,7 @@ def _written(params: Params, recording: Recording, name: str, losses: list[str])
     messages = [_messages(writer, topic, t_ns) for topic, t_ns in _topics(params, recording, losses)]
     for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda one: one[0])):
         writer.add_message(channel, log_ns, content, log_ns, number)
-    writer.finish()
+    writer.finish()  # type: ignore[no-untyped-call]
     return sink.getvalue()
 
 
@@ -96,7 +96,9 @@ def _topics(params: Params, recording: Recording, losses: list[str]) -> Iterator
             continue
         t_ns = table.column(TIME).to_numpy()
         if table.num_rows and not 0 <= t_ns.min() <= t_ns.max() <= ros.LATEST_S * 10**9:
-            losses.append(f"stream {shown(stream)}: its stamps lie before 1970 or after 2038, which ROS has no stamps for")
+            losses.append(
+                f"stream {shown(stream)}: its stamps lie before 1970 or after 2038, which ROS has no stamps for"
+            )
             continue
         yield ros.own(stream, table, t_ns), t_ns
         if params.usual_messages:
@@ -135,5 +137,7 @@ def _losses(stream: str, table: pa.Table) -> Iterator[str]:
         if str(field.type) not in ros.TYPES:
             yield f"column {field.name} of {where}: messages have no type for {field.type}"
         elif column.null_count:
-            written: Any = "NaN" if pa.types.is_floating(field.type) else "empty" if pa.types.is_string(field.type) else 0
+            written: Any = (
+                "NaN" if pa.types.is_floating(field.type) else "empty" if pa.types.is_string(field.type) else 0
+            )
             yield f"missing values in column {field.name} of {where}: they are written as {written}"

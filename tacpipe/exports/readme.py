@@ -93,7 +93,9 @@ def _streams(contents: Contents) -> str:
 
 def _losses(recordings: Dataset, contents: Contents) -> str:
     lines = [f"- {what}{_of(names, recordings)}" for what, names in contents.losses.items()]
-    return "\n".join(["## Not carried", "", *(lines or ["Nothing: values, types, units and labels are all in these files."])])
+    return "\n".join(
+        ["## Not carried", "", *(lines or ["Nothing: values, types, units and labels are all in these files."])]
+    )
 
 
 def _of(names: Sequence[str], recordings: Dataset) -> str:

@@ -75,9 +75,11 @@ def own(stream: str, table: pa.Table, t_ns: Int64s) -> Topic:
     for name in names:
         column, kind = table.column(name), table.schema.field(name).type
         lines.append(f"{TYPES[str(kind)]} {fields[name]}\n")
-        columns.append({"field": fields[name], "name": name, "type": str(kind), "about": about(table.schema.field(name))})
+        columns.append(
+            {"field": fields[name], "name": name, "type": str(kind), "about": about(table.schema.field(name))}
+        )
         if pa.types.is_string(kind) or pa.types.is_binary(kind):
-            empty = "" if pa.types.is_string(kind) else b""
+            empty: Any = "" if pa.types.is_string(kind) else b""
             parts.append(Texts([empty if one is None else one for one in column.to_pylist()]))
         else:
             parts.append(Values(numbers(column)))
@@ -140,7 +142,7 @@ def numbers(column: pa.ChunkedArray) -> AnyArray:
 
     if column.null_count:
         column = column.fill_null(float("nan") if pa.types.is_floating(column.type) else pa.scalar(0).cast(column.type))
-    values = column.to_numpy()
+    values: AnyArray = column.to_numpy()
     return values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 

@@ -1,7 +1,7 @@
 """Write recordings as a Zarr replay buffer, as UMI and diffusion policy read it.
 
-Synchronized recordings, or any with ``--rate-hz``, one after another: ``data/STREAM_QUANTITY`` has the shape (frame, channel),
-``meta/episode_ends`` the frame behind the last of each recording. Zarr's format 2.
+Synchronized recordings, or any with ``--rate-hz``, one after another: ``data/STREAM_QUANTITY`` has the shape
+(frame, channel), ``meta/episode_ends`` the frame behind the last of each recording. Zarr's format 2.
 
 Example: tacpipe export zarr data/recordings -o exports/zarr --rate-hz 50 --actions robot
 """
@@ -9,21 +9,18 @@ Example: tacpipe export zarr data/recordings -o exports/zarr --rate-hz 50 --acti
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
-from tacpipe.printable import listed
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.exports.arrays import Array
 
     Parts = Dataset
 
@@ -40,8 +37,8 @@ store = zarr.open("EXPORT/{STORE}", mode="r")
 touch, ends = store["data/STREAM_tactile"], store["{ENDS}"]
 ```
 
-The attribute `columns` of an array names its channels, `units` their units. The attributes of the group `meta` hold the rate, the
-name of each recording and its labels.
+The attribute `columns` of an array names its channels, `units` their units. The attributes of the group `meta` hold the
+rate, the name of each recording and its labels.
 """
 
 
@@ -50,14 +47,16 @@ class Params:
     """What the arrays are made of."""
 
     rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
+    master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
+    common: bool = False  # leave out columns that not all recordings have
 
 
 def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
-    return {} if params.rate_hz is None else {frames.SYNCHRONIZE: {"rate_hz": params.rate_hz}}
+    return frames.synchronized(params.rate_hz, params.master)
 
 
 @stage(version=1, reads=("grid", "grid_rate_hz"))
@@ -83,8 +82,8 @@ def zarr(params: Params, recordings: Dataset, parts: Parts) -> Result:
     every = list(recordings)
     rate_hz = frames.rate_hz(every)
     found = contents.of_parts(parts)
-    made = [arrays.of(frames.table(one), params.actions) for one in every]
-    _refuse_different(every, made)
+    columns, found = frames.columns(found, common=params.common)
+    made = [arrays.of(frames.table(one).select(columns), params.actions) for one in every]
     files: dict[str, Content] = {}
     for several in zip(*made, strict=True):
         attributes = {"columns": list(several[0].columns), "units": list(several[0].units)}
@@ -119,19 +118,6 @@ def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[s
     )
     made[:] = values
     return {f"{path}/{name}": content.to_bytes() for name, content in store.items()}
-
-
-def _refuse_different(every: Sequence[Recording], made: Sequence[Sequence[Array]]) -> None:
-    """Raise `UsageError` where a recording has other arrays than the first: a replay buffer has the same in all."""
-    wanted = {one.name: tuple(one.columns) for one in made[0]}
-    for recording, several in zip(every, made, strict=True):
-        found = {one.name: tuple(one.columns) for one in several}
-        if found != wanted:
-            odd = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
-            raise UsageError(
-                f"Recording {recording.name} has other channels than the first one ({listed(odd, 4)}), and a replay buffer has "
-                f"the same in all. Export recordings of one rig at a time."
-            )
 
 
 def _json(value: Any) -> bytes:
