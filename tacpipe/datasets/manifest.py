@@ -68,9 +68,14 @@ class Manifest:
         return bool(self.recordings) and not self.inputs
 
     @property
+    def exported(self) -> bool:
+        """Whether its files are those of another tool."""
+        return self.stage.startswith(EXPORT)
+
+    @property
     def copied(self) -> bool:
         """Whether its directory holds copies, not links: recordings, and exports, in which other tools may write."""
-        return self.recorded or self.stage.startswith(EXPORT)
+        return self.recorded or self.exported
 
     @property
     def included(self) -> dict[str, Entry]:

@@ -56,8 +56,8 @@ dataset = LeRobotDataset("tacpipe/export", root="EXPORT")
 
 `observation.state` is the robot, `observation.tactile.STREAM` a tactile sensor in its unit. `tacpipe.t_ns` is the time of a
 frame in nanoseconds of UTC, `tacpipe.held.STREAM` and `tacpipe.gap.STREAM` mark frames in which a sensor repeated its last
-value or sent nothing, `tacpipe.dt_ns.STREAM` is the distance to the nearest sample. `meta/tacpipe.json` has unit and quantity of
-each column.
+value or sent nothing, `tacpipe.dt_ns.STREAM` is the distance to the nearest sample. `meta/tacpipe.json` has unit and
+quantity of each column.
 """
 
 
