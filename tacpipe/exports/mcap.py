@@ -87,12 +87,22 @@ def _written(params: Params, recording: Recording, name: str, losses: list[str])
 
 
 def _topics(params: Params, recording: Recording, losses: list[str]) -> Iterator[tuple[Topic, Int64s]]:
+    import numpy as np
+
     from tacpipe.exports import ros
 
+    starts = [start for stream in recording.streams if (start := _start(recording, stream)) is not None]
     for stream in recording.streams:
         table = recording.table(stream)
         losses += _losses(stream, table)
         if TIME not in table.column_names:
+            if set(ros.POINT) <= set(table.column_names) and starts and min(starts) >= 0:
+                yield ros.cloud(stream, table, min(starts)), np.array([min(starts)])
+                losses.append(
+                    f"stream {shown(stream)} has no time: its one message is stamped with the recording's start"
+                )
+            else:
+                losses.append(f"stream {shown(stream)}: it has no time, and a message needs one")
             continue
         t_ns = table.column(TIME).to_numpy()
         if table.num_rows and not 0 <= t_ns.min() <= t_ns.max() <= ros.LATEST_S * 10**9:
@@ -104,6 +114,14 @@ def _topics(params: Params, recording: Recording, losses: list[str]) -> Iterator
         if params.usual_messages:
             for topic in ros.usual(stream, table, t_ns):
                 yield topic, t_ns
+
+
+def _start(recording: Recording, stream: str) -> int | None:
+    """Return the first stamp of a stream; None where it has none."""
+    columns = recording.columns(stream)
+    if TIME not in columns.column_names or not columns.num_rows:
+        return None
+    return int(columns.column(TIME)[0].as_py())
 
 
 def _messages(writer: Writer, topic: Topic, t_ns: Int64s) -> Iterable[tuple[int, int, bytes]]:
@@ -131,7 +149,6 @@ def _losses(stream: str, table: pa.Table) -> Iterator[str]:
 
     where = f"stream {shown(stream)}"
     if TIME not in table.column_names:
-        yield f"{where}: it has no time, and a message needs one"
         return
     for field, column in zip(table.schema, table.columns, strict=True):
         if str(field.type) not in ros.TYPES:

@@ -16,13 +16,15 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.exports import cdr
-from tacpipe.exports.cdr import Part, Texts, Values
+from tacpipe.exports.cdr import Constant, Part, Texts, Values
 from tacpipe.exports.contents import TIME, about, shown
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 PACKAGE = "tacpipe_msgs"
+POINT, COLOURS = ("x_m", "y_m", "z_m"), ("red", "green", "blue")  # columns of a cloud
+_FLOAT32 = 7  # a constant of sensor_msgs/PointField
 LATEST_S = 2**31 - 1  # of a stamp's seconds, which are int32
 TYPES = {  # arrow type to type of a message's field
     **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
@@ -44,6 +46,11 @@ _DEFINITIONS = {
     "geometry_msgs/TwistStamped": f"{_HEADER}geometry_msgs/Twist twist\n",
     "sensor_msgs/JointState": f"{_HEADER}string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
     "sensor_msgs/ChannelFloat32": "string name\nfloat32[] values\n",
+    "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count\n",
+    "sensor_msgs/PointCloud2": (
+        f"{_HEADER}uint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\n"
+        "uint32 row_step\nuint8[] data\nbool is_dense\n"
+    ),
     "tactile_msgs/TactileState": f"{_HEADER}sensor_msgs/ChannelFloat32[] sensors\n",
 }
 
@@ -119,6 +126,31 @@ def usual(stream: str, table: pa.Table, t_ns: Int64s) -> list[Topic]:
         values = cdr.sequence([numbers(table.column(name)) for name in taxels], "<f4")
         add("tactile", "tactile_msgs/TactileState", [cdr.count(1), cdr.text(shown(stream)), *values])
     return found
+
+
+def cloud(stream: str, table: pa.Table, t_ns: int) -> Topic:
+    """Return the topic of a cloud of points: one message with x, y, z and, where there are colours, rgb, as float32."""
+    coloured = set(COLOURS) <= set(table.column_names)
+    names = ["x", "y", "z", *(["rgb"] if coloured else [])]
+    made = np.zeros((table.num_rows, len(names)), "<f4")  # (point, field)
+    for place, name in enumerate(POINT):
+        made[:, place] = numbers(table.column(name))
+    if coloured:
+        red, green, blue = (numbers(table.column(name)).astype("<u4") for name in COLOURS)
+        made[:, 3] = (red << 16 | green << 8 | blue).view("<f4")
+    step = made.itemsize * len(names)
+    fields: list[Part] = [cdr.count(len(names))]
+    for place, name in enumerate(names):
+        fields += [cdr.text(name), cdr.count(place * made.itemsize), Constant(bytes([_FLOAT32])), cdr.count(1)]
+    parts = [
+        *cdr.header(np.array([t_ns]), shown(stream)),
+        *(cdr.count(1), cdr.count(len(made)), *fields, Constant(b"\0"), cdr.count(step), cdr.count(step * len(made))),
+        *(Texts([made.tobytes()]), Constant(b"\1")),
+    ]
+    kind = "sensor_msgs/PointCloud2"
+    return Topic(
+        f"/{topic_part(shown(stream))}", _full(kind), _definition(kind, _DEFINITIONS), parts, {"stream": stream}
+    )
 
 
 def vector(table: pa.Table, quantity: str, components: Sequence[str]) -> list[Part]:

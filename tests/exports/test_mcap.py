@@ -102,3 +102,24 @@ def test_a_stream_without_time_is_listed_as_not_carried(lab: Lab) -> None:
     recordings.write(lab.folder / "rec", {"a": ({"cloud": cloud, "skin": recordings.skin(1)}, {})})
     assert "stream cloud" in lab.run("export mcap rec -o mcap").err
     assert set(read(lab.folder / "mcap/a.mcap")) == {"/skin", "/skin/tactile"}
+
+
+def test_a_cloud_of_points_is_one_message_with_its_colours(lab: Lab) -> None:
+    points = {name: pa.array([0.5, -1.5], pa.float32()) for name in ("x_m", "y_m", "z_m")}
+    colours = {name: pa.array([1, 255], pa.uint8()) for name in ("red", "green", "blue")}
+    recordings.write(
+        lab.folder / "rec", {"a": ({"scene": pa.table({**points, **colours}), "skin": recordings.skin(1)}, {})}
+    )
+    assert "stream scene" in lab.run("export mcap rec -o mcap").err
+    ((t_ns, message),) = read(lab.folder / "mcap/a.mcap")["/scene"]
+    assert t_ns == recordings.skin(1)["t_ns"][0].as_py()
+    assert (message.width, message.height, message.point_step) == (2, 1, 16)
+    assert [(field.name, field.offset, field.datatype) for field in message.fields] == [
+        ("x", 0, 7),
+        ("y", 4, 7),
+        ("z", 8, 7),
+        ("rgb", 12, 7),
+    ]
+    made = message.data.view([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    assert made["z"].tolist() == [0.5, -1.5]
+    assert made["rgb"].tolist() == [0x010101, 0xFFFFFF]
