@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -79,20 +80,38 @@ def _files(stream: str, pattern: str) -> dict[str, Any]:
 def _records(stream: str, columns: Sequence[Column]) -> dict[str, Any]:
     own = [one for one in columns if one.name != "recording"]
     recording = Column("recording", "string", {"quantity": "name of the recording"})
+    every = [one for one in (recording, *own) if _type(one)]
+    ids = identifiers([one.name for one in every])
     return {
         "@type": "cr:RecordSet",
         "@id": stream,
         "name": stream,
         "description": f"Rows of the stream {stream}, of all recordings.",
-        "field": [_field(stream, one) for one in (recording, *own) if _type(one)],
+        "field": [_field(stream, one, ids[one.name]) for one in every],
     }
 
 
-def _field(stream: str, column: Column) -> dict[str, Any]:
+def identifiers(names: Sequence[str]) -> dict[str, str]:
+    """Return an identifier for each column, without spaces and brackets, which readers refuse; no two alike.
+
+    >>> identifiers(["taxel01_x", "Force X [N]", "Force X (N)"])
+    {'taxel01_x': 'taxel01_x', 'Force X [N]': 'Force_X__N_', 'Force X (N)': 'Force_X__N__2'}
+    """
+    made: dict[str, str] = {}
+    for name in names:
+        letters = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+        candidate, number = letters, 2
+        while candidate in made.values():
+            candidate, number = f"{letters}_{number}", number + 1
+        made[name] = candidate
+    return made
+
+
+def _field(stream: str, column: Column, identifier: str) -> dict[str, Any]:
     return {
         "@type": "cr:Field",
-        "@id": f"{stream}/{column.name}",
-        "name": f"{stream}/{column.name}",
+        "@id": f"{stream}/{identifier}",
+        "name": f"{stream}/{identifier}",
         "description": described(column),
         "dataType": _type(column),
         "source": {"fileSet": {"@id": f"{stream}-files"}, "extract": {"column": column.name}},

@@ -15,9 +15,9 @@ from pathlib import Path
 
 ALONE = (
     "lerobot==0.4.4",
-    "accelerate==1.12.0",
-    "gymnasium==1.2.2",
-    "farama-notifications==0.0.4",
+    "accelerate==1.15.0",
+    "gymnasium==1.4.0",
+    "farama-notifications==0.0.6",
 )  # without what they need
 NEEDED = (
     *("datasets>=4,<5", "huggingface_hub>=0.34.2,<0.36", "packaging<26", "numpy<2.3", "mlcroissant>=1.0,<2"),

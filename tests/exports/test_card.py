@@ -60,6 +60,7 @@ def test_croissant_states_the_type_and_unit_of_each_column(rig: Lab) -> None:
     assert fields["skin/taxel01_x"]["dataType"] == "sc:Integer"
     assert "tactile (count)" in fields["skin/taxel01_x"]["description"]
     assert fields["odd/said"]["dataType"] == "sc:Text"
+    assert all(" " not in name for name in fields)
     assert fields["odd/on"]["dataType"] == "sc:Boolean"
     assert [one["name"] for one in value["creator"]] == ["A", "B"]
 
