@@ -38,6 +38,8 @@ from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats.arrays import files as array_files
+from tests.formats.lerobot import files as lerobot_files
 from tests.promises import decoding
 from tests.sensors.test_every_sensor import CASES
 
@@ -261,14 +263,35 @@ def _tables(folder: Path) -> None:
     (folder / "a.yaml").write_text("material: cork\nforce: 2.5\n")
 
 
-PARAMS = {"table": {"layout": json.dumps(tomllib.loads(LAYOUT))}}  # of formats that need some
+def _arrays(folder: Path) -> None:
+    array_files.lab(folder / "demo.hdf5")
+
+
+def _stores(folder: Path) -> None:
+    array_files.replay(folder / "a.zarr")
+    array_files.replay(folder / "b.zarr", zarr_format=3)
+
+
+def _episodes(folder: Path) -> None:
+    lerobot_files.write_v2(folder / "two", episodes=2)
+    lerobot_files.write_v3(folder / "three")
+
+
+RATE = '[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n'
+PARAMS = {  # of formats that need some
+    "table": {"layout": json.dumps(tomllib.loads(LAYOUT))},
+    "zarr": {"layout": json.dumps(tomllib.loads(RATE))},
+}
 TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of each format
     "biotac-slide": _biotac,
+    "hdf5": _arrays,
+    "lerobot": _episodes,
     "roboskin": _roboskin,
     "table": _tables,
     "vision2tactile": _grasps,
     "xela-flat": lambda folder: xela_files.write_flat(folder / "data_sample_a"),
     "xela-psc": lambda folder: xela_files.write_psc(folder / "data_sample_a"),
+    "zarr": _stores,
 }
 
 
@@ -307,8 +330,8 @@ def ingested(name: str, folder: Path) -> list[Any]:
 
 def ingest(lab: Lab, name: str) -> Ran:
     """Run the command that ingests the folder ``source``."""
-    (lab.folder / "layout.toml").write_text(LAYOUT)
-    options = "--layout layout.toml" if name == "table" else ""
+    (lab.folder / "layout.toml").write_text({"table": LAYOUT, "zarr": RATE}.get(name, ""))
+    options = "--layout layout.toml" if name in PARAMS else ""
     return lab.call(f"ingest {name} source -o data {options}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import Attribute
@@ -57,6 +57,31 @@ class Contents:
     attributes: Mapping[str, Attribute] = field(default_factory=dict)  # of the recording, as the file states them
     skipped: Mapping[str, str] = field(default_factory=dict)  # what cannot be read, by source: the reason
     notes: Sequence[str] = ()  # sentences about what is missing, as of a file that was cut off
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one episode of a container is read from, where that is less than all of its files: what its key rests on."""
+
+    files: Mapping[str, Path]  # by their path within the container
+    values: Mapping[str, Any] = field(default_factory=dict)  # of JSON: what else it depends on
+
+
+@runtime_checkable
+class Sharing(Protocol):
+    """A container in which a changed file costs only the episodes that are read from it."""
+
+    def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
+        """Return what these streams of an episode, or all, are read from; None: all files of the container."""
+
+
+@runtime_checkable
+class Naming(Protocol):
+    """A container that may hold recordings which have had their names before, in a dataset that it was exported from."""
+
+    @property
+    def names_itself(self) -> bool:
+        """Whether its episodes are named without the container's name before theirs."""
 
 
 class Container(Protocol):

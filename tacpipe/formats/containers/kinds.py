@@ -32,9 +32,9 @@ KINDS: Mapping[str, Kind] = {
         b"rosbag2_bagfile_information",
     ),
     "hdf5": Kind("tacpipe.formats.hdf5:opened", (".hdf5", ".h5")),
-    "zarr": Kind("tacpipe.formats.zarr:opened", (".zarr.zip",), (".zgroup", ".zarray", "zarr.json")),
+    "zarr": Kind("tacpipe.formats.zarr:opened", (".zarr.zip", ".zarr"), (".zgroup", ".zarray", "zarr.json")),
     "xdf": Kind("tacpipe.formats.xdf:opened", (".xdf", ".xdfz", ".xdf.gz")),
-    "lerobot": Kind("tacpipe.formats.lerobot:opened", (), ("meta/info.json",)),
+    "lerobot": Kind("tacpipe.formats.lerobot.container:opened", (), ("meta/info.json",)),
 }
 
 

@@ -8,15 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
 from tacpipe.formats.table import layout as layouts
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, RecordingOutput, Source, Values
 
 if TYPE_CHECKING:
+    from tacpipe.formats.containers.container import Share
     from tacpipe.formats.table import recordings
 
 WITHIN = "recording"  # among a source's values: which of the recordings that its files hold
 LABELS = "labels"
+STATED = "stated"  # what else a container states of the recording, where not all of its files are the recording's
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Command:
     def discover(self, params: Params, source: Path) -> dict[str, Source]:
         """Return the files and labels of each recording at or below ``source``."""
         layout = self.parsed(params)
-        return sources(layout, source, self._found(layout, source))
+        return sources(layout, source, self._found(layout, source), self.kind)
 
     def preview(self, params: Params, source: Path) -> str:
         """Return what would be read, in words."""
@@ -76,17 +79,65 @@ class Command:
         return recordings.found(layout, source)
 
 
-def sources(layout: layouts.Layout, source: Path, found: Sequence[recordings.Source]) -> dict[str, Source]:
-    """Return recordings as a stage's ``discover`` does: their files, labels, and which one of a file each is."""
+def sources(
+    layout: layouts.Layout, source: Path, found: Sequence[recordings.Source], kind: layouts.Format | None = None
+) -> dict[str, Source]:
+    """Return recordings as a stage's ``discover`` does: their files, labels, and which one of a file each is.
+
+    ``kind`` is the format of containers of which a layout without streams reads all.
+    """
     from tacpipe.formats.table import labels
 
     labelled = labels.found(layout, source if source.is_dir() else source.parent, found)
-    return {
-        one.name: Source(
-            members(one.files), {LABELS: labelled[one.name], **({} if one.within is None else {WITHIN: one.within})}
-        )
-        for one in found
-    }
+    shares = _Shares(layout, kind)
+    made = {}
+    for one in found:
+        files, stated = shares.of(one)
+        within = {} if one.within is None else {WITHIN: one.within}
+        made[one.name] = Source(files, {LABELS: labelled[one.name], **within, **({STATED: stated} if stated else {})})
+    return made
+
+
+class _Shares:
+    """Which files each recording is read from, with what else containers state of it; each container is opened once."""
+
+    def __init__(self, layout: layouts.Layout, kind: layouts.Format | None) -> None:
+        self._layout, self._kind = layout, kind
+        self._opened: dict[Path, object] = {}
+
+    def of(self, one: recordings.Source) -> tuple[dict[str, Path], dict[str, object]]:
+        files: dict[str, Path] = {}
+        stated: dict[str, object] = {}
+        by_place: dict[Path, list[str]] = {}
+        for name, place in one.files.items():
+            by_place.setdefault(place, []).append(name)
+        for place, names in by_place.items():
+            share = self._share(place, names, one.within) if place.is_dir() else None
+            if share is None:
+                files |= members(dict.fromkeys(names, place))
+                continue
+            files |= {f"{name}/{within}": path for name in names for within, path in share.files.items()}
+            if share.values:
+                stated[names[0]] = dict(share.values)
+        return files, stated
+
+    def _share(self, place: Path, names: Sequence[str], episode: str | None) -> Share | None:
+        """Return what streams of a container are read from; None: all of its files."""
+        from tacpipe.formats.containers import kinds
+        from tacpipe.formats.containers.container import Sharing
+
+        streams = {one.name: one for one in self._layout.streams if one.name in names}
+        kind = next((str(one.format) for one in streams.values()), self._kind)
+        if place not in self._opened:
+            self._opened[place] = kinds.opened(str(kind), place)
+        container = self._opened[place]
+        wanted = [one.source for one in streams.values()] or None
+        try:
+            return container.share(wanted, episode) if isinstance(container, Sharing) else None
+        except TacpipeError as error:
+            if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+                raise
+            return None  # reading it says what is wrong, of this recording alone
 
 
 def recording(layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values) -> RecordingOutput:

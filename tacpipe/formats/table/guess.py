@@ -278,7 +278,7 @@ def _rules(found: Looked, names: Sequence[str]) -> list[str]:
     for name in names:
         values = [value for value in found.values[name] if value is not None]
         kind = _kind(values)
-        by_rule.setdefault((_match(name), *_meaning(name, kind), kind), []).append(name)
+        by_rule.setdefault((_match(name), *meaning(name, kind), kind), []).append(name)
     rules = []
     for (match, quantity, unit, kind), members in by_rule.items():
         one = members[0] if len(members) == 1 else match
@@ -316,10 +316,10 @@ def _match(name: str) -> str:
     return re.sub(r"([A-Za-z_]*)\d+", placeholder, name)
 
 
-def _meaning(name: str, kind: str) -> tuple[str, str]:
+def meaning(name: str, kind: str) -> tuple[str, str]:
     """Return the quantity and the unit that a name shows.
 
-    >>> _meaning("force_x_n", "float64"), _meaning("fx", "float64"), _meaning("taxel3", "uint16")
+    >>> meaning("force_x_n", "float64"), meaning("fx", "float64"), meaning("taxel3", "uint16")
     (('force', 'N'), ('force', '?'), ('tactile', 'count'))
     """
     text = name.strip()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import recording_names
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError, UsageError
 from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Naming
 from tacpipe.formats.table import pattern, reading
 from tacpipe.formats.table.layout import FILE, Format, Layout, Stream
 from tacpipe.io import files as file_system
@@ -84,15 +85,30 @@ def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
     for path, stem in kinds.names(paths, source).items():
         stem = os.fsencode(stem).decode(errors="replace")
         files = {one.name: path for one in layout.streams} or {CONTAINER: path}
-        for episode in kinds.opened(kind, path).episodes() or (None,):
+        episodes, whole = _episodes(kind, path)
+        for episode in episodes:
             values = {FILE: stem, **({} if episode is None else {"recording": episode})}
-            plain_name = stem if episode is None else f"{stem}-{episode}"
+            plain_name = stem if episode is None else episode if whole else f"{stem}-{episode}"
             name = recording_names.valid(pattern.filled(layout.name, values) if layout.name else plain_name)
             if not name:
                 raise UsageError(f"{path} gives no name for a recording. Set name in [recordings], or rename the file.")
             sources.append(Source(name, files, {}, episode))
     recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
     return sorted(sources, key=lambda one: one.name)
+
+
+def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
+    """Return the recordings in a container, [None] where it is one, and whether these names need no container's before them.
+
+    A container that cannot be read is one: reading it says what is wrong, and others are not kept from being read.
+    """
+    try:
+        container = kinds.opened(kind, path)
+        return container.episodes() or [None], isinstance(container, Naming) and container.names_itself
+    except TacpipeError as error:
+        if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+            raise
+        return [None], False
 
 
 def _every(layout: Layout, folder: Path) -> list[Path]:
@@ -152,7 +168,7 @@ def _within(path: Path, stream: Stream) -> set[str] | None:
     import pyarrow.compute as pc
 
     if stream.contained:
-        return set(kinds.opened(str(stream.format), path).episodes()) or None
+        return {one for one in _episodes(str(stream.format), path)[0] if one is not None} or None
     file = reading.opened(path, stream)
     if stream.recording not in file.names():
         raise TacpipeError(

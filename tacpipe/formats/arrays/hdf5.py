@@ -1,0 +1,248 @@
+"""HDF5 files as trees of arrays.
+
+Nothing is read that lies in another file: external links, external storage and virtual datasets are left out and named,
+as their content would be no part of a recording's key. Of a file that is cut short all is read whose bytes are there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from tacpipe.arrays import AnyArray
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.arrays.tree import Array
+from tacpipe.io import memory, regular
+from tacpipe.printable import excerpt, plain
+
+BROKEN = (
+    OSError,
+    KeyError,
+    RuntimeError,
+    ValueError,
+    TypeError,
+)  # what h5py raises for bytes that are not as they should
+_TRUNCATED = re.compile(r"truncated file: eof = (\d+),.*stored_eof = (\d+)")
+
+
+class Hdf5Tree:
+    """An opened HDF5 file; ``bytes_left`` of one that is cut short are there, None of a whole one."""
+
+    def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
+        self.path, self._file, self._left = path, file, bytes_left
+
+    @property
+    def notes(self) -> list[str]:
+        """Return a sentence about what is missing."""
+        if self._left is None:
+            return []
+        return [f"{self.path} is cut short after {self._left:,} bytes, and what lies behind is missing. Copy it again."]
+
+    def members(self, group: str) -> tuple[list[Array], list[str]]:
+        """Return the arrays in a group and the paths of the groups in it; a group within itself is left out."""
+        arrays, below = [], []
+        with self._reading(group or "its root"):
+            found = self._file[group or "/"]
+            above = self._addresses(group)
+            for name in self._names(found):
+                path = f"{group}/{name}" if group else name
+                try:
+                    one = _member(found, name, path)
+                    again = not isinstance(one, Array) and one and _address(found[name]) in above
+                except BROKEN:
+                    if self._left is None:
+                        raise
+                    one, again = path, False  # behind the cut: listed, and refused when it is opened
+                if isinstance(one, Array):
+                    arrays.append(one)
+                elif one and not again:
+                    below.append(one)
+        return arrays, below
+
+    def is_group(self, path: str) -> bool:
+        """Return whether there is a group of this path."""
+        with self._reading(path or "its root"):
+            kind = self._file.get(path, getclass=True) if path else h5py.Group
+            return kind is not None and issubclass(kind, h5py.Group)
+
+    def attributes(self, group: str) -> Mapping[str, Any]:
+        """Return the attributes of a group, but those that cannot be read."""
+        with self._reading(group or "its root"):
+            return _attributes(self._file[group or "/"])
+
+    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+        """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""
+        memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
+        with self._reading(array.path):
+            found = self._file[array.path]
+            if self._left is not None:
+                _expect_there(found, self._left)
+            text = h5py.check_string_dtype(found.dtype) is not None
+            given = (found.asstr(errors="replace") if text else found)[() if not array.shape else slice(start, stop)]
+            return np.asarray(given)
+
+    def files(self, array: Array, start: int, stop: int) -> None:
+        """Return None: all arrays lie in one file."""
+
+    def stated(self, array: Array) -> None:
+        """Return nothing, as the file states it."""
+
+    @contextlib.contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        """Raise what h5py raises in the block as a `TacpipeError` that names file and place."""
+        try:
+            yield
+        except BROKEN as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                with regular.failing(self.path):
+                    raise
+            if self._left is not None:
+                cut = f"{self.path} is cut short after {self._left:,} bytes"
+                raise TacpipeError(f"{cut}, and {plain(what, 200)} lies behind. Copy it again.") from error
+            why = plain(str(error.args[0] if error.args else error), 200)
+            raise TacpipeError(
+                f"{self.path}: {plain(what, 200)} cannot be read: {why}. Copy the file again."
+            ) from error
+
+    def _names(self, group: h5py.Group) -> list[str]:
+        """Return the names in a group; of a file that is cut short as many as can be listed."""
+        if self._left is None:
+            return list(group)
+        found: list[bytes] = []
+        place = group.id  # kept: the links do not
+        with contextlib.suppress(*BROKEN):
+            place.links.iterate(found.append)  # a callback that returns nothing goes on
+        return [name.decode(errors="surrogateescape") for name in found]
+
+    def _addresses(self, group: str) -> set[Any]:
+        """Return where a group and those above it lie in the file."""
+        parts = group.split("/") if group else []
+        return {_address(self._file["/".join(parts[:count]) or "/"]) for count in range(len(parts) + 1)}
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Hdf5Tree]:
+    """Open an HDF5 file for reading, also one that is cut short. Raises `TacpipeError` for what is not HDF5."""
+    with regular.failing(path), regular.opened(path) as file:  # not a pipe, and what the system answers
+        size = file.seek(0, io.SEEK_END)
+    try:
+        found = h5py.File(path, "r", locking=False)
+    except BROKEN as error:
+        cut = _TRUNCATED.search(str(error))
+        if cut:
+            with _padded(path, int(cut[1]), int(cut[2])) as tree:
+                yield tree
+            return
+        if not size:
+            raise TacpipeError(f"{path} is empty. Copy it again, or take it away.") from error
+        if "already open for write" in str(error):
+            raise TacpipeError(
+                f"{path} was not closed by the program that wrote it, or is still being written. Close it there, or run "
+                f"`h5clear -s {path}` on a copy."
+            ) from error
+        raise TacpipeError(f"{path} is not an HDF5 file: {plain(str(error), 200)}.") from error
+    with found:
+        yield Hdf5Tree(path, found)
+
+
+@contextlib.contextmanager
+def _padded(path: Path, left: int, size: int) -> Iterator[Hdf5Tree]:
+    """Open a file of which ``left`` of ``size`` bytes are there. Raises `TacpipeError` where that is not enough."""
+    with regular.failing(path), regular.opened(path) as file:
+        try:
+            found = h5py.File(_Padded(file, left, size), "r")
+            with found:
+                tree = Hdf5Tree(path, found, left)
+                tree.members("")
+                yield tree
+        except BROKEN as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise
+            raise TacpipeError(
+                f"{path} is cut short: it has {left:,} bytes, and its header states {size:,}. Copy it again."
+            ) from error
+
+
+class _Padded(io.RawIOBase):
+    """A file that is cut short, with zeros to the size that it should have."""
+
+    def __init__(self, file: io.BufferedReader, left: int, size: int) -> None:
+        self._file, self._left, self._size, self._at = file, left, size, 0
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        wanted = max(0, min(len(buffer), self._size - self._at))
+        self._file.seek(min(self._at, self._left))
+        given = self._file.read(wanted)
+        buffer[: len(given)] = given
+        buffer[len(given) : wanted] = bytes(wanted - len(given))
+        self._at += wanted
+        return wanted
+
+
+def _expect_there(found: h5py.Dataset, left: int) -> None:
+    """Raise `OSError` where bytes of an array lie behind the end of a file that is cut short: they would read as zeros."""
+    if found.chunks is None:
+        offset = found.id.get_offset()
+        ends = [offset + found.id.get_storage_size()] if offset is not None else []
+    else:
+        chunks = (found.id.get_chunk_info(number) for number in range(found.id.get_num_chunks()))
+        ends = [one.byte_offset + one.size for one in chunks]
+        if not ends and found.size:
+            raise OSError("its chunks are not listed")
+    if max(ends, default=0) > left:
+        raise OSError("its values lie behind the end")
+
+
+def _member(group: h5py.Group, name: str, path: str) -> Array | str:
+    """Return an array, the path of a group, or an empty text for what is neither."""
+    link = group.get(name, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        return Array(
+            path, (), np.dtype("V"), problem=f"lies in another file ({excerpt(link.filename)}), which is not read"
+        )
+    if isinstance(link, h5py.SoftLink) and name not in group:
+        return Array(path, (), np.dtype("V"), problem="is a link to what is not there")
+    found = group[name]
+    if isinstance(found, h5py.Group):
+        return path
+    if not isinstance(found, h5py.Dataset):
+        return ""
+    problem = ""
+    if found.is_virtual or found.external:
+        problem = "has its values in another file, which is not read"
+    elif found.shape is None:
+        problem = "holds nothing"
+    return Array(path, found.shape or (), found.dtype, _attributes(found), problem)
+
+
+def _address(group: h5py.Group) -> Any:
+    about = h5py.h5o.get_info(group.id)
+    return about.fileno, about.addr
+
+
+def _attributes(found: Any) -> dict[str, Any]:
+    made = {}
+    for name in found.attrs:
+        with contextlib.suppress(*BROKEN):  # of types that numpy has not
+            made[str(name)] = found.attrs[name]
+    return made

@@ -1,0 +1,157 @@
+"""A tree of named arrays: what HDF5 and Zarr have in common, and all that is asked of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray
+from tacpipe.printable import plain
+
+MOST_COLUMNS = 4096  # of one array; one that has more is a picture or a mistake
+LONGEST_TEXT = 200  # characters of an attribute; longer ones are files of their own, as a simulator's model
+IMAGE_SIDE = 32  # pixels that a picture has at least
+IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
+COLOURS = (1, 3, 4)  # channels of a picture
+
+
+@dataclass(frozen=True)
+class Array:
+    """What a file states of one array; ``dtype`` is that of numpy, object where elements have no fixed length."""
+
+    path: str  # within the file, as "data/demo_0/actions"
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
+
+    @property
+    def name(self) -> str:
+        """The last part of the path."""
+        return self.path.rpartition("/")[2]
+
+    @property
+    def group(self) -> str:
+        """The path of the group that holds it; empty for the root."""
+        return self.path.rpartition("/")[0]
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row in memory."""
+        return int(np.prod(self.shape[1:], dtype=np.int64)) * max(self.dtype.itemsize, 1)
+
+
+class Tree(Protocol):
+    """An opened file of arrays."""
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What is missing of a file that is cut short, in sentences."""
+
+    def members(self, group: str) -> tuple[list[Array], list[str]]:
+        """The arrays in a group, and the paths of the groups in it."""
+
+    def is_group(self, path: str) -> bool:
+        """Whether there is a group of this path."""
+
+    def attributes(self, group: str) -> Mapping[str, Any]:
+        """The attributes of a group."""
+
+    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+        """The rows of an array from ``start`` up to ``stop``; a scalar array as it is. Raises `TacpipeError`."""
+
+    def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
+        """The files that hold rows of an array, by path within the store; None where all lies in one file."""
+
+    def stated(self, array: Array) -> Any:
+        """How the rows of an array are encoded, as JSON, without how many there are."""
+
+
+def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
+    """Yield each group below a group, itself first, with the arrays in it."""
+    arrays, below = tree.members(group)
+    yield group, arrays
+    for one in below:
+        yield from walk(tree, one)
+
+
+def is_frames(array: Array) -> bool:
+    """Return whether an array may hold an encoded picture a row: bytes without fixed length, or padded with zeros."""
+    if array.dtype.kind == "O":
+        return (
+            array.dtype.metadata is not None and array.dtype.metadata.get("vlen") == np.uint8 and len(array.shape) == 1
+        )
+    return array.dtype == np.uint8 and len(array.shape) == 2 and _named_as_image(array.path)
+
+
+def is_image(array: Array) -> bool:
+    """Return whether an array holds a decoded picture a row.
+
+    >>> is_image(Array("obs/agentview_image", (9, 84, 84, 3), np.dtype("uint8")))
+    True
+    >>> is_image(Array("obs/tactile", (9, 16, 3), np.dtype("uint16")))
+    False
+    """
+    sides = array.shape[1:]
+    if len(sides) < 2 or max(sides) < IMAGE_SIDE:
+        return False
+    coloured = len(sides) == 3 and (sides[-1] in COLOURS or sides[0] in COLOURS) and sorted(sides)[1] >= IMAGE_SIDE
+    return coloured or _named_as_image(array.path)
+
+
+def left_out(array: Array) -> str:
+    """Return why an array is not read as columns, as in "NAME …"; empty where it is.
+
+    >>> left_out(Array("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
+    'holds decoded pictures (480 x 640 x 3), which are not read'
+    """
+    if array.problem:
+        return array.problem
+    if is_image(array):
+        return f"holds decoded pictures ({' x '.join(map(str, array.shape[1:]))}), which are not read"
+    if array.dtype.kind not in "biufSUOTV" or (array.dtype.itemsize > 8 and array.dtype.kind == "f"):
+        return f"has the type {array.dtype}, which is not read"
+    if array.dtype.kind == "O" and not is_text(array) and not is_frames(array):
+        return "has elements of no fixed length, which are not read"
+    if not is_frames(array) and int(np.prod(array.shape[1:], dtype=np.int64)) > MOST_COLUMNS:
+        return f"has {int(np.prod(array.shape[1:], dtype=np.int64))} values a row, more than the {MOST_COLUMNS} of a stream"
+    return ""
+
+
+def is_text(array: Array) -> bool:
+    """Return whether an array holds text."""
+    about = array.dtype.metadata
+    return array.dtype.kind in "SUT" or (about is not None and about.get("vlen") in (str, bytes))
+
+
+def plain_attributes(found: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
+    """Return the attributes that are a text of some length, a number, or true or false, as plain values.
+
+    >>> plain_attributes({"a": np.float32(0.5), "b": b"x", "c": np.array([1, 2]), "d": np.array([3])})
+    {'a': 0.5, 'b': 'x', 'd': 3}
+    """
+    made: dict[str, str | int | float | bool] = {}
+    for name, value in found.items():
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(-1)[0]
+        if isinstance(value, np.generic):
+            value = value.item()
+        if isinstance(value, bytes):
+            value = value.decode(errors="replace")
+        finite = not isinstance(value, float) or math.isfinite(value)
+        if isinstance(value, str | int | float | bool) and finite and len(str(value)) <= LONGEST_TEXT:
+            made[plain(str(name))] = value
+    return made
+
+
+def _named_as_image(path: str) -> bool:
+    return any(word in path.lower() for word in IMAGE_NAMES)

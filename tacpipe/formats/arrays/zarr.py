@@ -1,0 +1,277 @@
+"""Zarr stores as trees of arrays: folders and zip files, format 2 and 3.
+
+Metadata are read as the JSON that they are, values by the library zarr. A chunk that is not there is refused unless that
+was allowed: by the specification it holds fill values alone, and so zarr reads a lost file as zeros without a word.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import json
+import math
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.arrays.tree import Array
+from tacpipe.io import memory, regular
+from tacpipe.printable import excerpt, listed, plain
+
+MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
+MOST_BYTES = 1 << 26  # of a file of metadata
+BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
+BROKEN = (  # what zarr and its codecs raise for bytes that are not as they should be
+    *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
+    SystemError,  # of blosc
+)
+_filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether a chunk that is not there holds fill values
+_KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
+
+
+@dataclass(frozen=True)
+class ZarrTree:
+    """A Zarr store: ``path`` is a folder or a zip file, ``names`` what a zip file holds, None of a folder."""
+
+    path: Path
+    names: frozenset[str] | None
+    notes: Sequence[str] = ()
+
+    def members(self, group: str) -> tuple[list[Array], list[str]]:
+        """Return the arrays in a group and the paths of the groups in it, sorted."""
+        arrays, below = [], []
+        for name in self._below(group):
+            path = f"{group}/{name}" if group else name
+            found = self._node(path)
+            if found is not None and "shape" in found[0]:
+                arrays.append(_array(path, *found))
+            elif found is not None:
+                below.append(path)
+        return arrays, below
+
+    def is_group(self, path: str) -> bool:
+        """Return whether there is a group of this path."""
+        found = self._node(path)
+        return found is not None and "shape" not in found[0]
+
+    def attributes(self, group: str) -> Mapping[str, Any]:
+        """Return the attributes of a group."""
+        found = self._node(group)
+        return found[1] if found is not None else {}
+
+    def read(self, array: Array, start: int, stop: int) -> AnyArray:
+        """Return the rows of an array. Raises `TacpipeError` for what is damaged, and for a chunk that is not there."""
+        import zarr
+
+        stop = min(stop, array.shape[0]) if array.shape else 1
+        memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
+        chunks = self.chunks(array, start, stop)
+        lost = [name for name in chunks if not self._has(name)]
+        for name in chunks if self.names is None else ():
+            if name not in lost:
+                with regular.failing(self.path / name):
+                    regular.require(self.path / name, (self.path / name).stat().st_mode)  # zarr would wait for a pipe
+        if lost and not _filled.get():
+            raise TacpipeError(
+                f"{self.path} lacks {listed(lost, 2)}, which hold{'s' * (len(lost) == 1)} rows of {plain(array.path, 200)}. "
+                f"Copy the store again; if the program that wrote it leaves out chunks of fill values alone, as zarr 3 "
+                f"does, give --fill-missing-chunks."
+            )
+        try:
+            with self._store() as store:
+                found = zarr.open_array(store, path=array.path, mode="r")
+                return np.asarray(found[() if not array.shape else slice(start, stop)])
+        except BROKEN as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                with regular.failing(self.path):
+                    raise
+            raise TacpipeError(
+                f"{self.path}: {plain(array.path, 200)}, rows {start + 1} to {stop}, cannot be read: "
+                f"{plain(str(error), 200)}. Copy the store again."
+            ) from error
+
+    def chunks(self, array: Array, start: int, stop: int) -> list[str]:
+        """Return the names, within the store, of the files that hold rows of an array."""
+        found = self._node(array.path)
+        assert found is not None
+        shape, key = _grid(found[0])
+        if math.prod(array.shape) == 0 or stop <= start:
+            return []
+        spans = [range(math.ceil(size / step)) for size, step in zip(array.shape, shape, strict=True)]
+        if spans:
+            spans[0] = range(start // shape[0], math.ceil(stop / shape[0]))
+        return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
+
+    def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
+        """Return the files that hold rows of an array; None of a zip file."""
+        if self.names is not None:
+            return None
+        return {name: self.path / name for name in self.chunks(array, start, stop) if self._has(name)}
+
+    def stated(self, array: Array) -> Any:
+        """Return the metadata of an array but for its shape, which grows with each recording that is added."""
+        found = self._node(array.path)
+        return {key: value for key, value in found[0].items() if key != "shape"} if found is not None else None
+
+    def _has(self, name: str) -> bool:
+        return os.path.lexists(self.path / name) if self.names is None else name in self.names
+
+    def _below(self, group: str) -> list[str]:
+        """Return the names of the folders in a group."""
+        if self.names is None:
+            with regular.failing(self.path), os.scandir(self.path / group) as entries:
+                return sorted(one.name for one in entries if one.is_dir(follow_symlinks=False))
+        start = f"{group}/" if group else ""
+        return sorted(
+            {
+                name[len(start) :].partition("/")[0]
+                for name in self.names
+                if name.startswith(start) and "/" in name[len(start) :]
+            }
+        )
+
+    def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+        """Return metadata and attributes of a group or an array; None where there is neither."""
+        for mark in MARKS:
+            name = f"{path}/{mark}" if path else mark
+            if self._has(name):
+                about = self._json(name)
+                if mark == MARKS[-1]:
+                    attributes = about.get("attributes", {})
+                else:
+                    beside = f"{path}/.zattrs" if path else ".zattrs"
+                    attributes = self._json(beside) if self._has(beside) else {}
+                return about, attributes if isinstance(attributes, dict) else {}
+        return None
+
+    def _json(self, name: str) -> dict[str, Any]:
+        try:
+            found = json.loads(self._content(name))
+        except (*BROKEN_ZIP, RecursionError) as error:
+            raise TacpipeError(f"{self.path}: {plain(name, 200)} cannot be read: {plain(str(error), 200)}.") from error
+        if not isinstance(found, dict):
+            raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(found)}; it must be a JSON object.")
+        return found
+
+    def _content(self, name: str) -> bytes:
+        if self.names is None:
+            with regular.failing(self.path / name):
+                return regular.content(self.path / name, MOST_BYTES)
+        with _archive(self.path) as archive:
+            if archive.getinfo(name).file_size > MOST_BYTES:
+                raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MOST_BYTES:,} bytes.")
+            return archive.read(name)
+
+    @contextlib.contextmanager
+    def _store(self) -> Iterator[Any]:
+        from zarr import storage
+
+        if self.names is None:
+            yield storage.LocalStore(self.path, read_only=True)
+            return
+        store = storage.ZipStore(self.path, mode="r")
+        try:
+            yield store
+        finally:
+            store.close()
+
+
+@contextlib.contextmanager
+def missing_chunks(*, filled: bool) -> Iterator[None]:
+    """Have chunks that are not there read as fill values in the block, or refused, as they are without it."""
+    before = _filled.set(filled)
+    try:
+        yield
+    finally:
+        _filled.reset(before)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[ZarrTree]:
+    """Open a Zarr store, folder or zip file. Raises `TacpipeError` where it is neither."""
+    names = None
+    if not path.is_dir():
+        try:
+            with _archive(path) as archive:
+                names = frozenset(archive.namelist())
+        except BROKEN_ZIP as error:
+            raise TacpipeError(
+                f"{path} is not a whole zip file: {plain(str(error), 200)}. Its table of contents lies at its end: copy the "
+                f"file again."
+            ) from error
+    found = ZarrTree(path, names)
+    if not found.is_group(""):
+        raise TacpipeError(f"{path} is not a Zarr group: it has no .zgroup or zarr.json of one at its top.")
+    yield found
+
+
+@contextlib.contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    with regular.failing(path):
+        file = regular.opened(path)
+    with file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                yield archive
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # a place before the file's first byte, where its table is wrong
+                with regular.failing(path):
+                    raise
+            raise zipfile.BadZipFile("its table of contents leads out of the file") from error
+
+
+def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
+    problem = ""
+    shape = about.get("shape")
+    if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
+        return Array(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is none")
+    try:
+        kind = _dtype(about)
+    except (TypeError, ValueError, LookupError, AttributeError):
+        kind, problem = np.dtype("V"), f"has the type {excerpt(about.get('dtype', about.get('data_type')))}"
+    try:
+        steps, _ = _grid(about)
+    except (TypeError, ValueError, LookupError, AttributeError):
+        steps = []
+    if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
+        problem = "has chunks of no known shape"
+    return Array(path, tuple(shape), kind, attributes, f"{problem}, which is not read" if problem else "")
+
+
+def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
+    if about.get("zarr_format") == 3:
+        called = about["data_type"]
+        if called in ("string", "variable_length_utf8"):
+            return np.dtype("O", metadata={"vlen": str})
+        if not _KINDS.fullmatch(called):
+            raise TypeError(called)
+        return np.dtype(str(called))
+    kind: Any = about["dtype"]
+    if kind == "|O":
+        texts = [one.get("id") for one in about.get("filters") or ()]
+        return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})
+    found: np.dtype[Any] = np.dtype([tuple(one) for one in kind] if isinstance(kind, list) else kind)
+    return found
+
+
+def _grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
+    """Return the shape of a chunk, and a function from its place in the grid to its name within the array."""
+    if about.get("zarr_format") == 3:
+        encoding = about.get("chunk_key_encoding", {"name": "default"})
+        between = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")
+        before = ["c"] if encoding["name"] == "default" else []
+        shape = about["chunk_grid"]["configuration"]["chunk_shape"]
+        return list(shape), lambda at: between.join([*before, *map(str, at)]) or "0"
+    between = about.get("dimension_separator") or "."
+    return list(about["chunks"]), lambda at: between.join(map(str, at)) or "0"

@@ -1,0 +1,261 @@
+"""LeRobot datasets as containers of streams: an episode a recording, a feature a stream.
+
+The frames have one rate. Where ``timestamp`` agrees with ``frame_index / fps``, the stamps are that quotient, exact to the
+nanosecond; else they are the column's own float32 seconds. The metadata of ``t_ns`` state which.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from tacpipe.arrays import Int64s
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.arrays import known
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Contents, Share, SourceStream, Time
+from tacpipe.formats.lerobot import description
+from tacpipe.formats.lerobot.description import Description, Episode, Feature
+from tacpipe.io import memory, regular
+from tacpipe.io.parquet import ParquetTable
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import plain
+
+NATIVE = "tacpipe"  # the folder with the streams that a dataset was exported from, a folder a recording
+TOLERANCE_S = 1e-4  # as LeRobot's own
+INDEX, FRAME, STAMP = "episode_index", "frame_index", "timestamp"
+OWN = (INDEX, FRAME, STAMP, "index", "task_index")  # features that count frames
+TOGETHER = ("next", NATIVE)  # features that begin so are one stream, as next.reward and next.done
+EXACT = f"{NATIVE}.t_ns"  # the feature with the stamps in ns, of datasets that tacpipe exported
+CLOCK = Time(column="t_ns", unit="ns", origin="start")
+FROM_RATE, FROM_STAMPS = "frame_index / fps", "timestamp, float32 seconds"
+
+
+class LeRobotContainer:
+    """A LeRobot dataset."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def episodes(self) -> Sequence[str]:
+        """Return the names of the episodes, by index."""
+        return list(self._episodes)
+
+    def look(self, episode: str | None) -> Contents:
+        """Return the streams of an episode, without rows."""
+        return self._contents(self._named(episode), None, rows=False)
+
+    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+        """Return the streams of an episode, all or those of some features."""
+        return self._contents(self._named(episode), sources, rows=True)
+
+    @property
+    def names_itself(self) -> bool:
+        """Whether the episodes have the names of the recordings that they were exported from."""
+        return all(one.original is not None for one in self._episodes.values())
+
+    def share(self, sources: Collection[str] | None, episode: str | None) -> Share:
+        """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
+        one = self._named(episode)
+        about = self._about
+        found = [self.path / one.file, *self._native(one).values()]
+        files = {path.relative_to(self.path).as_posix(): path for path in found if os.path.lexists(path)}
+        stated = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": one.index}
+        stated |= {"tasks": list(one.tasks), "videos": dict(one.videos), "attributes": dict(one.attributes)}
+        stated |= {"length": one.length}
+        return Share(files or {description.INFO: self.path / description.INFO}, stated)
+
+    @functools.cached_property
+    def _about(self) -> Description:
+        return description.read(self.path)
+
+    @functools.cached_property
+    def _episodes(self) -> dict[str, Episode]:
+        return {one.name: one for one in self._about.episodes()}
+
+    def _named(self, name: str | None) -> Episode:
+        if name not in self._episodes:
+            raise TacpipeError(f"{self.path} holds no episode {plain(str(name))}.")
+        return self._episodes[name]
+
+    def _native(self, episode: Episode) -> dict[str, Path]:
+        """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
+        folder, file = self.path / NATIVE / episode.name, self.path / NATIVE / f"{episode.name}.parquet"
+        found = {path.stem: path for path in sorted(folder.glob("*.parquet"))} if folder.is_dir() else {}
+        return {"": file} if file.is_file() and not found else found
+
+    def _contents(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> Contents:
+        native = self._native(episode)
+        if native:
+            streams = [self._exact(name, path) for name, path in native.items() if _wanted(name, sources)]
+            return Contents(streams, episode.original or {})
+        attributes: dict[str, Attribute] = {**episode.attributes, "episode_index": episode.index}
+        attributes |= episode.original or {}
+        if episode.tasks:
+            attributes["task"] = "; ".join(episode.tasks)
+        if self._about.robot:
+            attributes["robot_type"] = self._about.robot
+        skipped = {key: f"is a video, {path}, which is not read" for key, path in episode.videos.items()}
+        attributes |= {f"video.{key}": path for key, path in episode.videos.items()}
+        streams = self._streams(episode, sources, rows=rows)
+        return Contents(streams, attributes | {"fps": self._about.fps}, skipped)
+
+    def _exact(self, name: str, path: Path) -> SourceStream:
+        """Return a stream as it was before the export, to the bit."""
+        try:
+            table = ParquetTable(regular.source(path)).read()
+        except TacpipeError as error:
+            raise TacpipeError(f"{path} cannot be read: {error} Copy it again.") from error
+        return SourceStream(name, name, Time(column="t_ns", unit="ns"), table, table.num_rows)
+
+    def _streams(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> list[SourceStream]:
+        by_source: dict[str, list[Feature]] = {}
+        for feature in self._about.features.values():
+            if feature.key not in (*OWN, EXACT) and feature.dtype != "video":
+                first = feature.key.partition(".")[0]
+                by_source.setdefault(first if first in TOGETHER else feature.key, []).append(feature)
+        names = kinds.identifiers([_called(source) for source in by_source])
+        chosen = {source: features for source, features in by_source.items() if _wanted(source, sources)}
+        exact = [EXACT] if EXACT in self._about.features else []
+        frames = self._frames(episode, [*exact, *(one.key for features in chosen.values() for one in features)])
+        if exact:
+            t_ns, made = frames.column(EXACT).to_numpy(), {}
+        else:
+            t_ns, how = _stamps(frames, self._about.fps, self.path / episode.file)
+            made = {"made": how}
+        clock = pa.field(CLOCK.column, pa.int64(), metadata=made)
+        frames = frames if rows else frames.slice(0, 0)
+        found = []
+        for source, features in chosen.items():
+            columns = [(clock, pa.array(t_ns[: frames.num_rows]))]
+            for feature in features:
+                columns += self._columns(episode, feature, frames.column(feature.key))
+            table = pa.table([values for _, values in columns], pa.schema([field for field, _ in columns]))
+            time = replace(CLOCK, origin="unix") if exact else CLOCK
+            found.append(SourceStream(source, names[_called(source)], time, table, episode.length))
+        return found
+
+    def _frames(self, episode: Episode, keys: Sequence[str]) -> pa.Table:
+        """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""
+        path = self.path / episode.file
+        with description.parquet_errors(path), regular.opened(path) as source:
+            file = pq.ParquetFile(source)
+            there = set(file.schema_arrow.names)
+            missing = [key for key in (INDEX, FRAME, STAMP, *keys) if key not in there]
+            if missing:
+                raise TacpipeError(f"{path} has no column {plain(missing[0])}, which {description.INFO} names.")
+            groups = _groups(file, episode.index)
+            memory.require(sum(file.metadata.row_group(one).total_byte_size for one in groups), str(path))
+            found = file.read_row_groups(groups, columns=[INDEX, FRAME, STAMP, *keys], use_threads=False)
+        found = found.filter(pc.equal(found.column(INDEX), episode.index))
+        if found.num_rows != episode.length:
+            raise TacpipeError(
+                f"{path} holds {found.num_rows} frames of episode {episode.index}, and the folder meta states "
+                f"{episode.length}. Copy the dataset again."
+            )
+        return found
+
+    def _columns(
+        self, episode: Episode, feature: Feature, values: pa.ChunkedArray
+    ) -> list[tuple[pa.Field, pa.Array | pa.ChunkedArray]]:
+        if feature.dtype == "image":
+            return [(pa.field("frame", pa.binary(), metadata={"quantity": "image"}), _pictures(values))]
+        last = feature.key.rpartition(".")[2]
+        about = known.meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
+        names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])
+        found: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
+        for at, column in enumerate(self._flat(episode, feature, values)):
+            one = about[at] if about[at] != known.NOTHING else known.of_name(names[at], feature.dtype)
+            metadata = {"quantity": one.quantity, "unit": one.unit, "component": one.component}
+            if feature.quantities:
+                metadata = {"quantity": feature.quantities[at], "unit": feature.units[at] if feature.units else ""}
+            found.append((pa.field(names[at], column.type, metadata={k: v for k, v in metadata.items() if v}), column))
+        return found
+
+    def _flat(
+        self, episode: Episode, feature: Feature, values: pa.ChunkedArray
+    ) -> Sequence[pa.Array | pa.ChunkedArray]:
+        """Return the columns of a feature, which may be lists within lists."""
+        kind = values.type
+        inner = values.combine_chunks()
+        while (
+            pa.types.is_list(inner.type)
+            or pa.types.is_fixed_size_list(inner.type)
+            or pa.types.is_large_list(inner.type)
+        ):
+            inner = inner.flatten()
+        if not pa.types.is_nested(kind):
+            return [pa.array(inner)]
+        if len(inner) != len(values) * feature.width or inner.null_count:
+            raise TacpipeError(
+                f"{self.path / episode.file}: {plain(feature.key)} holds rows of another length than the {feature.width} "
+                f"values that {description.INFO} states."
+            )
+        if pa.types.is_string(inner.type):
+            return [inner.take(pa.array(np.arange(at, len(inner), feature.width))) for at in range(feature.width)]
+        flat = inner.to_numpy(zero_copy_only=False).reshape(len(values), feature.width)
+        return [pa.array(np.ascontiguousarray(flat[:, at])) for at in range(feature.width)]
+
+
+def opened(path: Path) -> LeRobotContainer:
+    """Return the dataset in the folder ``path``."""
+    return LeRobotContainer(path)
+
+
+def _wanted(source: str, sources: Collection[str] | None) -> bool:
+    return sources is None or source in sources
+
+
+def _called(source: str) -> str:
+    """Return what a stream is named after: its feature without the parts that all have.
+
+    >>> _called("observation.state"), _called("observation.tactile.xela1"), _called("action")
+    ('state', 'xela1', 'action')
+    """
+    return source.removeprefix("observation.").removeprefix("tactile.").removeprefix("images.")
+
+
+def _groups(file: pq.ParquetFile, episode: int) -> list[int]:
+    """Return the row groups that may hold an episode, by the statistics of its index."""
+    metadata = file.metadata
+    column = [metadata.schema.column(one).path for one in range(metadata.num_columns)].index(INDEX)
+    about = [metadata.row_group(group).column(column).statistics for group in range(metadata.num_row_groups)]
+    return [
+        group for group, one in enumerate(about) if one is None or not one.has_min_max or one.min <= episode <= one.max
+    ]
+
+
+def _stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
+    """Return the stamps of frames (time,) in ns from the start of the episode, and what they are made from."""
+    index = frames.column(FRAME).to_numpy().astype(np.int64)  # (time,)
+    seconds = frames.column(STAMP).to_numpy().astype(np.float64)
+    if not np.isfinite(seconds).all():
+        row = int((~np.isfinite(seconds)).argmax())
+        raise TacpipeError(f"{path}: {STAMP} of frame {row + 1} is {seconds[row]}; it must be a number of seconds.")
+    allowed_s = TOLERANCE_S + np.spacing(np.abs(seconds).astype(np.float32))  # what float32 cannot state
+    if (np.abs(index / fps - seconds) <= allowed_s).all():
+        return _quotients(index, fps), FROM_RATE
+    return np.rint(seconds * 1e9).astype(np.int64), FROM_STAMPS
+
+
+def _quotients(index: Int64s, fps: float) -> Int64s:
+    """Return ``index / fps`` in ns (frame,), rounded, in whole numbers: ``fps`` is exactly a quotient of two.
+
+    >>> _quotients(np.array([1, 2, 3]), 30.0).tolist()
+    [33333333, 66666667, 100000000]
+    """
+    above, below = fps.as_integer_ratio()
+    return np.array([(2 * int(one) * 10**9 * below + above) // (2 * above) for one in index], np.int64)
+
+
+def _pictures(values: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return the bytes of pictures, which are kept with a path beside them."""
+    return pc.struct_field(values, "bytes") if pa.types.is_struct(values.type) else values

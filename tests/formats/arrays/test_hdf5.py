@@ -1,0 +1,269 @@
+"""HDF5 files, as h5py, robomimic and ALOHA write them."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats import hdf5
+from tacpipe.formats.table.contained import Params
+from tacpipe.plugins.stage import RecordingOutput
+from tests.formats.arrays import files
+
+NONE = Params()
+
+
+def given(text: str) -> Params:
+    return Params(json.dumps(tomllib.loads(text)))
+
+
+def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
+    found = hdf5.COMMAND.discover(params, folder)
+    return {name: hdf5.hdf5(params, one.files, one.values) for name, one in found.items()}
+
+
+def about(table: pa.Table, column: str) -> dict[str, str]:
+    return {key.decode(): value.decode() for key, value in (table.schema.field(column).metadata or {}).items()}
+
+
+def test_each_demonstration_of_robomimic_is_a_recording_at_the_rate_of_its_controller(tmp_path: Path) -> None:
+    files.robomimic(tmp_path / "lift.hdf5", demos=11)
+    found = read(tmp_path)
+    assert set(found) == {f"lift-demo_{number}" for number in range(11)}
+    obs = found["lift-demo_10"].streams["obs"]
+    assert obs.column("t_ns").to_pylist() == [row * 50_000_000 for row in range(20)]
+    expected = files.values(20, 3, seed=10)
+    assert obs.column("robot0_eef_pos_y").to_pylist() == expected[:, 1].tolist()
+    assert about(obs, "robot0_eef_pos_y") == {"quantity": "position", "unit": "m", "component": "y"}
+    assert about(obs, "tactile_3_2") == {"quantity": "tactile", "unit": "count", "taxel": "4", "axis": "z"}
+    assert obs.schema.field("tactile_3_2").type == pa.uint16()
+    assert "unit" not in about(obs, "robot0_gripper_qpos_0")
+    assert found["lift-demo_10"].attributes["env_args.env_name"] == "Lift"
+    assert found["lift-demo_10"].attributes["num_samples"] == 20
+
+
+def test_what_is_left_out_is_named_with_its_reason(tmp_path: Path) -> None:
+    files.robomimic(tmp_path / "lift.hdf5", demos=1)
+    (found,) = read(tmp_path).values()
+    said = " ".join(found.notes)
+    assert all(part in said for part in ("obs/agentview_image", "84 x 84 x 3", "next_obs", "model_file", "800"))
+    assert "agentview_image" in str(found.attributes["skipped"])
+
+
+def test_frames_of_aloha_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
+    files.aloha(tmp_path / "episode_0.hdf5")
+    layout = """
+    [streams.arms]
+    source = "observations"
+    time = { rate_hz = 50 }
+    [streams.camera]
+    source = "observations/images/cam_high"
+    time = { rate_hz = 50 }
+    """
+    (found,) = read(tmp_path, given(layout)).values()
+    assert found.streams["camera"].column("frame").to_pylist() == files.pictures(8)
+    assert about(found.streams["camera"], "frame") == {"quantity": "image", "encoding": "jpeg"}
+    assert about(found.streams["arms"], "qpos_5") == {"quantity": "joint_position", "unit": "rad"}
+    assert about(found.streams["arms"], "qpos_6") == {"quantity": "state", "unit": "1"}
+    assert found.streams["arms"].column("t_ns").to_pylist()[1] == 20_000_000
+
+
+def test_decoded_frames_are_named_and_not_read(tmp_path: Path) -> None:
+    files.aloha(tmp_path / "episode_0.hdf5", compressed=False)
+    layout = '[streams.camera]\nsource = "observations/images/cam_high"\ntime = { rate_hz = 50 }'
+    with pytest.raises(TacpipeError, match=r"episode_0\.hdf5: observations/images/cam_high .*48 x 64 x 3"):
+        read(tmp_path, given(layout))
+
+
+def test_frames_of_their_own_length_are_kept(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time_ns"] = files.START_NS + np.arange(3)
+        made = file.create_dataset("cam", (3,), dtype=h5py.vlen_dtype(np.uint8))
+        for row, frame in enumerate(files.pictures(3)):
+            made[row] = np.frombuffer(frame, np.uint8)
+    (found,) = read(tmp_path).values()
+    assert found.streams["cam"].column("frame").to_pylist() == files.pictures(3)
+    assert found.streams["cam"].column("t_ns").to_pylist() == [files.START_NS + row for row in range(3)]
+
+
+def test_without_a_rate_nothing_is_read_and_the_entry_to_write_is_named(tmp_path: Path) -> None:
+    files.robomimic(tmp_path / "lift.hdf5", demos=1, rate_hz=None)
+    with pytest.raises(TacpipeError, match=r"lift\.hdf5 .*\[streams\.\w+\].*rate_hz"):
+        read(tmp_path)
+
+
+def test_groups_of_a_lab_have_their_own_stamps_units_and_labels(tmp_path: Path) -> None:
+    files.lab(tmp_path / "run.h5")
+    (found,) = read(tmp_path).values()
+    assert set(found.streams) == {"skin", "arm", "gripper"}
+    skin, arm, gripper = (found.streams[name] for name in ("skin", "arm", "gripper"))
+    assert skin.column("t_ns").to_pylist() == [files.START_NS + row * 10_000_000 for row in range(50)]
+    assert skin.column("taxels_3").to_pylist() == list(range(3, 200, 4))
+    assert about(arm, "load_2") == {"unit": "N"}
+    assert arm.column("t_ns").to_pylist()[4] == files.START_NS + 10**9
+    assert gripper.column_names == ["t_ns", "width", "status"]
+    assert gripper.column("t_ns").to_pylist() == [row * 100_000_000 for row in range(6)]
+    assert gripper.column("status").to_pylist() == ["ok"] * 6
+    assert (
+        found.attributes["material"] == "cork" and found.attributes["trial"] == 3 and found.attributes["mass"] == 0.25
+    )
+    assert "calibration" in " ".join(found.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "stamps", "unit", "second"),
+    [
+        ("timestamps", [1.7e9, 1.7e9 + 1], None, 1_700_000_001 * 10**9),
+        ("t_us", [0, 1_000_000], None, 10**9),
+        ("time", [0.0, 0.5], "seconds", 5 * 10**8),
+        ("stamp", [1_700_000_000_000, 1_700_000_000_007], None, 1_700_000_000_007 * 10**6),
+    ],
+)
+def test_the_unit_of_stamps_is_that_of_attribute_name_or_size(
+    tmp_path: Path, name: str, stamps: list[float], unit: str | None, second: int
+) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file[name], file["x"] = stamps, [1.0, 2.0]
+        if unit:
+            file[name].attrs["unit"] = unit
+    (found,) = read(tmp_path).values()
+    assert found.streams["x"].column("t_ns").to_pylist()[1] == second
+
+
+def test_stamps_of_no_known_unit_are_not_taken_for_seconds(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time"], file["x"] = [0.0, 1.0], [1.0, 2.0]
+    with pytest.raises(TacpipeError, match=r"a\.h5 .*rate_hz"):
+        read(tmp_path)
+    (found,) = read(tmp_path, given('[streams.x]\nsource = "x"\ntime = { column = "time", unit = "ms" }')).values()
+    assert found.streams["x"].column("t_ns").to_pylist() == [0, 10**6]
+
+
+@pytest.mark.parametrize(
+    "kind", ["int8", "uint8", "int16", ">i4", "uint32", "int64", "uint64", "float32", ">f8", "bool"]
+)
+def test_values_keep_their_type_and_every_bit(tmp_path: Path, kind: str) -> None:
+    wanted = np.arange(-3, 4).astype(kind)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["rate_hz"], file["x"] = 10, wanted
+    (found,) = read(tmp_path).values()
+    column = found.streams["x"].column("x")
+    assert column.to_pylist() == wanted.tolist()
+    assert column.type == pa.from_numpy_dtype(np.dtype(kind).newbyteorder("="))
+
+
+def test_arrays_of_another_length_are_a_stream_of_their_own(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["fps"] = 10
+        file["robot/q"], file["robot/dq"], file["robot/slow"] = (
+            files.values(9, 7),
+            files.values(9, 7),
+            files.values(4, 2),
+        )
+    (found,) = read(tmp_path).values()
+    assert {name: one.num_rows for name, one in found.streams.items()} == {"dq": 9, "slow": 4}
+    assert len(found.streams["dq"].column_names) == 15
+
+
+def test_nothing_of_another_file_is_read(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "secret.bin", "w") as file:
+        file["x"] = np.arange(4.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["rate_hz"] = 10
+        file["y"] = np.arange(4.0)
+        file["linked"] = h5py.ExternalLink(str(tmp_path / "secret.bin"), "/x")
+        layout = h5py.VirtualLayout(shape=(4,), dtype="f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "secret.bin"), "x", shape=(4,))
+        file.create_virtual_dataset("virtual", layout)
+    (found,) = read(tmp_path).values()
+    assert found.streams["y"].column_names == ["t_ns", "y"]
+    assert "linked" in " ".join(found.notes) and "virtual" in " ".join(found.notes)
+
+
+def test_a_group_within_itself_ends(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["rate_hz"] = 10
+        file["g/x"] = np.arange(4.0)
+        file["g/again"] = file["g"]
+    (found,) = read(tmp_path).values()
+    assert set(found.streams) == {"g"}
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (lambda content: content[: len(content) // 2], ("cut short",)),
+        (lambda content: b"", ("empty",)),
+        (lambda content: b"time,x\n" * 100, ("not an HDF5 file",)),
+    ],
+)
+def test_a_damaged_file_is_one_sentence_and_keeps_no_other_from_being_read(
+    tmp_path: Path, damage: object, parts: tuple[str, ...]
+) -> None:
+    assert callable(damage)
+    files.lab(tmp_path / "good.h5")
+    (tmp_path / "bad.h5").write_bytes(damage((tmp_path / "good.h5").read_bytes()))
+    found = hdf5.COMMAND.discover(NONE, tmp_path)
+    assert set(found) == {"bad", "good"}
+    assert hdf5.hdf5(NONE, found["good"].files, found["good"].values).streams
+    with pytest.raises(TacpipeError, match=r"bad\.h5") as raised:
+        hdf5.hdf5(NONE, found["bad"].files, found["bad"].values)
+    assert all(part in str(raised.value) for part in parts)
+
+
+def test_of_a_file_that_is_cut_short_all_is_read_whose_bytes_are_there_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "lift.hdf5"
+    files.robomimic(path, demos=40)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 6 // 10])
+    found = hdf5.COMMAND.discover(NONE, tmp_path)
+    whole = 0
+    for name, one in found.items():
+        number = int(name.rpartition("_")[2])
+        try:
+            made = hdf5.hdf5(NONE, one.files, one.values)
+        except TacpipeError as error:
+            assert "lift.hdf5" in str(error)
+            continue
+        expected = files.values(10 + number, 3, seed=number)
+        assert made.streams["obs"].column("robot0_eef_pos_x").to_pylist() == expected[:, 0].tolist()
+        assert f"{len(content) * 6 // 10:,} bytes" in " ".join(made.notes)
+        whole += 1
+    assert 10 < whole < 30
+
+
+def test_a_damaged_array_is_named_and_costs_its_own_recording(tmp_path: Path) -> None:
+    path = tmp_path / "lift.hdf5"
+    with h5py.File(path, "w") as file:
+        for number in range(2):
+            group = file.create_group(f"demo_{number}")
+            group.attrs["rate_hz"] = 10
+            group.create_dataset("x", data=files.values(4000), compression="gzip", chunks=(4000,))
+        place = file["demo_1/x"].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[place.byte_offset + 500 : place.byte_offset + 700] = bytes(200)
+    path.write_bytes(content)
+    found = hdf5.COMMAND.discover(NONE, tmp_path)
+    assert hdf5.hdf5(NONE, found["lift-demo_0"].files, found["lift-demo_0"].values).streams["x"].num_rows == 4000
+    with pytest.raises(TacpipeError, match=r"lift\.hdf5: demo_1/x"):
+        hdf5.hdf5(NONE, found["lift-demo_1"].files, found["lift-demo_1"].values)
+
+
+def test_the_layout_that_a_guess_prints_reads_the_same(tmp_path: Path) -> None:
+    files.lab(tmp_path / "run.h5")
+    (plain,), (laid,) = read(tmp_path).values(), read(tmp_path, given(hdf5.COMMAND.guess(tmp_path))).values()
+    assert plain.streams == laid.streams
+    for name, table in plain.streams.items():
+        assert table.schema.equals(laid.streams[name].schema, check_metadata=True)
+
+
+def test_a_guess_marks_a_rate_that_no_file_states(tmp_path: Path) -> None:
+    files.aloha(tmp_path / "episode_0.hdf5")
+    assert 'rate_hz = "?"' in hdf5.COMMAND.guess(tmp_path)

@@ -1,0 +1,252 @@
+"""LeRobot datasets, version 2.1 and 3.0."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import tacpipe
+from tacpipe.channels import schema
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.lerobot.ingest import COMMAND, lerobot
+from tacpipe.formats.table.contained import Params
+from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins.stage import RecordingOutput
+from tests.conftest import Lab
+from tests.formats.lerobot import files
+
+NONE = Params()
+EPISODE = "pick-episode_00000{}"
+
+
+def given(text: str) -> Params:
+    return Params(json.dumps(tomllib.loads(text)))
+
+
+def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
+    return {name: lerobot(params, one.files, one.values) for name, one in COMMAND.discover(params, folder).items()}
+
+
+def about(table: pa.Table, column: str) -> dict[str, str]:
+    return {key.decode(): value.decode() for key, value in (table.schema.field(column).metadata or {}).items()}
+
+
+@pytest.mark.parametrize("write", [files.write_v2, files.write_v3])
+def test_both_versions_give_the_same_recordings(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    write(tmp_path / "pick")
+    found = read(tmp_path)
+    assert list(found) == [EPISODE.format(episode) for episode in range(3)]
+    for episode, one in enumerate(found.values()):
+        assert set(one.streams) == {"state", "action", "pad", "next"}
+        table = one.streams["state"]
+        assert table.column_names == ["t_ns", *files.NAMES]
+        assert table.column("joint3_rad").to_pylist() == files.state(episode)[:, 2].tolist()
+        assert table.column("t_ns").to_pylist() == [round(row * 10**9 / files.FPS) for row in range(table.num_rows)]
+        assert about(table, "t_ns")["made"] == "frame_index / fps"
+        assert one.streams["pad"].column("pad_3").to_pylist()[:2] == [3, 7]
+        assert one.streams["next"].column("done").to_pylist()[-1] is True
+        assert one.attributes["task"] == files.TASKS[episode % 2]
+        assert one.attributes["robot_type"] == "so100"
+
+
+@pytest.mark.parametrize(
+    ("write", "path"),
+    [
+        (files.write_v2, "videos/chunk-000/observation.images.top/episode_000001.mp4"),
+        (files.write_v3, "videos/observation.images.top/chunk-000/file-004.mp4"),
+    ],
+)
+def test_a_video_is_named_with_its_path_and_not_read(tmp_path: Path, write: Callable[[Path], None], path: str) -> None:
+    write(tmp_path / "pick")
+    found = read(tmp_path)[EPISODE.format(1)]
+    assert found.attributes["video.observation.images.top"] == path
+    assert path in " ".join(found.notes)
+
+
+def test_quantities_and_units_follow_the_names(tmp_path: Path) -> None:
+    files.write_v3(tmp_path / "pick")
+    found = read(tmp_path)[EPISODE.format(0)]
+    assert about(found.streams["state"], "joint6_rad") == {"quantity": "joint_position", "unit": "rad"}
+    assert about(found.streams["state"], "gripper") == {}
+    assert about(found.streams["pad"], "pad_0") == {"quantity": "tactile", "unit": "count"}
+
+
+def test_stamps_that_the_rate_does_not_give_are_read_as_they_are(tmp_path: Path) -> None:
+    files.write_v2(tmp_path / "pick", episodes=1)
+    pq.write_table(files.frames(0, late_s=0.5), tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet")
+    (found,) = read(tmp_path).values()
+    table = found.streams["state"]
+    stamp = files.frames(0, late_s=0.5).column("timestamp")[-1].as_py()
+    assert table.column("t_ns").to_pylist()[-1] == round(stamp * 1e9)
+    assert "float32" in about(table, "t_ns")["made"]
+
+
+def test_frames_of_hours_keep_the_rate_although_float32_seconds_do_not(tmp_path: Path) -> None:
+    files.write_v2(tmp_path / "pick", episodes=1)
+    path = tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet"
+    table, frame = files.frames(0), pa.array(range(400_000, 400_012))
+    seconds = pa.compute.divide(pa.compute.cast(frame, pa.float64()), float(files.FPS)).cast(pa.float32(), safe=False)
+    table = table.set_column(table.column_names.index("frame_index"), "frame_index", frame)
+    pq.write_table(table.set_column(table.column_names.index("timestamp"), "timestamp", seconds), path)
+    (found,) = read(tmp_path).values()
+    assert found.streams["state"].column("t_ns").to_pylist()[1] == round(400_001 * 10**9 / files.FPS)
+
+
+def test_images_in_the_frames_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
+    files.write_v2(
+        tmp_path / "pick",
+        episodes=1,
+        features={**files.FEATURES, "observation.images.top": {"dtype": "image", "shape": [3, 4, 4]}},
+    )
+    pictures = [b"\x89PNG%d" % row for row in range(files.LENGTHS[0])]
+    structs = pa.array([{"bytes": one, "path": f"{row}.png"} for row, one in enumerate(pictures)])
+    table = files.frames(0).append_column("observation.images.top", structs)
+    pq.write_table(table, tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet")
+    (found,) = read(tmp_path).values()
+    assert found.streams["top"].column("frame").to_pylist() == pictures
+
+
+def test_a_layout_renames_and_adds_what_the_dataset_does_not_state(tmp_path: Path) -> None:
+    files.write_v3(tmp_path / "pick")
+    text = '[recordings]\nname = "{recording}"\n[streams.robot]\nsource = "action"\ncolumns = [\n'
+    text += '{ match = "action_{n}", name = "joint{n}_target_rad", quantity = "target_joint_position", unit = "rad" }]'
+    found = read(tmp_path, given(text))
+    assert set(found) == {"episode_000000", "episode_000001", "episode_000002"}
+    table = found["episode_000002"].streams["robot"]
+    assert about(table, "joint6_target_rad")["quantity"] == "target_joint_position"
+
+
+def _originals(root: Path) -> dict[str, pa.Table]:
+    """Add what tacpipe's own export adds: names, attributes and the streams that the frames were made of."""
+    rows = pq.read_table(root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
+    names = pa.array(["cup", "box", "can"])
+    attributes = pa.array(
+        [json.dumps({"material": name, "trial": at}) for at, name in enumerate(["cork", None, "foam"])]
+    )
+    rows = rows.append_column("tacpipe/recording", names).append_column("tacpipe/attributes", attributes)
+    pq.write_table(rows, root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
+    angles, _ = schema.joint_fields()
+    fields = [*schema.uskin_fields(), *angles, pa.field("mode", pa.string()), pa.field("on", pa.bool_())]
+    rng = np.random.default_rng(3)
+    columns = [
+        *rng.integers(0, 60000, (48, 200)),
+        *rng.normal(size=(7, 200)),
+        np.array(["a"] * 200),
+        np.arange(200) % 2,
+    ]
+    columns[50][7] = np.nan
+    t_ns = 1_700_000_000_000_000_000 + np.cumsum(rng.integers(0, 9_000_000, 200))
+    arrays = [pa.array(t_ns), *(pa.array(one).cast(field.type) for one, field in zip(columns, fields, strict=True))]
+    table = pa.table(arrays, pa.schema([schema.time_field("from mean rate"), *fields]))
+    for name in names.to_pylist():
+        (root / "tacpipe" / name).mkdir(parents=True)
+        (root / "tacpipe" / name / "xela1.parquet").write_bytes(to_parquet(table))
+    return {"xela1": table}
+
+
+def test_a_dataset_that_was_exported_gives_the_recordings_back_to_the_bit(tmp_path: Path) -> None:
+    files.write_v3(tmp_path / "pick")
+    streams = _originals(tmp_path / "pick")
+    found = read(tmp_path)
+    assert set(found) == {"cup", "box", "can"}
+    assert found["box"].attributes == {"material": None, "trial": 1}
+    assert to_parquet(found["cup"].streams["xela1"]) == to_parquet(streams["xela1"])
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (lambda root: _cut(root / "data/chunk-000/episode_000001.parquet"), ("episode_000001.parquet",)),
+        (
+            lambda root: (root / "data/chunk-000/episode_000001.parquet").unlink(),
+            ("episode_000001.parquet", "not there"),
+        ),
+        (lambda root: _shorten(root / "data/chunk-000/episode_000001.parquet"), ("episode_000001.parquet", "6", "7")),
+    ],
+)
+def test_a_damaged_file_costs_its_own_episode(
+    tmp_path: Path, damage: Callable[[Path], object], parts: tuple[str, ...]
+) -> None:
+    files.write_v2(tmp_path / "pick")
+    damage(tmp_path / "pick")
+    found = COMMAND.discover(NONE, tmp_path)
+    assert len(found) == 3
+    for name, one in found.items():
+        if name != EPISODE.format(1):
+            assert lerobot(NONE, one.files, one.values).streams
+            continue
+        with pytest.raises(TacpipeError) as raised:
+            lerobot(NONE, one.files, one.values)
+        assert all(part in str(raised.value) for part in parts)
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _shorten(path: Path) -> None:
+    pq.write_table(pq.read_table(path).slice(0, 6), path)
+
+
+@pytest.mark.parametrize(
+    ("info", "parts"),
+    [
+        ({"codebase_version": "v1.6"}, ("codebase_version", "v1.6", "v2.1")),
+        ({"fps": 0}, ("fps", "0")),
+        ({"features": {"action": [7]}}, ("action", "shape")),
+        ({"data_path": "../../{episode_index}"}, ("data_path", "leads out")),
+        ({"data_path": "data/{episode}"}, ("data_path", "episode_index")),
+    ],
+)
+def test_a_wrong_description_is_one_sentence_with_its_entry(
+    tmp_path: Path, info: dict[str, Any], parts: tuple[str, ...]
+) -> None:
+    files.write_v2(tmp_path / "pick", episodes=1)
+    path = tmp_path / "pick" / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | info))
+    with pytest.raises(TacpipeError, match=r"meta/info\.json") as raised:
+        read(tmp_path)
+    assert all(part in str(raised.value) for part in parts)
+
+
+def counts(lab: Lab, more: str = "") -> tuple[int, int]:
+    found = json.loads(lab.run(f"ingest lerobot sets -o data/rec --json {more}").out)
+    return found["ran"], found["reused"]
+
+
+def test_an_episode_that_is_added_costs_itself_alone(lab: Lab) -> None:
+    files.write_v2(lab.folder / "sets" / "pick", episodes=2)
+    assert counts(lab) == (2, 0)
+    files.write_v2(lab.folder / "sets" / "pick", episodes=3)
+    assert counts(lab) == (1, 2)
+    assert [one.attributes["task"] for one in tacpipe.open("data/rec")] == [
+        files.TASKS[0],
+        files.TASKS[1],
+        files.TASKS[0],
+    ]
+
+
+def test_a_changed_file_of_version_3_costs_the_episodes_in_it(lab: Lab) -> None:
+    files.write_v3(lab.folder / "sets" / "pick")
+    assert counts(lab) == (3, 0)
+    path = lab.folder / "sets" / "pick" / "data" / "chunk-000" / "file-001.parquet"
+    pq.write_table(pq.read_table(path), path, compression="zstd")
+    before = tacpipe.open("data/rec").digest
+    assert counts(lab, "--replace") == (1, 2)
+    assert tacpipe.open("data/rec").digest == before  # the same values: nothing after it is computed again
+
+
+def test_a_damaged_episode_is_left_out_with_skip_bad(lab: Lab) -> None:
+    files.write_v2(lab.folder / "sets" / "pick")
+    _cut(lab.folder / "sets" / "pick" / "data" / "chunk-000" / "episode_000001.parquet")
+    refused = lab.call("ingest lerobot sets -o data/rec")
+    assert refused.code == 1 and EPISODE.format(1) in refused.err
+    assert counts(lab, "--skip-bad") == (0, 2)
