@@ -21,7 +21,7 @@ from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import ROLES
+from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Store, locate
 
@@ -220,8 +220,9 @@ class _Run:
         if kind == "Parts":
             return keys.of_dataset(self._parts, None, self._parts.recordings)
         if self.stage.part is not None:
-            chosen = {one: entry for one, entry in self._given.included.items() if one in self._parts.recordings}
-            return keys.of_dataset(self._given, reads, chosen)
+            given = self.inputs.merged if name == ORIGINALS else self._given
+            chosen = {one: entry for one, entry in given.included.items() if one in self._parts.recordings}
+            return keys.of_dataset(given, reads, chosen)
         if name in ROLES:
             chosen = inputs.in_role(inputs.merged, name, may_lack=self.stage.optional(name))
             return keys.of_dataset(inputs.merged, reads, chosen)

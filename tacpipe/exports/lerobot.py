@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 VERSION = "v3.0"
 ORIGINALS = "tacpipe"
-RECORDING = "tacpipe.recording"  # column of the episodes
+RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the second is JSON
 ACTION = "action"
 STATS = "stats"  # table of a part
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -105,7 +105,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     return frames.synchronized(params.rate_hz, params.master)
 
 
-def originals(params: Params) -> str:
+def shards(params: Params) -> str:
     """Return the folder of the shards as they were given."""
     return ORIGINALS if params.originals else ""
 
@@ -129,8 +129,8 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     return RecordingOutput({**contents.part(recording, losses), STATS: made})
 
 
-@stage(version=1, part=part, first=first, originals=originals)
-def lerobot(params: Params, recordings: Dataset, parts: Parts) -> Result:
+@stage(version=1, part=part, first=first, originals=shards)
+def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
     """Write recordings as a LeRobot dataset (v3.0).
 
     Frames at one rate: synchronized recordings, or any with ``--rate-hz``. The recorded shards are beside them.
@@ -161,7 +161,7 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts) -> Result:
         )
         number += len(bundle)
     files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
-        made, every, parts, starts, places, lengths, tasks, fps
+        made, every, parts, originals, starts, places, lengths, tasks, fps
     )
     files["meta/tasks.parquet"] = _task_table(tasks)
     files["meta/info.json"] = _json(_info(params, made, lengths, tasks, fps))
@@ -371,6 +371,7 @@ def _episodes(
     made: Sequence[Feature],
     every: Sequence[Recording],
     parts: Dataset,
+    originals: Dataset,
     starts: Mapping[str, int],
     places: Mapping[str, tuple[int, int]],
     lengths: Mapping[str, int],
@@ -381,7 +382,6 @@ def _episodes(
     import pyarrow.parquet as pq
 
     order = _task_order(tasks)
-    labels = _labels(every)
     rows = []
     for episode, one in enumerate(every):
         chunk, file = places[one.name]
@@ -396,7 +396,7 @@ def _episodes(
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
             RECORDING: one.name,
-            **labels[one.name],
+            ATTRIBUTES: json.dumps(dict(originals[one.name].attributes), sort_keys=True),
         }
         stats = _episode_stats(made, parts[one.name], lengths[one.name])
         stats |= _index_stats(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
@@ -405,21 +405,6 @@ def _episodes(
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
     return bytes(sink.getvalue().to_pybytes())
-
-
-def _labels(every: Sequence[Recording]) -> dict[str, dict[str, Any]]:
-    """Return the attributes of each recording for columns of one type: all text where they are of several."""
-    taken = {"tasks", "length", "episode_index", "dataset_from_index", "dataset_to_index"}
-    found: dict[str, dict[str, Any]] = {one.name: {} for one in every}
-    for name in dict.fromkeys(name for one in every for name in one.attributes):
-        values = {one.name: one.attributes.get(name) for one in every}
-        kinds = {type(value) for value in values.values() if value is not None}
-        alike = len(kinds) <= 1 or kinds == {int, float}
-        column = f"{ORIGINALS}.{name}" if name in taken or "/" in name else name
-        for recording, value in values.items() if kinds else ():
-            text = value if alike or value is None else str(value)
-            found[recording][column] = float(text) if kinds == {int, float} and text is not None else text
-    return found
 
 
 Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel

@@ -6,7 +6,8 @@ by its annotation what the stage reads:
 ==============  ==========================================================================================
 ``Recording``   one recording at a time; the stage is run, keyed and stored for each recording alone
 ``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
-                may be empty where it is annotated ``Dataset | None``
+                may be empty where it is annotated ``Dataset | None``; ``originals`` are the recordings as they were
+                given, before they went through the stages that ``first`` names
 ``Datasets``    several datasets side by side, as a tuple
 ``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
 ``Fitted``      the files that the stage's ``fit`` made of the training recordings
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROLES = ("train", "val", "test")
+ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
 Values = Mapping[str, Any]  # of JSON, by name

@@ -38,7 +38,7 @@ def lerobot(folder: str) -> dict[str, Any]:
         "window": window["observation.state"].tolist(),
         "padded": window["observation.state_is_pad"].tolist(),
         "mean": whole.meta.stats["observation.tactile.skin"]["mean"].tolist(),
-        "recordings": list(whole.meta.episodes["tacpipe.recording"]),
+        "recordings": list(whole.meta.episodes["tacpipe/recording"]),
     }
 
 

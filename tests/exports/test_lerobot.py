@@ -12,6 +12,7 @@ import pytest
 
 import tacpipe
 from tests.conftest import Lab
+from tests.exports import recordings
 
 EXPORT = "export lerobot rec -o lr --rate-hz 100 --actions arm --task 'press the {object}'"
 
@@ -54,9 +55,10 @@ def test_the_task_is_the_recording_s_label_and_every_label_is_with_its_episode(r
     assert tasks["task_index"].to_dict() == {"press the box": 0, "press the cup": 1}
     episodes = pq.read_table("lr/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [one["tasks"] for one in episodes] == [["press the box"], ["press the cup"]]
-    assert [(one["tacpipe.recording"], one["code"], one["mass_kg"]) for one in episodes] == [
-        ("trial-00", "007", 0.0),
-        ("trial-01", "007", 0.25),
+    assert [one["tacpipe/recording"] for one in episodes] == ["trial-00", "trial-01"]
+    assert [json.loads(one["tacpipe/attributes"]) for one in episodes] == [
+        recordings.trial(0)[1],
+        recordings.trial(1)[1],
     ]
     err = rig.call("export lerobot rec -o lr --rate-hz 100 --task 'press the {colour}'").err
     assert "colour" in err
