@@ -29,7 +29,14 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{name}.md"
-        for name in ("tutorials/simulated", "howto/stage", "tutorials/own-data", "tutorials/ci-and-dvc", "howto/python")
+        for name in (
+            "tutorials/simulated",
+            "howto/stage",
+            "howto/export",
+            "tutorials/own-data",
+            "tutorials/ci-and-dvc",
+            "howto/python",
+        )
     ),
     *sorted((ROOT / "docs" / "tasks").glob("*.md")),
     ROOT / "docs" / "rig.md",

@@ -60,7 +60,7 @@ def part(params: Params, recording: Recording, name: Name) -> Result:
 
 @stage(version=1, part=part)
 def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
-    """Write a dataset card: Parquet, README.md and Croissant metadata.
+    """Write a dataset card: Parquet, README.md, Croissant.
 
     Rows have native rates and types and a column with the recording's name; the folder can be uploaded as it is.
 

@@ -59,7 +59,7 @@ def part(params: Params, recording: Recording, name: Name) -> Result:
 
 @stage(version=1, part=part)
 def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
-    """Write recordings as CSV files, with a layout file that reads them back.
+    """Write recordings as CSV files that can be read back.
 
     One file a stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives values, stamps, types, units and
     labels back.

@@ -71,7 +71,7 @@ class Params:
     tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read nothing else
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
     common: bool = False  # leave out columns that not all recordings have
-    task: str = "touch"  # text of the task; {label} stands for the recording's label
+    task: str = "touch"  # text of the task, with labels in braces
     robot_type: str = ""  # what info.json states as the robot
     originals: bool = True  # put the shards as they were given under tacpipe/
 

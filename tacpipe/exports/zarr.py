@@ -69,7 +69,7 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
 
 @stage(version=1, part=part, first=first)
 def zarr(params: Params, recordings: Dataset, parts: Parts) -> Result:
-    """Write recordings as a Zarr replay buffer (UMI, diffusion policy).
+    """Write recordings as a Zarr replay buffer, as UMI does.
 
     Synchronized recordings, or any with ``--rate-hz``, one after another, with meta/episode_ends.
 
