@@ -40,14 +40,14 @@ def make(folder: Path) -> Path:
     venv.create(folder, with_pip=True, clear=True)
     python = folder / "bin" / "python"
     found = subprocess.run(
-        [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+        [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
         capture_output=True,
         text=True,
         check=True,
     )
     packages = Path(found.stdout.strip())
     (packages / "tests.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
-    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*install, "--no-deps", *ALONE], check=True)
     subprocess.run(
         [*install, *NEEDED], check=True, stderr=subprocess.DEVNULL

@@ -20,6 +20,7 @@ EVERY = (
     "zarr rec --rate-hz 100",
     "hdf5 rec --structure robomimic --rate-hz 100",
 )
+LATER = [EVERY[0], *(pytest.param(export, marks=pytest.mark.long) for export in EVERY[1:])]
 
 
 def counts(ran: str) -> tuple[int, int]:
@@ -28,7 +29,7 @@ def counts(ran: str) -> tuple[int, int]:
     return found["ran"], found["reused"]
 
 
-@pytest.mark.parametrize("export", EVERY)
+@pytest.mark.parametrize("export", LATER)
 def test_an_export_is_answered_by_the_store_the_second_time(rig: Lab, export: str) -> None:
     first = counts(rig.run(f"export {export} -o out --json").out)
     assert first[0] >= 2
@@ -38,7 +39,9 @@ def test_an_export_is_answered_by_the_store_the_second_time(rig: Lab, export: st
     assert rig.call(f"export {export} -o out --check").code == 0
 
 
-@pytest.mark.parametrize("export", ["csv", "mcap", "hdf5", "card"])
+@pytest.mark.parametrize(
+    "export", ["csv", *(pytest.param(one, marks=pytest.mark.long) for one in ("mcap", "hdf5", "card"))]
+)
 def test_a_new_recording_costs_one_recording_and_leaves_the_files_of_the_others(rig: Lab, export: str) -> None:
     rig.run(f"export {export} rec -o out")
     old = {path: path.stat().st_mtime_ns for path in (rig.folder / "out").rglob("*") if "trial-0" in str(path)}
@@ -64,7 +67,7 @@ def test_a_corrected_label_costs_no_file_of_values_where_these_do_not_hold_label
     assert json.loads((rig.folder / "out/trial-01/labels.json").read_bytes())["object"] == "mug"
 
 
-@pytest.mark.parametrize("export", ["mcap", "hdf5"])
+@pytest.mark.parametrize("export", ["mcap", pytest.param("hdf5", marks=pytest.mark.long)])
 def test_a_corrected_label_costs_its_recording_where_files_hold_labels(rig: Lab, export: str) -> None:
     rig.run(f"export {export} rec -o out")
     rig.run("label rec trial-01 --set object=mug")
@@ -130,6 +133,7 @@ def test_the_manifest_leads_back_to_the_recordings(rig: Lab) -> None:
     assert rig.manifest("rec").digest in (rig.folder / "out/README.md").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("export", EVERY)
 def test_two_exports_of_the_same_recordings_are_the_same_bytes(rig: Lab, export: str) -> None:
     rig.run(f"export {export} -o one")

@@ -64,6 +64,7 @@ def test_the_task_is_the_recording_s_label_and_every_label_is_with_its_episode(r
     assert "colour" in err
 
 
+@pytest.mark.long
 def test_statistics_are_those_of_the_frames(rig: Lab) -> None:
     rig.run(EXPORT)
     frames = pq.read_table("lr/data/chunk-000/file-000.parquet")
@@ -87,6 +88,7 @@ def test_the_recorded_shards_lie_beside_the_frames_byte_for_byte(rig: Lab) -> No
     assert not (rig.folder / "bare/tacpipe").exists()
 
 
+@pytest.mark.long
 def test_only_measured_channels_are_observations_and_touch_joins_the_state_if_asked(rig: Lab) -> None:
     rig.run(EXPORT)
     names = [name for name in info()["features"] if name.startswith("observation.")]

@@ -16,8 +16,8 @@ from tests.exports import recordings
     [
         ("csv rec", "table out --layout out/layout.toml"),
         ("mcap rec", "mcap out"),
-        ("hdf5 rec", "hdf5 out"),
-        ("lerobot rec --rate-hz 100", "lerobot out"),
+        pytest.param("hdf5 rec", "hdf5 out", marks=pytest.mark.long),
+        pytest.param("lerobot rec --rate-hz 100", "lerobot out", marks=pytest.mark.long),
     ],
     ids=["csv", "mcap", "hdf5", "lerobot"],
 )
@@ -29,6 +29,7 @@ def test_the_shards_are_the_same(rig: Lab, export: str, ingest: str) -> None:
     assert {one.name: dict(one.attributes) for one in back} == {one.name: dict(one.attributes) for one in given}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("export", ["zarr rec --rate-hz 100", "hdf5 rec --structure robomimic --rate-hz 100"])
 def test_frames_come_back_with_their_values_and_times(rig: Lab, export: str) -> None:
     rig.run(f"export {export} -o out")
@@ -42,6 +43,7 @@ def test_frames_come_back_with_their_values_and_times(rig: Lab, export: str) -> 
             assert table[name].equals(given.table()[name])
 
 
+@pytest.mark.long
 def test_events_come_back(lab: Lab) -> None:
     columns = {"stream": pa.array(["skin"]), "cause": pa.array(["link"]), "frames": pa.array([3])}
     fields = [schema.time_field(), *(pa.field(name, column.type) for name, column in columns.items())]
