@@ -57,9 +57,10 @@ def add_frame(folder: str) -> dict[str, Any]:
         if frame["episode_index"].item() != episode:
             made.save_episode()
             episode = frame["episode_index"].item()
-        made.add_frame(
-            {**{name: frame[name].numpy().reshape(features[name]["shape"]) for name in features}, "task": frame["task"]}
-        )
+        values = {
+            name: frame[name].numpy().astype(one["dtype"]).reshape(one["shape"]) for name, one in features.items()
+        }
+        made.add_frame({**values, "task": frame["task"]})
     made.save_episode()
     made.finalize()
     seconds = time.perf_counter() - started
