@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -86,6 +89,22 @@ def test_what_was_finished_before_a_failure_is_reused(rig: Lab) -> None:
     assert not (rig.folder / "out").exists()
     path.write_bytes(content)
     assert counts(rig.run("export mcap rec -o out --json").out) == (1, 1)
+
+
+@pytest.mark.long
+def test_an_export_that_was_killed_resumes(lab: Lab) -> None:
+    recordings.write(lab.folder / "rec", recordings.trials(24))
+    before = len(list(lab.store.records()))
+    command = [sys.executable, "-m", "tacpipe", "export", "mcap", "rec", "-o", "out", "--jobs", "1"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
+        while len(list(lab.store.records())) == before and running.poll() is None:
+            time.sleep(0.01)
+        running.kill()
+    ran, reused = counts(lab.run("export mcap rec -o out --json").out)
+    assert reused >= 1
+    assert ran + reused == 24
+    assert len(list((lab.folder / "out").glob("*.mcap"))) == 24
+    assert not [path for path in (lab.folder / "out").iterdir() if path.name.startswith(".")]
 
 
 def test_a_directory_with_another_program_s_files_is_refused(rig: Lab) -> None:
