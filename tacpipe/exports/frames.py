@@ -110,7 +110,7 @@ def state_of(every: Sequence[Channel], streams: Sequence[str]) -> list[Channel]:
     there = list(dict.fromkeys(one.stream for one in every if one.stream))
     for name in streams:
         if name not in there:
-            raise UsageError(f"There is no stream {plain(name)} for the state; there are {listed(there)}.")
+            raise UsageError(f"There is no stream {plain(name)} in these frames; there are {listed(there)}.")
     robots = streams or [one for one in there if any(c.stream == one and c.quantity in ROBOT for c in every)]
     return [one for one in every if one.stream in robots and one.signal and not one.quantity.startswith(TARGETS)]
 
