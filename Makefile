@@ -36,7 +36,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -97,6 +97,12 @@ test-kernel: $(VENV)/.dev ## run the tests of HID on Debian's kernel in a virtua
 	    $(call debian,$(VIRTUAL_MACHINE)); \
 	fi
 	@OMP_NUM_THREADS=1 TACPIPE_TEST_KERNEL=1 $(BIN)/pytest -q -s tests/kernel
+
+test-exports: $(VENV)/.dev ## have LeRobot's loader, datasets and mlcroissant open exports, in an environment of their own (0.5 GB)
+	@if [ ! -e .cache/exports/bin/.made ]; then \
+	    $(BIN)/python -m tests.exports.environment .cache/exports && touch .cache/exports/bin/.made; \
+	fi
+	@TACPIPE_EXPORTS_PYTHON=$(CURDIR)/.cache/exports/bin/python $(PYTEST) tests/exports
 
 test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
 	@$(BIN)/python -m tests.packaging.environments

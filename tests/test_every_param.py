@@ -51,6 +51,22 @@ FREE = {  # params that are any text, and why
     "train.material.run_label": "words for a report",
     "train.touch.run_label": "words for a report",
     "report.title": "words for a report",
+    "export.card.title": "words for a page",
+    "export.card.description": "words for a page",
+    "export.card.license": "the identifier of any licence",
+    "export.card.creators": "names",
+    "export.card.url": "an address",
+    "export.card.published": "a date, which is printed as it is given",
+    "export.card.cite_as": "words for a page",
+    "export.hdf5.actions": "the name of a stream",
+    "export.hdf5.master": "the name of a stream",
+    "export.lerobot.actions": "the name of a stream",
+    "export.lerobot.master": "the name of a stream",
+    "export.lerobot.robot_type": "the name of a robot",
+    "export.lerobot.state": "names of streams",
+    "export.lerobot.task": "words, with labels of recordings",
+    "export.zarr.actions": "the name of a stream",
+    "export.zarr.master": "the name of a stream",
 }
 
 

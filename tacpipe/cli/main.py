@@ -32,6 +32,7 @@ SUMMARIES = {
     "compress": "Compress tactile channels to a few latents.",
     "train": "Train the model of a task.",
     "simulate": "Simulate recordings of a rig, with ground truth.",
+    "export": "Write recordings in the formats of other tools.",
 }
 
 
@@ -201,7 +202,10 @@ def _add_summaries(program: typer.Typer, names: dict[str, str], groups: set[str]
             program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
 
 
-ORDER = ("ingest", "simulate", "synchronize", "segment", "split", "compress", "train", "evaluate", "predict", "report")
+ORDER = (
+    *("ingest", "simulate", "synchronize", "segment", "split", "compress"),
+    *("train", "evaluate", "predict", "report", "export"),
+)
 
 
 def _first(names: dict[str, str], group: str) -> str:

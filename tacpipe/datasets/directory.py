@@ -79,7 +79,8 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
     check_output(store, directory)
     objects = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    stale = [] if relabelled else _stale(store, manifest, directory) if current else list(objects)
+    known = current or manifest.exported  # files of an export are large copies, so those that are right stay
+    stale = [] if relabelled else _stale(store, manifest, directory) if known else list(objects)
     gone = set() if relabelled else _named(directory) - set(objects)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
@@ -91,7 +92,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         sweep(directory, shards=bool(stale))
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
-                place(store, objects[path], directory / path, copy=manifest.recorded)
+                place(store, objects[path], directory / path, copy=manifest.copied)
         _remove(directory, gone)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))

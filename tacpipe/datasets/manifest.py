@@ -19,9 +19,10 @@ from tacpipe.printable import excerpt, plain
 FORMAT = 1
 NAME = "manifest.json"
 VALUES = "{values}"  # among the files of a source: the digest of what was read beside them, as labels
+EXPORT = "export."  # begins the names of stages whose result is other tools' files
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
 NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add to it
-_PART = r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*"
+_PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"  # the last: of Zarr
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 _PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
@@ -65,6 +66,16 @@ class Manifest:
     def recorded(self) -> bool:
         """Whether this is a dataset of recordings: it was made from no other dataset."""
         return bool(self.recordings) and not self.inputs
+
+    @property
+    def exported(self) -> bool:
+        """Whether its files are those of another tool."""
+        return self.stage.startswith(EXPORT)
+
+    @property
+    def copied(self) -> bool:
+        """Whether its directory holds copies, not links: recordings, and exports, in which other tools may write."""
+        return self.recorded or self.exported
 
     @property
     def included(self) -> dict[str, Entry]:

@@ -34,10 +34,19 @@ class ByRecording:
         Raises `TacpipeError` where recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
         would run.
         """
+        recordings: dict[str, Entry] = {}
+        for recording, result in sorted(self.results(name, tasks).items()):
+            made = result["recordings"][""]
+            before = entries[recording]["attributes"] if recording in entries else {}
+            recordings[recording] = {"attributes": {**before, **made["attributes"]}, "shards": made["shards"]}
+        return recordings
+
+    def results(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
+        """Return what the record of each task of stage ``name`` holds as its result, by recording; raises as `run`."""
         results: dict[str, Mapping[str, Any]] = {}
         stored: dict[str, Mapping[str, Any]] = {}  # records
         missing: list[Task] = []
-        rerun = self.request.rerun and name == self.request.name
+        rerun = self.request.rerun and registry.whole(name) == self.request.name
         for task in tasks:
             record = self.store.record(digest(task.identity))
             if record is not None and not rerun and records.complete(self.store, record):
@@ -46,20 +55,16 @@ class ByRecording:
             else:
                 missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
         if missing and self.request.check:
-            raise WouldChangeError(f"{name} would run for {len(missing)} of {len(tasks)} recordings.")
+            raise WouldChangeError(f"{registry.whole(name)} would run for {len(missing)} of {len(tasks)} recordings.")
         if self.request.compare:
             missing = [replace(task, dry=True) for task in tasks]
         self.outcome.reused += len(tasks) - len(missing)
         results.update(self._compute(name, missing, stored))
         if not results:
             lines = _lines(self.outcome.bad)
-            raise error(FAILED, f"{name} could not read any of the {len(tasks)} recordings:\n{lines}")
-        recordings: dict[str, Entry] = {}
-        for recording, result in sorted(results.items()):
-            made = result["recordings"][""]
-            before = entries[recording]["attributes"] if recording in entries else {}
-            recordings[recording] = {"attributes": {**before, **made["attributes"]}, "shards": made["shards"]}
-        return recordings
+            whole = registry.whole(name)
+            raise error(FAILED, f"{whole} could not read any of the {len(tasks)} recordings:\n{lines}")
+        return results
 
     def replay(self, given: Manifest, model: Manifest, beside: tuple[str, ...], where: str) -> Manifest:
         """Return ``given`` after the stages that a model was trained behind, from wherever it is among them now.
@@ -94,8 +99,9 @@ class ByRecording:
     ) -> dict[str, Mapping[str, Any]]:
         results: dict[str, Mapping[str, Any]] = {}
         bad: dict[str, Done] = {}
-        preload = ["tacpipe.io.parquet", "tacpipe.engine.execution", registry.stages()[name].partition(":")[0]]
-        with progress.bar(name, len(tasks)) as advance:
+        module = registry.stages()[registry.whole(name)].partition(":")[0]
+        preload = ["tacpipe.io.parquet", "tacpipe.engine.execution", module]
+        with progress.bar(registry.whole(name), len(tasks)) as advance:
             for done in executors.run(execution.compute, tasks, self.request.jobs, preload):
                 advance(note=done.recording)
                 if done.record is None:
@@ -126,7 +132,8 @@ class ByRecording:
         advice = "fix these." if others else "fix these, or leave them out with --skip-bad."
         raise error(
             max(done.exit_code for done in bad.values()),
-            f"{name} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; {advice}",
+            f"{registry.whole(name)} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; "
+            f"{advice}",
         )
 
 

@@ -92,7 +92,7 @@ class _Scratch:
 
 def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str, Any], list[str]]:
     """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
-    stage, stage_name = stage_of(task.name), task.name.removesuffix(".fit")
+    stage, stage_name = stage_of(task.name), registry.whole(task.name)
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments:
         try:
@@ -108,7 +108,7 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
     recordings = {
         name: _entry(recording, sink, durable=stage.source) for name, recording in sorted(returned.recordings.items())
     }
-    files = {name: vars(sink.put(content)) for name, content in sorted(returned.files.items())}
+    files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
     notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
     return {"recordings": recordings, "files": files}, notes
 
@@ -127,11 +127,14 @@ def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Mani
 
 
 def stage_of(name: str) -> AnyStage:
-    """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``."""
-    stage = registry.load(name.removesuffix(".fit"))
-    if name.endswith(".fit"):
+    """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``, and so with parts."""
+    stage = registry.load(registry.whole(name))
+    if name.endswith(registry.FIT):
         assert stage.fit is not None
         return stage.fit
+    if name.endswith(registry.PART):
+        assert stage.part is not None
+        return stage.part
     return stage
 
 
@@ -256,7 +259,7 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
     for name, kind in stage.arguments.items():
         if kind == "Recording":
             found[name] = Recording(task.recording, inputs[name], read)
-        elif kind in ("Dataset", "Model"):
+        elif kind in ("Dataset", "Model", "Parts"):
             found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
             found[name] = tuple(_dataset(value, read) for value in inputs[name])
@@ -264,7 +267,7 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
             found[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
             found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
-        elif kind in ("Trial", "Values"):
+        elif kind in ("Trial", "Values", "Name"):
             found[name] = inputs[name]
         elif kind == "Roles":
             found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}

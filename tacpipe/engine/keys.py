@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.engine import execution
 from tacpipe.engine.execution import Task
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
-from tacpipe.plugins.stage import AnyStage, Source
+from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
 
 
@@ -22,7 +22,7 @@ def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) ->
 def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
     """Return what a key says of a recording: digests of its streams, and the attributes in ``reads`` (None: all)."""
     attributes = entry["attributes"]
-    if reads is not None:
+    if reads is not None and reads != ALL:
         attributes = {name: attributes[name] for name in reads if name in attributes}
     return {
         "attributes": attributes,
@@ -52,14 +52,15 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
 
 def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> list[Task]:
     """Return one task a recording of ``given`` for the map stage of a link of a chain."""
-    stage = registry.load(step["stage"])
+    stage = execution.stage_of(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
+    named = stage.argument("Name")
 
     def task(name: str, entry: Entry) -> Task:
-        inputs = {recording: of_recording(entry, stage.reads or ()), **fitted}
-        named = identity(step["stage"], stage.version, step["params"], inputs)
-        return Task(str(store.root), step["stage"], named, name, beside=beside)
+        inputs = {recording: of_recording(entry, stage.reads or ()), **fitted, **({named: name} if named else {})}
+        wanted = identity(step["stage"], stage.version, step["params"], inputs)
+        return Task(str(store.root), step["stage"], wanted, name, beside=beside)
 
     return [task(name, entry) for name, entry in sorted(given.included.items())]
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets import manifest, replacing, roles
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.manifest import Entry, Manifest, shard_path
 from tacpipe.engine import by_recording, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.execution import Task
@@ -19,9 +20,12 @@ from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import ROLES
+from tacpipe.plugins import registry
+from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Store, locate
+
+_NOTHING: Entry = {"attributes": {}, "shards": {}}  # of a part that gives files alone
 
 
 def open_dataset(path: Path | str) -> Dataset:
@@ -76,7 +80,7 @@ class _Run:
         if not all(self.store.has(name, size) for name, size in found.sizes()):
             return None
         self.outcome.restore(record["provenance"])
-        self.outcome.reused = len(found.recordings) or 1
+        self.outcome.reused = len(self.inputs.merged.included) if self.stage.part else len(found.recordings) or 1
         return found
 
     def result(self, *, rerun: bool) -> Manifest:
@@ -106,6 +110,9 @@ class _Run:
         made = Manifest(request.name, stage.version, params_of.to_json(request.params), self.inputs.lineage())
         if not stage.mapped:
             identity = keys.identity(request.name, stage.version, request.params, self._whole_inputs())
+            if stage.part is not None:
+                files = {**self._whole(request.name, identity, counted=False)["files"], **self._parts.files}
+                return replace(made, files={**files, **self._originals()}, skipped=self._skipped)
             result = self._whole(request.name, identity)
             return replace(made, chain=self._chain(), recordings=result["recordings"], files=result["files"])
         fitted = self._fit() if stage.fit else None
@@ -124,15 +131,19 @@ class _Run:
         if not tasks:
             raise UsageError(f"{request.name} found no recording to work on.")
         recordings = self._by_recording.run(request.name, tasks, entries)
-        carried = {name: why for found in self.inputs.datasets for name, why in found.manifest.skipped.items()}
         return replace(
             made,
             chain=chain,
             recordings=recordings,
             files=fitted or {},
-            skipped={**carried, **self.outcome.bad},
+            skipped=self._skipped,
             sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
         )
+
+    @property
+    def _skipped(self) -> dict[str, str]:
+        carried = {name: why for found in self.inputs.datasets for name, why in found.manifest.skipped.items()}
+        return {**carried, **self.outcome.bad}
 
     @property
     def _by_recording(self) -> ByRecording:
@@ -145,6 +156,49 @@ class _Run:
         return chains[0] if chains and all(chain == chains[0] for chain in chains) else ()
 
     # ---- stages over whole datasets
+
+    @cached_property
+    def _given(self) -> Manifest:
+        """The given datasets read as one, after the stages that the recordings go through first."""
+        given, first = self.inputs.merged, self.stage.first
+        wanted = first(self.request.params) if first is not None else {}
+        if not wanted:
+            return given
+        chain = list(given.chain)
+        for name, options in wanted.items():
+            stage = registry.load(name)
+            chain.append(keys.chain_step(name, stage, params_of.build(name, stage, options=options), None))
+        behind = Manifest(self.request.name, self.stage.version, chain=chain)
+        return self._by_recording.replay(given, behind, self.inputs.beside, str(self.request.datasets[0]))
+
+    @cached_property
+    def _parts(self) -> Manifest:
+        """What the stage's part gave for each recording: tables, and files by their names in the result."""
+        given, name = self._given, f"{self.request.name}{registry.PART}"
+        assert self.stage.part is not None
+        step = keys.chain_step(name, self.stage.part, self.request.params, None)
+        tasks = keys.shard_tasks(self.store, given, step, self.inputs.beside)
+        if not tasks:
+            raise UsageError(f"{self.request.name} found no recording to work on.")
+        results = self._by_recording.results(name, tasks)
+        recordings = {recording: result["recordings"].get("", _NOTHING) for recording, result in results.items()}
+        files = {file: stored for result in results.values() for file, stored in result["files"].items()}
+        return Manifest(name, self.stage.part.version, step["params"], recordings=recordings, files=files)
+
+    def _originals(self) -> dict[str, Any]:
+        """Return the shards that were given as files of the result, where the stage asks for them; they are in the store."""
+        folder = self.stage.originals(self.request.params) if self.stage.originals is not None else ""
+        if not folder:
+            return {}
+        given, found = self.inputs.merged, {}
+        read = execution.reader(self.store, self.inputs.beside, dict(given.sizes()))
+        for recording, entry in given.included.items():
+            for stream, shard in entry["shards"].items():
+                path = shard_path(recording, stream)
+                if not self.store.has(shard["digest"], shard["bytes"]):
+                    read(shard["digest"], path)  # adopts it, or computes it again
+                found[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
+        return found
 
     def _whole_inputs(self) -> dict[str, Any]:
         return {
@@ -163,6 +217,12 @@ class _Run:
         if kind == "Roles":
             old = inputs.named.get("extend")
             return roles.digest(old.manifest, str(old.directory)) if old else None
+        if kind == "Parts":
+            return keys.of_dataset(self._parts, None, self._parts.recordings)
+        if self.stage.part is not None:
+            given = self.inputs.merged if name == ORIGINALS else self._given
+            chosen = {one: entry for one, entry in given.included.items() if one in self._parts.recordings}
+            return keys.of_dataset(given, reads, chosen)
         if name in ROLES:
             chosen = inputs.in_role(inputs.merged, name, may_lack=self.stage.optional(name))
             return keys.of_dataset(inputs.merged, reads, chosen)

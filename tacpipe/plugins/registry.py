@@ -1,4 +1,4 @@
-"""Names of stages, formats, tasks, reports and sensors, found through entry points and loaded when asked for."""
+"""Names of stages, formats, exports, tasks, reports and sensors, found through entry points and loaded when asked for."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
+EXPORTS = "tacpipe.exports"
 REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
-GROUPS = (STAGES, FORMATS, TASKS, REPORTS, SENSORS)
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS)
+FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
 @functools.cache
@@ -60,10 +62,20 @@ def _entry_point_files(folder: str) -> list[Path]:
 
 @functools.cache
 def stages() -> dict[str, str]:
-    """Return the target of every stage by name; a format ``x`` is the stage ``ingest.x``."""
+    """Return the target of every stage by name; a format ``x`` is the stage ``ingest.x``, an export ``export.x``."""
     found = entry_points()
     formats = {f"ingest.{name}": target for name, target in found[FORMATS].items()}
-    return dict(sorted({**found[STAGES], **formats}.items()))
+    exports = {f"export.{name}": target for name, target in found[EXPORTS].items()}
+    return dict(sorted({**found[STAGES], **formats, **exports}.items()))
+
+
+def whole(name: str) -> str:
+    """Return the name of the stage that a fit or a part belongs to, or the name of a stage itself.
+
+    >>> whole("compress.pca.fit"), whole("export.csv.part"), whole("split")
+    ('compress.pca', 'export.csv', 'split')
+    """
+    return name.removesuffix(FIT).removesuffix(PART)
 
 
 def load(name: str) -> AnyStage:

@@ -6,10 +6,13 @@ by its annotation what the stage reads:
 ==============  ==========================================================================================
 ``Recording``   one recording at a time; the stage is run, keyed and stored for each recording alone
 ``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
-                may be empty where it is annotated ``Dataset | None``
+                may be empty where it is annotated ``Dataset | None``; ``originals`` are the recordings as they were
+                given, before they went through the stages that ``first`` names
 ``Datasets``    several datasets side by side, as a tuple
 ``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
 ``Fitted``      the files that the stage's ``fit`` made of the training recordings
+``Parts``       what the stage's ``part`` gave for each recording, as a `Dataset`
+``Name``        the name of the one recording; part of its key
 ``Files``       the files of one recording of a source; the stage's ``discover`` finds them
 ``Values``      what ``discover`` gave for one recording beside its files, as labels; part of its key
 ``Trial``       the number of one recording to simulate, from 0 to ``params.trials``
@@ -35,16 +38,22 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROLES = ("train", "val", "test")
+ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
 Values = Mapping[str, Any]  # of JSON, by name
 Fitted = Mapping[str, bytes]  # file name, content
+Name = str
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
-_KINDS = ("Recording", "Dataset", "Datasets", "Model", "Fitted", "Files", "Values", "Trial", "Roles", "Workspace")
+ALL = ("*",)  # as ``reads``: every attribute
+_KINDS = (
+    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "Name"),
+    *("Files", "Values", "Trial", "Roles", "Workspace"),
+)
 
 
 @dataclass(frozen=True)
@@ -74,11 +83,15 @@ class Source:
 
 
 Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
+First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by name, each with params of its own
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`)."""
+    """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`).
+
+    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory.
+    """
 
     recordings: Mapping[str, RecordingOutput] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
@@ -95,6 +108,9 @@ class Stage(Generic[P, R]):
         None  # attributes that the function looks at; None: none of a Recording, all of a Dataset
     )
     fit: AnyStage | None = None  # makes what a ``Fitted`` argument holds
+    part: AnyStage | None = None  # runs on each recording; its files are files of the result, its tables are ``Parts``
+    first: First | None = None  # stages that the recordings go through before, as the params ask
+    originals: Callable[[Any], str] | None = None  # folder of the result for the shards that were given; empty: none
     discover: Discover | None = None
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
     preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
@@ -170,6 +186,9 @@ def stage(
     version: int,
     reads: tuple[str, ...] | None = None,
     fit: AnyStage | None = None,
+    part: AnyStage | None = None,
+    first: First | None = None,
+    originals: Callable[[Any], str] | None = None,
     discover: Discover | None = None,
     headline: str | None = None,
     preview: Callable[[Any, Path], str] | None = None,
@@ -178,6 +197,10 @@ def stage(
     """Declare the decorated function a stage, whose signature it keeps. Raise ``version`` whenever its result changes.
 
     ``headline`` names the file of its result (`tacpipe.metrics.headline`) that the command prints as a table.
+    ``part`` is keyed recording by recording, with the same params; its files become files of the result, and an argument
+    ``Parts`` holds its tables. ``first`` names stages that the recordings go through before, with params of their own.
     ``preview`` returns what ``discover`` and the stage would read of a source, in words; ``guess`` a first layout of one.
     """
-    return lambda function: Stage(function, version, reads, fit, discover, headline, preview, guess)
+    return lambda function: Stage(
+        function, version, reads, fit, part, first, originals, discover, headline, preview, guess
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -179,6 +179,12 @@ def _of(chain: str, names: dict[int, str]) -> list[Case]:
     return [Case(name, CHAINS[chain][number], CHAINS[chain][:number]) for number, name in names.items()]
 
 
+def _export(names: Sequence[str], dataset: str, before: int) -> list[Case]:
+    """Return cases that export a dataset of the chain, made by its first commands."""
+    chain = CHAINS["two forward"][:before]
+    return [Case(f"export.{name}", f"export {name} {dataset} -o data/out", chain) for name in names]
+
+
 def _ingest(name: str) -> Case:
     options = " --layout src/layout.toml" if name == "table" else ""
     command = f"ingest {name} src -o data/r{options}"
@@ -224,6 +230,8 @@ STAGES = (
     ),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
     Case("report", "report results/f -o report.html", FORWARD),
+    *_export(("card", "csv", "hdf5", "mcap"), "data/r", 1),
+    *_export(("lerobot", "zarr"), "data/synced", 2),
     *(_ingest(name) for name in ("biotac-slide", "roboskin", "table", "vision2tactile", "xela-flat", "xela-psc")),
 )
 CASES = {case.name: case for case in (*TOYS, *STAGES)}

@@ -94,7 +94,7 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
 
 def _field(rule: Column, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
     made = pattern.filled(rule.name, values) if rule.name else name.strip()
-    about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values}
+    about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
     about = {key: value for key, value in about.items() if value}
     if declared is None:
         return pa.field(made, TYPES[rule.type or "float64"], metadata=about)

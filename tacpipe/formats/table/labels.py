@@ -19,6 +19,7 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
 MOST_BYTES = 1 << 26  # of a file of labels
+RECORDING = "recording"  # the placeholder of a recording's name
 
 
 def found(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, dict[str, Attribute]]:
@@ -28,8 +29,7 @@ def found(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, 
     a recording without a row or a file, two rows of one recording, a missing column, and a value that is not plain.
     """
     made: dict[str, dict[str, Attribute]] = {
-        one.name: {**layout.attributes, **{name: plain_value(value) for name, value in one.values.items()}}
-        for one in sources
+        one.name: {**layout.attributes, **{name: plain_value(value) for name, value in _named(one)}} for one in sources
     }
     for labels in layout.labels:
         shared = not pattern.placeholders(labels.file)
@@ -38,6 +38,13 @@ def found(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, 
             values = _row(rows, one, folder / labels.file) if shared else _file(folder, labels, one)
             made[one.name] |= _picked(values, labels, one.name)
     return made
+
+
+def _named(source: Source) -> Iterator[tuple[str, str]]:
+    """Yield the placeholders of a recording's files with their text; one that is the recording's name is no label."""
+    for name, value in source.values.items():
+        if (name, value) != (RECORDING, source.name):
+            yield name, value
 
 
 def plain_value(text: str) -> Attribute:

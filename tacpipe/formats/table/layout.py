@@ -66,6 +66,7 @@ class Column:
     type: Kind | None = None  # None: as a container declares it, else float64
     scale: float = 1.0  # a value is what the file holds times this
     component: str = ""
+    about: tuple[tuple[str, str], ...] = ()  # more metadata of the column; a table in the file
     skip: bool = False
 
 
@@ -292,7 +293,10 @@ def _time(values: Mapping[str, Any], where: str) -> Time:
 
 
 def _column(value: Any, where: str) -> Column:
-    made: Column = fields.filled(Column, _table(value, where, ""), where, "entry")
+    values = dict(_table(value, where, ""))
+    if "about" in values:
+        values["about"] = tuple(sorted(_table(values["about"], where, "about").items()))
+    made: Column = fields.filled(Column, values, where, "entry")
     pattern.filled(made.name, dict.fromkeys(pattern.placeholders(made.match), "x"))
     if made.type in ("bool", "text", "binary") and made.scale != 1.0:
         raise UsageError(f"{where}: scale is {made.scale}; only numbers have one.")

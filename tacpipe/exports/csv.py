@@ -1,0 +1,166 @@
+"""Write recordings as CSV files, one a stream, with a layout file that reads them back.
+
+`tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives the same streams: values and stamps to the bit, types,
+units, quantities and labels. ``layout.toml`` describes each column, ``labels.json`` holds the attributes of a recording.
+
+Example: tacpipe export csv data/recordings -o exports/csv
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.exports import contents, readme
+from tacpipe.exports.contents import TIME, Contents, Stream, shown
+from tacpipe.exports.files import Content, Files
+from tacpipe.plugins.stage import Name, RecordingOutput, Result, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+    Parts = Dataset
+
+LAYOUT, LABELS = "layout.toml", "labels.json"
+TYPES = {"float": "float32", "double": "float64", "string": "text"}  # of arrow, where the layout's name differs
+READ = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float", "double", "bool", "string")
+_OPENING = f"""
+One CSV file a stream, in a folder a recording. `{TIME}` is the time in nanoseconds of UTC. tacpipe reads them back with
+types, units and labels:
+
+```sh
+tacpipe ingest table EXPORT --layout EXPORT/{LAYOUT} -o data/recordings
+```
+
+From Python: `pandas.read_csv("EXPORT/RECORDING/STREAM.csv")`.
+"""
+
+
+@dataclass(frozen=True)
+class Params:
+    """CSV has no options."""
+
+
+@stage(version=1)
+def part(params: Params, recording: Recording, name: Name) -> Result:
+    """Return a file a stream."""
+    files, losses = {}, []
+    for stream in recording.streams:
+        table = recording.table(stream)
+        losses += list(_losses(stream, table))
+        files[f"{name}/{shown(stream)}.csv"] = _content(table)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
+
+
+@stage(version=1, part=part)
+def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
+    """Write recordings as CSV files that can be read back.
+
+    One file a stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives values, stamps, types, units and
+    labels back.
+
+    Example: tacpipe export csv data/recordings -o exports/csv
+    """
+    found = contents.of_parts(parts)
+    files: dict[str, Content] = {
+        f"{one.name}/{LABELS}": json.dumps(dict(one.attributes), indent=1, sort_keys=True).encode() + b"\n"
+        for one in recordings
+    }
+    files[LAYOUT] = layout(found).encode()
+    files[readme.NAME] = readme.text("Tactile recordings as CSV", _OPENING, recordings, found)
+    return Result(files=Files(files), notes=readme.notes(recordings, found))
+
+
+def layout(found: Contents) -> str:
+    """Return the layout file that reads the files of an export back."""
+    lines = ["# Reads these files back: tacpipe ingest table FOLDER --layout FOLDER/layout.toml -o data/recordings"]
+    lines += ["", "[recordings]", 'name = "{recording}"']
+    count = max((len(one.recordings) for one in found.streams.values()), default=0)
+    for one in found.streams.values():
+        if any(column.name == TIME for column in one.columns):
+            lines += _stream(one, optional=len(one.recordings) < count)
+    return "\n".join([*lines, "", "[[labels]]", f'file = "{{recording}}/{LABELS}"', ""])
+
+
+def _stream(one: Stream, *, optional: bool) -> Iterator[str]:
+    yield ""
+    yield f"[streams.{shown(one.name)}]"
+    yield f"files = {json.dumps(f'{{recording}}/{shown(one.name)}.csv')}"
+    yield f'time = {{ column = "{TIME}", unit = "ns" }}'
+    if optional:
+        yield "optional = true"
+    if one.nan:
+        yield 'missing = ["nan"]'
+    yield "columns = ["
+    for column in one.columns:
+        if column.name == TIME:
+            continue
+        if column.type not in READ:
+            yield f"    {{ match = {_text(column.name)}, skip = true }},"
+            continue
+        entries = {"match": _text(column.name), "type": _text(TYPES.get(column.type, column.type))}
+        entries |= {key: _text(column.about[key]) for key in ("quantity", "unit", "component") if key in column.about}
+        more = {key: value for key, value in column.about.items() if key not in ("quantity", "unit", "component")}
+        if more:
+            entries["about"] = f"{{ {', '.join(f'{_text(key)} = {_text(value)}' for key, value in more.items())} }}"
+        yield f"    {{ {', '.join(f'{key} = {value}' for key, value in entries.items())} }},"
+    yield "]"
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=True)  # a basic string of TOML is written alike
+
+
+def _content(table: pa.Table) -> bytes:
+    """Return a table as CSV: floats with the fewest digits that give the same bits back, NaN as ``nan``."""
+    import pyarrow as pa
+    import pyarrow.csv as pc
+
+    bare = pa.Table.from_arrays([_written(column) for column in table.columns], names=table.column_names)
+    sink = io.BytesIO()
+    pc.write_csv(bare, sink)
+    return sink.getvalue()
+
+
+def _written(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return a column as it can be written: bytes as hex digits, whatever else has no form in CSV as text."""
+    import pyarrow as pa
+
+    if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
+        return pa.chunked_array(
+            [pa.array([None if one is None else one.hex() for one in column.to_pylist()], pa.string())]
+        )
+    if pa.types.is_nested(column.type):
+        return pa.chunked_array([pa.array([json.dumps(one) for one in column.to_pylist()], pa.string())])
+    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+
+
+def _losses(stream: str, table: pa.Table) -> Iterator[str]:
+    """Yield what of a stream CSV and the layout do not give back."""
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    where = f"stream {shown(stream)}"
+    if not stream:
+        yield "that the recordings are one table of several streams: they are read back as one stream, data"
+    if TIME not in table.column_names:
+        yield f"{where} has no time, so {LAYOUT} leaves it out"
+        return
+    about: Mapping[str, str] = contents.about(table.schema.field(TIME))
+    if "made" in about:
+        yield f"how the stamps of {where} were made ({about['made']})"
+    for field, column in zip(table.schema, table.columns, strict=True):
+        if str(field.type) not in READ:
+            yield f"column {field.name} of {where}, of the type {field.type}: {LAYOUT} leaves it out"
+        elif column.null_count and not pa.types.is_string(field.type):
+            yield f"missing values in column {field.name} of {where}: their cells are empty, and ingest refuses or reads NaN"
+        elif pa.types.is_floating(field.type) and bool(np.isinf(column.to_numpy()).any()):
+            yield f"infinite values in column {field.name} of {where}: ingest refuses them"
+        elif pa.types.is_string(field.type) and pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py():
+            yield f"line ends in the text of column {field.name} of {where}: ingest refuses them"

@@ -1,0 +1,164 @@
+"""A synchronized recording as frames of arrays: which columns belong together, what the robot's state and actions are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray
+from tacpipe.channels.masks import GRID
+from tacpipe.channels.streams import TRUTH
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.exports.contents import TIME, Contents, about
+from tacpipe.printable import listed, plain
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Recording
+
+RATE = "grid_rate_hz"  # attribute of a synchronized recording
+SYNCHRONIZE = "synchronize"
+ROBOT = ("joint_position", "position", "orientation")  # a stream with one of these is a robot's
+TARGETS = "target_"  # begins the quantities of what a robot was asked to do
+CLOCKS = ("time", "sequence", "mask", "label", "status", "text")  # quantities that are no signals
+TACTILE = "tactile"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A column of a synchronized table, with the stream that it came from; empty for what stages added."""
+
+    name: str
+    stream: str
+    quantity: str
+    unit: str
+    type: str
+
+    @property
+    def short(self) -> str:
+        """Its name as it was recorded, without the stream before it."""
+        return self.name.removeprefix(f"{self.stream}_") if self.stream else self.name
+
+    @property
+    def signal(self) -> bool:
+        """Whether it is a number that a sensor or a robot measured."""
+        number = self.type.startswith(("int", "uint", "float", "double", "half"))
+        return bool(self.stream) and number and self.quantity not in CLOCKS and not self.name.startswith(TRUTH)
+
+
+def synchronized(rate_hz: float | None, master: str) -> dict[str, dict[str, Any]]:
+    """Return the stage that gives recordings one rate, with its params; none without a rate."""
+    if rate_hz is None:
+        return {}
+    return {SYNCHRONIZE: {"rate_hz": rate_hz, **({"master": master} if master else {})}}
+
+
+def table(recording: Recording) -> pa.Table:
+    """Return the table of a synchronized recording. Raises `UsageError` for one that is not."""
+    if set(recording.streams) != {""} or GRID not in recording.attributes:
+        raise UsageError(
+            f"Recording {recording.name} is not synchronized, and the format has one rate for all streams. Give "
+            f"--rate-hz, or the output of `tacpipe {SYNCHRONIZE}`."
+        )
+    return recording.table()
+
+
+def columns(found: Contents, *, common: bool) -> tuple[list[str], Contents]:
+    """Return the columns of the frames, and what the recordings hold with what of it is left out.
+
+    Recordings whose columns differ are refused, or, where ``common``, those that all have are kept. Raises `UsageError`.
+    """
+    (stream,) = found.streams.values()
+    if not stream.others:
+        return list(stream.shared), found
+    lost = [one.name for one in stream.columns if one.name not in stream.shared]
+    if not common:
+        what = f"lacks {listed(lost, 3)}" if lost else "has more columns than"
+        raise UsageError(
+            f"Recording {stream.others[0]} {what}{', unlike' if lost else ''} the first one ({len(stream.others)} of "
+            f"{len(stream.recordings)} recordings differ), and the format has the same in all. Export recordings of one rig "
+            f"at a time, or give --common to leave out what not all of them have."
+        )
+    what = (
+        f"columns that not all recordings have, as {listed(lost, 3)}"
+        if lost
+        else "columns that not all recordings have"
+    )
+    return list(stream.shared), replace(found, losses={**found.losses, what: list(stream.recordings)})
+
+
+def channels(table: pa.Table) -> list[Channel]:
+    """Return the columns but the time."""
+    found = []
+    for field in table.schema:
+        if field.name != TIME:
+            given = about(field)
+            about_ = (given.get("stream", ""), given.get("quantity", ""), given.get("unit", ""))
+            found.append(Channel(field.name, *about_, str(field.type)))
+    return found
+
+
+def state_of(every: Sequence[Channel], streams: Sequence[str]) -> list[Channel]:
+    """Return the channels of the robot's state: of these streams, or of all that have joints or a pose.
+
+    Raises `UsageError` for a stream that is not there.
+    """
+    there = list(dict.fromkeys(one.stream for one in every if one.stream))
+    for name in streams:
+        if name not in there:
+            raise UsageError(f"There is no stream {plain(name)} in these frames; there are {listed(there)}.")
+    robots = streams or [one for one in there if any(c.stream == one and c.quantity in ROBOT for c in every)]
+    return [one for one in every if one.stream in robots and one.signal and not one.quantity.startswith(TARGETS)]
+
+
+def action_of(table: pa.Table, every: Sequence[Channel], stream: str) -> tuple[list[Channel], AnyArray]:
+    """Return the channels of the actions and their values (time, channel), float32.
+
+    These are the targets that ``stream`` recorded, at the same frame; without targets its measured state one frame later,
+    where the last frame repeats its own. Raises `UsageError` for a stream that is not there.
+    """
+    targets = [one for one in every if one.stream == stream and one.quantity.startswith(TARGETS)]
+    chosen = targets or state_of(every, [stream])
+    values = matrix(table, chosen, np.dtype(np.float32))
+    return chosen, values if targets else np.concatenate([values[1:], values[-1:]])
+
+
+def matrix(table: pa.Table, chosen: Sequence[Channel], kind: np.dtype[np.generic] | None = None) -> AnyArray:
+    """Return channels as one array (time, channel), of their common type or of ``kind``."""
+    with np.errstate(over="ignore"):
+        made = np.column_stack([table.column(one.name).to_numpy() for one in chosen])
+        return made if kind is None else made.astype(kind)
+
+
+def rounded(table: pa.Table, chosen: Sequence[Channel]) -> list[Channel]:
+    """Return the channels that float32 does not hold exactly."""
+    found = []
+    for one in chosen:
+        values = table.column(one.name).to_numpy()
+        with np.errstate(over="ignore"):
+            back = values.astype(np.float32).astype(values.dtype)
+        if not np.array_equal(values, back, equal_nan=values.dtype.kind == "f"):
+            found.append(one)
+    return found
+
+
+def rate_hz(recordings: Sequence[Recording]) -> float:
+    """Return the rate that all recordings share. Raises `UsageError` where they have several."""
+    rates = sorted({_rate(one) for one in recordings})
+    if len(rates) > 1:
+        raise UsageError(
+            f"The recordings have rates of {listed([f'{rate:g}' for rate in rates], 4)} Hz, and the format has one. Give "
+            f"recordings as they were recorded with --rate-hz, or synchronize them alike."
+        )
+    return rates[0]
+
+
+def _rate(recording: Recording) -> float:
+    rate = recording.attributes.get(RATE)
+    if not isinstance(rate, int | float) or rate <= 0:
+        raise TacpipeError(f"Recording {recording.name} does not state its rate ({RATE}). Synchronize it again.")
+    return float(rate)

@@ -1,0 +1,201 @@
+"""Write recordings as HDF5 files: a group a stream at its own rate, or one file of demonstrations as robomimic reads them.
+
+By default one file a recording: a group a stream, a dataset a column in its own type, unit and quantity as attributes,
+labels as attributes of the file. ``--structure robomimic`` writes one file ``demos.hdf5`` from synchronized recordings, or
+any with ``--rate-hz``: ``data/demo_0/obs/STREAM_QUANTITY`` and, with ``--actions``, ``actions``.
+
+Example: tacpipe export hdf5 data/recordings -o exports/hdf5
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from tacpipe.errors import UsageError
+from tacpipe.exports import contents, readme
+from tacpipe.exports.contents import TIME, shown
+from tacpipe.exports.files import Content, Files
+from tacpipe.plugins.constraints import Rate
+from tacpipe.plugins.stage import ALL, Attribute, Name, RecordingOutput, Result, stage
+
+if TYPE_CHECKING:
+    import h5py
+    import pyarrow as pa
+
+    from tacpipe.arrays import AnyArray
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+    Parts = Dataset
+
+DEMOS = "demos.hdf5"
+VERSION = ("v110", "v110")  # of HDF5, from 2016: many small columns take half of what they take in older ones
+CHUNK_ROWS = 1 << 16
+LEVEL = 4  # of gzip; higher ones take twice the time for 1 %
+_STREAMS = f"""
+One HDF5 file a recording: the group `STREAM` has a dataset a column; `{TIME}` is the time in nanoseconds of UTC.
+Attributes of a dataset are its unit and quantity, attributes of the file the labels:
+
+```python
+import h5py
+
+with h5py.File("EXPORT/RECORDING.h5") as file:
+    values, unit = file["STREAM/COLUMN"][:], file["STREAM/COLUMN"].attrs["unit"]
+```
+
+tacpipe reads them back with `tacpipe ingest hdf5`.
+"""
+_DEMOS = f"""
+One file of demonstrations, `{DEMOS}`, as robomimic reads them: `data/demo_0/obs/STREAM_QUANTITY` has the shape
+(frame, channel); the attribute `columns` names its channels, `units` their units. `data/demo_0` has the recording's name and
+labels as attributes.
+"""
+
+
+@dataclass(frozen=True)
+class Params:
+    """How the files are structured."""
+
+    structure: Literal["streams", "robomimic"] = "streams"  # a file a recording, or one of demonstrations
+    rate_hz: Rate | None = None  # robomimic: synchronize to this rate first
+    master: str = ""  # robomimic: stream whose samples start and end the frames; without it the first tactile one
+    actions: str = ""  # robomimic: stream of the actions: its targets, else its state one frame later
+    common: bool = False  # robomimic: leave out columns that not all recordings have
+
+    def check(self) -> None:
+        """Raise `UsageError` for an option that has no effect on streams."""
+        if self.structure == "streams" and (self.rate_hz is not None or self.actions or self.master or self.common):
+            raise UsageError(
+                "rate_hz, master, actions and common belong to --structure robomimic; streams are written as they are."
+            )
+
+
+def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
+    """Return the stage that recordings go through first, where a rate is given."""
+    from tacpipe.exports import frames
+
+    return frames.synchronized(params.rate_hz, params.master)
+
+
+@stage(version=1, reads=ALL)
+def part(params: Params, recording: Recording, name: Name) -> Result:
+    """Return the file of one recording, or nothing where all are in one."""
+    if params.structure == "robomimic":
+        from tacpipe.exports import arrays
+
+        return Result({"": RecordingOutput(contents.part(recording, arrays.losses(recording)))})
+    losses: list[str] = []
+    content = _recording(recording, losses)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, {f"{name}.h5": content})
+
+
+@stage(version=1, part=part, first=first)
+def hdf5(params: Params, recordings: Dataset, parts: Parts) -> Result:
+    """Write recordings as HDF5 files.
+
+    One file a recording with a group a stream at its own rate; or ``--structure robomimic``, one file of demonstrations.
+
+    Example: tacpipe export hdf5 data/recordings -o exports/hdf5
+    """
+    found = contents.of_parts(parts)
+    files: dict[str, Content] = {}
+    opening = _STREAMS
+    if params.structure == "robomimic":
+        from tacpipe.exports import frames
+
+        columns, found = frames.columns(found, common=params.common)
+        opening, files[DEMOS] = _DEMOS, lambda: _demos(params, recordings, columns)
+    files[readme.NAME] = readme.text("Tactile recordings as HDF5", opening, recordings, found)
+    return Result(files=Files(files), notes=readme.notes(recordings, found))
+
+
+def _recording(recording: Recording, losses: list[str]) -> bytes:
+    import h5py
+
+    sink = io.BytesIO()
+    with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
+        losses += _attributes(file, recording.attributes)
+        for stream in recording.streams:
+            group = file.create_group(shown(stream), track_order=True)
+            table = recording.table(stream)
+            for field, column in zip(table.schema, table.columns, strict=True):
+                losses += _column(group, field, column, shown(stream))
+    return sink.getvalue()
+
+
+def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[str]:
+    """Set the attributes of a recording; yield those that HDF5 has no value for."""
+    empty = [name for name, value in values.items() if value is None]
+    for name, value in values.items():
+        if value is not None:
+            group.attrs[name] = value
+    if empty:
+        yield "attributes without a value (null): HDF5 has none, so they are left out"
+
+
+def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[str]:
+    """Write a column; yield what of it is lost."""
+    import h5py
+    import numpy as np
+    import pyarrow as pa
+
+    kind, where = field.type, f"column {field.name} of stream {stream}"
+    if pa.types.is_string(kind):
+        values = np.array([one or "" for one in column.to_pylist()], dtype=object)
+        made = group.create_dataset(field.name, data=values, dtype=h5py.string_dtype())
+    elif pa.types.is_binary(kind):
+        values = np.empty(len(column), dtype=object)
+        values[:] = [np.frombuffer(one or b"", np.uint8) for one in column.to_pylist()]
+        made = group.create_dataset(field.name, data=values, dtype=h5py.vlen_dtype(np.uint8))
+    elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+        from tacpipe.exports import ros
+
+        values = ros.numbers(column)
+        made = group.create_dataset(field.name, data=values, **_storage(values))
+    else:
+        yield f"{where}: HDF5 has no type for {kind}"
+        return
+    for key, value in contents.about(field).items():
+        made.attrs[key] = value
+    if column.null_count:
+        yield f"missing values in {where}: they are written as NaN, 0 or empty text"
+
+
+def _storage(values: AnyArray) -> dict[str, Any]:
+    """Return how an array is stored: in compressed chunks, but for one without rows, which has none."""
+    if not len(values):
+        return {}
+    chunks = (min(len(values), CHUNK_ROWS), *values.shape[1:])
+    return {"chunks": chunks, "compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
+
+
+def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> bytes:
+    import h5py
+
+    from tacpipe.exports import arrays, frames
+
+    every = list(recordings)
+    rate_hz = frames.rate_hz(every)
+    sink = io.BytesIO()
+    with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
+        data = file.create_group("data", track_order=True)
+        total = 0
+        for number, one in enumerate(every):
+            demo = data.create_group(f"demo_{number}", track_order=True)
+            table = frames.table(one).select(columns)
+            for array in arrays.of(table, params.actions):
+                # robomimic reads actions next to obs
+                name = array.name if array.name in ("actions", TIME) else f"obs/{array.name}"
+                made = demo.create_dataset(name, data=array.values, **_storage(array.values))
+                made.attrs["columns"], made.attrs["units"] = list(array.columns), list(array.units)
+            demo.attrs["num_samples"] = table.num_rows
+            demo.attrs["recording"] = one.name
+            for _ in _attributes(demo, one.attributes):
+                pass  # stated for the part
+            total += table.num_rows
+        data.attrs["total"] = total
+        data.attrs["env_args"] = json.dumps({"env_name": "tacpipe", "type": 1, "env_kwargs": {"control_freq": rate_hz}})
+    return sink.getvalue()

@@ -1,0 +1,520 @@
+"""Write recordings as a LeRobot dataset (v3.0): frames at one rate, with the recorded shards beside them.
+
+Synchronized recordings, or any with ``--rate-hz``. The robot's streams are ``observation.state``, tactile streams
+``observation.tactile.STREAM``; clocks and masks are ``tacpipe.*``, which policies leave out. ``--actions`` names the stream
+whose targets, or next state, are ``action``. The task is ``--task``, with labels in braces. The shards as they were given,
+with their own rates and types, are under ``tacpipe/``.
+
+Example: tacpipe export lerobot data/recordings -o exports/lerobot --rate-hz 50 --actions robot --task "grasp the {object}"
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.channels.masks import GRID
+from tacpipe.channels.streams import TRUTH
+from tacpipe.errors import UsageError
+from tacpipe.exports import contents, readme
+from tacpipe.exports.contents import TIME
+from tacpipe.exports.files import Content, Files
+from tacpipe.plugins.constraints import Names, Rate
+from tacpipe.plugins.stage import RecordingOutput, Result, stage
+from tacpipe.printable import listed, plain
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import AnyArray, Floats
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+    Parts = Dataset
+
+VERSION = "v3.0"
+ORIGINALS = "tacpipe"
+RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the second is JSON
+ACTION = "action"
+STATS = "stats"  # table of a part
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
+CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # of LeRobot's own writer
+_PLACE = re.compile(r"\{([^{}]+)\}")
+_NUMPY = {"float": "float32", "double": "float64", "halffloat": "float16"}  # of arrow, where numpy's name differs
+_OPENING = """
+A LeRobot dataset, v3.0:
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("tacpipe/export", root="EXPORT")
+```
+
+`observation.state` is the robot, `observation.tactile.STREAM` a tactile sensor in its unit. `tacpipe.t_ns` is the time of a
+frame in nanoseconds of UTC, `tacpipe.held.STREAM` and `tacpipe.gap.STREAM` mark frames in which a sensor repeated its last
+value or sent nothing, `tacpipe.dt_ns.STREAM` is the distance to the nearest sample. `meta/tacpipe.json` has unit and
+quantity of each column.
+"""
+
+
+@dataclass(frozen=True)
+class Params:
+    """What the frames are made of."""
+
+    rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
+    master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
+    state: Names = ""  # streams of observation.state; without it those with joints or a pose
+    tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read nothing else
+    actions: str = ""  # stream of the actions: its targets, else its state one frame later
+    common: bool = False  # leave out columns that not all recordings have
+    task: str = "touch"  # text of the task, with labels in braces
+    robot_type: str = ""  # what info.json states as the robot
+    originals: bool = True  # put the shards as they were given under tacpipe/
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One feature of a frame: its values (time,) or (time, channel), and the channels' names, units and quantities."""
+
+    name: str
+    values: AnyArray
+    names: Sequence[str]
+    columns: Sequence[str]  # of the synchronized table
+    units: Sequence[str] = ()
+    quantities: Sequence[str] = ()
+
+    @property
+    def dtype(self) -> str:
+        """The type, as info.json names it."""
+        return "string" if self.values.dtype.kind in "OUT" else str(self.values.dtype)
+
+    @property
+    def shape(self) -> list[int]:
+        """The shape of one frame."""
+        return list(self.values.shape[1:]) or [1]
+
+
+def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
+    """Return the stage that recordings go through first, where a rate is given."""
+    from tacpipe.exports import frames
+
+    return frames.synchronized(params.rate_hz, params.master)
+
+
+def shards(params: Params) -> str:
+    """Return the folder of the shards as they were given."""
+    return ORIGINALS if params.originals else ""
+
+
+@stage(version=1, reads=("grid", "grid_rate_hz"))
+def part(params: Params, recording: Recording) -> RecordingOutput:
+    """Return the statistics of each feature of one recording."""
+    import pyarrow as pa
+
+    from tacpipe.exports import frames
+
+    table = frames.table(recording)
+    losses = list(_losses(params, table, str(recording.attributes[GRID])))
+    params = params if not params.actions or _has(table, params.actions) else replace(params, actions="")
+    rows = [
+        (one.name == ACTION, column, *values) for one in features(params, table) for column, values in _statistics(one)
+    ]
+    columns = list(zip(*rows, strict=True))
+    names = [ACTION, "column", *STATISTICS]
+    made = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
+    return RecordingOutput({**contents.part(recording, losses), STATS: made})
+
+
+@stage(version=1, part=part, first=first, originals=shards)
+def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
+    """Write recordings as a LeRobot dataset (v3.0).
+
+    Frames at one rate: synchronized recordings, or any with ``--rate-hz``. The robot's streams are observation.state,
+    tactile ones observation.tactile.STREAM; the shards as they were given are under tacpipe/.
+
+    Example: tacpipe export lerobot data/recordings -o exports/lerobot --rate-hz 50 --actions robot
+    """
+    from tacpipe.exports import frames
+
+    every = list(recordings)
+    fps = frames.rate_hz(every)
+    found = contents.of_parts(parts)
+    columns, found = frames.columns(found, common=params.common)
+    made = features(params, frames.table(every[0]).select(columns).slice(0, 2))
+    tasks = _tasks(params, every)
+    lengths = {one.name: _rows(parts, one.name) for one in every}
+    bundles = list(_bundles(every, lengths, sum(one.values[:1].nbytes for one in made)))
+    files: dict[str, Content] = {}
+    starts: dict[str, int] = {}
+    places: dict[str, tuple[int, int]] = {}
+    number = start = 0
+    for index, bundle in enumerate(bundles):
+        chunk, file = divmod(index, CHUNK_FILES)
+        for one in bundle:
+            starts[one.name], places[one.name] = start, (chunk, file)
+            start += lengths[one.name]
+        files[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = _data(
+            params, columns, bundle, number, starts, tasks, fps
+        )
+        number += len(bundle)
+    files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
+        made, every, parts, originals, starts, places, lengths, tasks, fps
+    )
+    files["meta/tasks.parquet"] = _task_table(tasks)
+    files["meta/info.json"] = _json(_info(params, made, lengths, tasks, fps))
+    files["meta/stats.json"] = _json(_all_stats(parts, made, starts, lengths, tasks, fps))
+    files["meta/tacpipe.json"] = _json(_about(made, found))
+    files[readme.NAME] = readme.text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, found)
+    return Result(files=Files(files), notes=readme.notes(recordings, found))
+
+
+def features(params: Params, table: pa.Table) -> list[Feature]:
+    """Return the features of a synchronized table, in a fixed order."""
+    import numpy as np
+
+    from tacpipe.exports import frames
+
+    every = frames.channels(table)
+    state = frames.state_of(every, [one.strip() for one in params.state.split(",") if one.strip()])
+    taxels = [one for one in every if one.signal and one.quantity == frames.TACTILE]
+    state = [one for one in state if one not in taxels]
+
+    def vector(name: str, chosen: Sequence[frames.Channel], values: AnyArray | None = None) -> Feature:
+        values = frames.matrix(table, chosen, np.dtype(np.float32)) if values is None else values
+        several = {one.stream for one in chosen}
+        names = [one.short if len(several) == 1 else one.name for one in chosen]
+        flat = values[:, 0] if values.shape[1] == 1 else values
+        return Feature(
+            name,
+            flat,
+            names,
+            [one.name for one in chosen],
+            [one.unit for one in chosen],
+            [one.quantity for one in chosen],
+        )
+
+    found: list[Feature] = []
+    whole = [*state, *taxels] if params.tactile_in_state else state
+    found += [vector("observation.state", whole)] if whole else []
+    if params.actions:
+        found.append(vector(ACTION, *frames.action_of(table, every, params.actions)))
+    rest = [one for one in every if one.signal and one not in state]
+    for stream in dict.fromkeys(one.stream for one in rest):
+        touch = [one for one in rest if one.stream == stream and one in taxels]
+        other = [one for one in rest if one.stream == stream and one not in taxels]
+        found += [vector(f"observation.tactile.{stream}", touch)] if touch else []
+        found += [vector(f"observation.{stream}", other)] if other else []
+    latents = [one for one in every if one.quantity == "latent"]
+    found += [vector("observation.latents", latents)] if latents else []
+    truth = [one for one in every if one.name.startswith(TRUTH) and one.type in ("float", "double")]
+    found += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
+    found.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
+    taken = {one.name for one in (*state, *rest, *latents, *truth)}
+    for one in every:
+        if one.name not in taken:
+            name = f"{one.short}.{one.stream}" if one.stream else one.short
+            values = table.column(one.name).to_numpy()
+            name = f"{ORIGINALS}.{name.replace('/', '_')}"
+            found.append(Feature(name, values, [one.name], [one.name], [one.unit], [one.quantity]))
+    return found
+
+
+def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[str]:
+    from tacpipe.exports import frames
+
+    every = frames.channels(table)
+    kept = f"; the shards under {ORIGINALS}/ keep them" if params.originals else ""
+    yield f"rates of the streams and what happened between frames: one frame rate for all{kept}"
+    if not params.originals:
+        yield "stream events, and types and units of the recorded streams (with --originals they are carried)"
+    if grid != "uniform":
+        yield f"distances between frames: timestamp is frame / fps, and the grid is {grid}; {ORIGINALS}.{TIME} has the times"
+    lossy = frames.rounded(table, [one for one in every if one.signal])
+    for stream in dict.fromkeys(one.stream for one in lossy):
+        yield f"digits beyond float32 of stream {stream}{kept}"
+
+
+def _has(table: pa.Table, stream: str) -> bool:
+    from tacpipe.exports import frames
+
+    return any(one.stream == stream for one in frames.channels(table))
+
+
+def _statistics(one: Feature) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Yield each column of a feature with its statistics; none of text, and NaN where nothing was measured."""
+    import numpy as np
+
+    if one.dtype == "string":
+        return
+    values = one.values.reshape(len(one.values), -1).astype(np.float64)
+    for channel, column in enumerate(one.columns):
+        yield column, _numbers(values[:, channel])
+
+
+def _numbers(values: Floats) -> tuple[float, ...]:
+    import numpy as np
+
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return (0.0,) * len(STATISTICS)
+    ends = (float(finite.min()), float(finite.max()), float(finite.mean()), float(finite.std()))
+    return (*ends, *(float(one) for one in np.quantile(finite, list(QUANTILES.values()))))
+
+
+def _rows(parts: Dataset, name: str) -> int:
+    return int(parts[name].table(contents.STREAMS)["rows"][0].as_py())
+
+
+def _tasks(params: Params, every: Sequence[Recording]) -> dict[str, str]:
+    """Return the task of each recording. Raises `UsageError` for a label that a recording does not have."""
+    found = {}
+    for one in every:
+        for label in _PLACE.findall(params.task):
+            if one.attributes.get(label) is None:
+                raise UsageError(
+                    f"The task names {{{plain(label)}}}, and recording {one.name} has no such label; it has "
+                    f"{listed(one.attributes)}."
+                )
+        found[one.name] = _PLACE.sub(lambda match, one=one: str(one.attributes[match[1]]), params.task)  # type: ignore[misc]
+    return found
+
+
+def _bundles(every: Sequence[Recording], lengths: Mapping[str, int], row_bytes: int) -> Iterator[list[Recording]]:
+    """Yield the recordings of each data file."""
+    bundle: list[Recording] = []
+    size = 0
+    for one in every:
+        bytes_ = lengths[one.name] * row_bytes
+        if bundle and size + bytes_ > FILE_BYTES:
+            yield bundle
+            bundle, size = [], 0
+        bundle.append(one)
+        size += bytes_
+    yield bundle
+
+
+def _data(
+    params: Params,
+    columns: Sequence[str],
+    bundle: Sequence[Recording],
+    number: int,
+    starts: Mapping[str, int],
+    tasks: Mapping[str, str],
+    fps: float,
+) -> Callable[[], bytes]:
+    """Return what makes a data file, one row group an episode; ``number`` is that of its first episode."""
+
+    def content() -> bytes:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        from tacpipe.exports import frames
+
+        order = _task_order(tasks)
+        sink = pa.BufferOutputStream()
+        writer = None
+        for episode, one in enumerate(bundle, start=number):
+            made = features(params, frames.table(one).select(columns))
+            arrays = {feature.name: _arrow(feature) for feature in made}
+            arrays |= _index(len(made[0].values), episode, starts[one.name], order[tasks[one.name]], fps)
+            table = pa.table(arrays)
+            writer = writer or pq.ParquetWriter(sink, table.schema, compression="zstd")
+            writer.write_table(table, row_group_size=max(1, table.num_rows))
+        assert writer is not None
+        writer.close()
+        return bytes(sink.getvalue().to_pybytes())
+
+    return content
+
+
+def _index(rows: int, episode: int, start: int, task: int, fps: float) -> dict[str, pa.Array]:
+    import numpy as np
+    import pyarrow as pa
+
+    frame = np.arange(rows)
+    return {
+        "timestamp": pa.array((frame / fps).astype(np.float32)),
+        "frame_index": pa.array(frame),
+        "episode_index": pa.array(np.full(rows, episode)),
+        "index": pa.array(frame + start),
+        "task_index": pa.array(np.full(rows, task)),
+    }
+
+
+def _arrow(feature: Feature) -> pa.Array:
+    import pyarrow as pa
+
+    values = feature.values
+    if values.ndim == 1:
+        return pa.array(values)
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+
+
+def _task_order(tasks: Mapping[str, str]) -> dict[str, int]:
+    return {task: index for index, task in enumerate(sorted(set(tasks.values())))}
+
+
+def _task_table(tasks: Mapping[str, str]) -> bytes:
+    """Return the tasks as LeRobot has them: a frame of pandas with the text as its index."""
+    import pandas as pd
+
+    order = _task_order(tasks)
+    sink = io.BytesIO()
+    pd.DataFrame({"task_index": list(order.values())}, index=list(order)).to_parquet(sink)
+    return sink.getvalue()
+
+
+def _episodes(
+    made: Sequence[Feature],
+    every: Sequence[Recording],
+    parts: Dataset,
+    originals: Dataset,
+    starts: Mapping[str, int],
+    places: Mapping[str, tuple[int, int]],
+    lengths: Mapping[str, int],
+    tasks: Mapping[str, str],
+    fps: float,
+) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    order = _task_order(tasks)
+    rows = []
+    for episode, one in enumerate(every):
+        chunk, file = places[one.name]
+        row: dict[str, Any] = {
+            "episode_index": episode,
+            "tasks": [tasks[one.name]],
+            "length": lengths[one.name],
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+            "dataset_from_index": starts[one.name],
+            "dataset_to_index": starts[one.name] + lengths[one.name],
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+            RECORDING: one.name,
+            ATTRIBUTES: json.dumps(dict(originals[one.name].attributes), sort_keys=True),
+        }
+        stats = _episode_stats(made, parts[one.name], lengths[one.name])
+        stats |= _index_stats(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
+        row |= {f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()}
+        rows.append(row)
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
+    return bytes(sink.getvalue().to_pybytes())
+
+
+Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
+
+
+def _episode_stats(made: Sequence[Feature], part: Recording, rows: int) -> Stats:
+    known = {(row[ACTION], row["column"]): row for row in part.table(STATS).to_pylist()}
+    found: Stats = {}
+    for one in made:
+        if one.dtype != "string":
+            mine = [known[one.name == ACTION, column] for column in one.columns]
+            found[one.name] = {**{name: [row[name] for row in mine] for name in STATISTICS}, "count": [rows]}
+    return found
+
+
+def _index_stats(rows: int, episode: int, start: int, task: int, fps: float) -> Stats:
+    import numpy as np
+
+    frame = np.arange(rows, dtype=np.float64)
+    columns = {
+        "timestamp": frame / fps,
+        "frame_index": frame,
+        "episode_index": np.full(rows, float(episode)),
+        "index": frame + start,
+        "task_index": np.full(rows, float(task)),
+    }
+    return {
+        name: {**{key: [value] for key, value in zip(STATISTICS, _numbers(values), strict=True)}, "count": [rows]}
+        for name, values in columns.items()
+    }
+
+
+def _all_stats(
+    parts: Dataset,
+    made: Sequence[Feature],
+    starts: Mapping[str, int],
+    lengths: Mapping[str, int],
+    tasks: Mapping[str, str],
+    fps: float,
+) -> Stats:
+    """Return the statistics over all episodes, put together as LeRobot does: of quantiles the mean over frames."""
+    import numpy as np
+
+    order = _task_order(tasks)
+    every = [
+        {
+            **_episode_stats(made, parts[name], rows),
+            **_index_stats(rows, episode, starts[name], order[tasks[name]], fps),
+        }
+        for episode, (name, rows) in enumerate(lengths.items())
+    ]
+    weights = np.array(list(lengths.values()), float)[:, None] / sum(lengths.values())
+    found: Stats = {}
+    for feature in every[0]:
+        stacked = {name: np.array([one[feature][name] for one in every]) for name in STATISTICS}  # (episode, channel)
+        mean = (weights * stacked["mean"]).sum(0)
+        spread = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(0)
+        found[feature] = {
+            "min": stacked["min"].min(0).tolist(),
+            "max": stacked["max"].max(0).tolist(),
+            "mean": mean.tolist(),
+            "std": np.sqrt(spread).tolist(),
+            "count": [sum(lengths.values())],
+            **{name: (weights * stacked[name]).sum(0).tolist() for name in QUANTILES},
+        }
+    return found
+
+
+def _info(
+    params: Params, made: Sequence[Feature], lengths: Mapping[str, int], tasks: Mapping[str, str], fps: float
+) -> dict[str, Any]:
+    described: dict[str, Any] = {
+        one.name: {"dtype": one.dtype, "shape": one.shape, "names": list(one.names) if one.shape != [1] else None}
+        for one in made
+    }
+    described["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    for name in ("frame_index", "episode_index", "index", "task_index"):
+        described[name] = {"dtype": "int64", "shape": [1], "names": None}
+    return {
+        "codebase_version": VERSION,
+        "robot_type": params.robot_type or None,
+        "total_episodes": len(lengths),
+        "total_frames": sum(lengths.values()),
+        "total_tasks": len(set(tasks.values())),
+        "chunks_size": CHUNK_FILES,
+        "data_files_size_in_mb": FILE_BYTES >> 20,
+        "video_files_size_in_mb": 200,
+        "fps": int(fps) if fps.is_integer() else fps,
+        "splits": {"train": f"0:{len(lengths)}"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "features": described,
+    }
+
+
+def _about(made: Sequence[Feature], found: contents.Contents) -> dict[str, Any]:
+    """Return units and quantities of each feature, and the columns of the synchronized table."""
+    return {
+        "features": {
+            one.name: {"columns": list(one.columns), "units": list(one.units), "quantities": list(one.quantities)}
+            for one in made
+        },
+        "columns": {
+            column.name: {"type": column.type, **column.about}
+            for stream in found.streams.values()
+            for column in stream.columns
+        },
+    }
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, indent=4, ensure_ascii=False).encode() + b"\n"

@@ -1,0 +1,160 @@
+"""Write recordings as MCAP files, one a recording, for Foxglove and ROS 2.
+
+Each stream is a topic of ROS 2 messages with one field a column in its own type, at its own rate; events are a topic too,
+labels a metadata record. Streams that make up a pose, a wrench, a twist, joint states or tactile states are written as
+these messages besides (``--no-usual-messages`` leaves them out). Log time and header stamp are the stamps of the stream.
+
+Example: tacpipe export mcap data/recordings -o exports/mcap
+"""
+
+from __future__ import annotations
+
+import heapq
+import io
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.exports import contents, readme
+from tacpipe.exports.contents import TIME, shown
+from tacpipe.exports.files import Files
+from tacpipe.plugins.stage import ALL, Name, RecordingOutput, Result, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from mcap.writer import Writer
+
+    from tacpipe.arrays import Int64s
+    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.exports.ros import Topic
+
+    Parts = Dataset
+
+RECORD = "tacpipe"  # the name of the metadata record
+_OPENING = """
+One MCAP file a recording (profile `ros2`, messages in CDR with their definitions): open it in Foxglove, play it with
+`ros2 bag play FILE.mcap`, or read it in Python with `rosbags` or `mcap`.
+
+The topic `/STREAM` has messages of the type `tacpipe_msgs/msg/Stream`, a field a column; the metadata of its channel name
+stream, columns and units (`tacpipe`, JSON). Topics below it (`/STREAM/pose`) repeat some columns as usual messages. Labels
+are in the metadata record `tacpipe`. tacpipe reads the files back with `tacpipe ingest mcap`.
+"""
+
+
+@dataclass(frozen=True)
+class Params:
+    """What is written besides the streams themselves."""
+
+    usual_messages: bool = True  # poses, wrenches, twists, joint and tactile states as messages of these types too
+
+
+@stage(version=1, reads=ALL)
+def part(params: Params, recording: Recording, name: Name) -> Result:
+    """Return the MCAP file of one recording."""
+    losses: list[str] = []
+    content = _written(params, recording, name, losses)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, {f"{name}.mcap": content})
+
+
+@stage(version=1, part=part)
+def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
+    """Write recordings as MCAP files for Foxglove and ROS 2.
+
+    One file a recording, one topic a stream at its own rate with each column in its own type; labels are metadata, events
+    a topic.
+
+    Example: tacpipe export mcap data/recordings -o exports/mcap
+    """
+    found = contents.of_parts(parts)
+    text = readme.text("Tactile recordings as MCAP", _OPENING, recordings, found)
+    return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found))
+
+
+def _written(params: Params, recording: Recording, name: str, losses: list[str]) -> bytes:
+    from mcap.writer import CompressionType, Writer
+
+    sink = io.BytesIO()
+    writer = Writer(sink, compression=CompressionType.ZSTD)
+    writer.start(profile="ros2", library="tacpipe")
+    record = {"recording": name, "attributes": json.dumps(dict(recording.attributes), sort_keys=True)}
+    writer.add_metadata(RECORD, record)
+    messages = [_messages(writer, topic, t_ns) for topic, t_ns in _topics(params, recording, losses)]
+    for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda one: one[0])):
+        writer.add_message(channel, log_ns, content, log_ns, number)
+    writer.finish()  # type: ignore[no-untyped-call]
+    return sink.getvalue()
+
+
+def _topics(params: Params, recording: Recording, losses: list[str]) -> Iterator[tuple[Topic, Int64s]]:
+    import numpy as np
+
+    from tacpipe.exports import ros
+
+    starts = [start for stream in recording.streams if (start := _start(recording, stream)) is not None]
+    for stream in recording.streams:
+        table = recording.table(stream)
+        losses += _losses(stream, table)
+        if TIME not in table.column_names:
+            if set(ros.POINT) <= set(table.column_names) and starts and min(starts) >= 0:
+                yield ros.cloud(stream, table, min(starts)), np.array([min(starts)])
+                losses.append(
+                    f"stream {shown(stream)} has no time: its one message is stamped with the recording's start"
+                )
+            else:
+                losses.append(f"stream {shown(stream)}: it has no time, and a message needs one")
+            continue
+        t_ns = table.column(TIME).to_numpy()
+        if table.num_rows and not 0 <= t_ns.min() <= t_ns.max() <= ros.LATEST_S * 10**9:
+            losses.append(
+                f"stream {shown(stream)}: its stamps lie before 1970 or after 2038, which ROS has no stamps for"
+            )
+            continue
+        yield ros.own(stream, table, t_ns), t_ns
+        if params.usual_messages:
+            for topic in ros.usual(stream, table, t_ns):
+                yield topic, t_ns
+
+
+def _start(recording: Recording, stream: str) -> int | None:
+    """Return the first stamp of a stream; None where it has none."""
+    columns = recording.columns(stream)
+    if TIME not in columns.column_names or not columns.num_rows:
+        return None
+    return int(columns.column(TIME)[0].as_py())
+
+
+def _messages(writer: Writer, topic: Topic, t_ns: Int64s) -> Iterable[tuple[int, int, bytes]]:
+    """Register a topic, and return log time, channel and content of each message, in the order of time."""
+    import numpy as np
+
+    from tacpipe.exports import cdr
+
+    schema = writer.register_schema(topic.type, "ros2msg", topic.definition.encode())
+    metadata = {"tacpipe": json.dumps(topic.metadata, sort_keys=True)}
+    channel = writer.register_channel(topic.name, "cdr", schema, metadata)
+    contents_ = cdr.packed(topic.parts, len(t_ns))
+    stamps = t_ns.tolist()
+    if np.any(np.diff(t_ns) < 0):  # events come stream by stream
+        every = list(contents_)
+        return ((stamps[row], channel, every[row]) for row in np.argsort(t_ns, kind="stable").tolist())
+    return zip(stamps, (channel for _ in stamps), contents_, strict=True)
+
+
+def _losses(stream: str, table: pa.Table) -> Iterator[str]:
+    """Yield what of a stream its messages do not hold."""
+    import pyarrow as pa
+
+    from tacpipe.exports import ros
+
+    where = f"stream {shown(stream)}"
+    if TIME not in table.column_names:
+        return
+    for field, column in zip(table.schema, table.columns, strict=True):
+        if str(field.type) not in ros.TYPES:
+            yield f"column {field.name} of {where}: messages have no type for {field.type}"
+        elif column.null_count:
+            written: Any = (
+                "NaN" if pa.types.is_floating(field.type) else "empty" if pa.types.is_string(field.type) else 0
+            )
+            yield f"missing values in column {field.name} of {where}: they are written as {written}"

@@ -1,0 +1,15 @@
+"""A project with two recordings."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.conftest import Lab
+from tests.exports import recordings
+
+
+@pytest.fixture
+def rig(lab: Lab) -> Lab:
+    """A project with the dataset ``rec`` of two recordings of three streams."""
+    recordings.write(lab.folder / "rec", recordings.trials())
+    return lab

@@ -1,0 +1,91 @@
+"""Recordings made by hand with every type of column, and the same ones synchronized, written as a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.channels import schema
+from tacpipe.datasets import directory
+from tacpipe.datasets.manifest import ACQUIRE, Manifest
+from tacpipe.io.parquet import to_parquet
+from tacpipe.store.store import Store
+
+START_NS = 1_700_000_000_123_456_789
+Tables = Mapping[str, pa.Table]
+
+
+def skin(seed: int, rows: int = 40, rate_hz: float = 100.0) -> pa.Table:
+    """Return a stream of a tactile array: time, a counter, 2 taxels of three axes in uint16."""
+    chance = np.random.default_rng(seed)
+    t_ns = START_NS + np.rint(np.arange(rows) * 1e9 / rate_hz).astype(np.int64) + chance.integers(0, 1000, rows)
+    fields = [pa.field("seq", pa.int64(), metadata={"unit": "1", "quantity": "sequence"}), *schema.uskin_fields(2)]
+    return schema.stream(t_ns, [np.arange(rows), *chance.integers(0, 65536, (6, rows))], fields)
+
+
+def arm(seed: int, rows: int = 200, rate_hz: float = 500.0) -> pa.Table:
+    """Return a stream of an arm: a pose and a wrench in float64 of any digits, one of them NaN."""
+    chance = np.random.default_rng(seed + 100)
+    t_ns = START_NS + np.rint(np.arange(rows) * 1e9 / rate_hz).astype(np.int64)
+    fields = [*schema.pose_fields(), *schema.wrench_fields()]
+    values = chance.normal(0, 1, (len(fields), rows)) * 10.0 ** chance.integers(-200, 200, (len(fields), rows))
+    values[:7] = chance.normal(0, 1, (7, rows))
+    values[8, 3], values[9, 4] = np.nan, -0.0
+    return schema.stream(t_ns, values, fields)
+
+
+def odd(seed: int, rows: int = 30) -> pa.Table:
+    """Return a stream with every other type, at the ends of their ranges."""
+    chance = np.random.default_rng(seed + 200)
+    t_ns = START_NS + np.arange(rows) * 3_000_001
+    columns: dict[str, pa.Array] = {"t_ns": pa.array(t_ns)}
+    for kind in ("int8", "uint8", "int16", "int32", "uint32", "int64"):
+        limits = np.iinfo(kind)
+        values = chance.integers(limits.min, limits.max, rows, dtype=kind, endpoint=True)
+        values[:2] = limits.min, limits.max
+        columns[kind] = pa.array(values)
+    bits = chance.integers(0, 2**32, rows, dtype=np.uint32).view(np.float32)
+    columns["Force X [N]"] = pa.array(np.where(np.isfinite(bits), bits, np.float32(1e-45)).astype(np.float32))
+    columns["on"] = pa.array(chance.integers(0, 2, rows).astype(bool))
+    columns["said"] = pa.array([f'row {row}, "quoted", µ' if row % 3 else "" for row in range(rows)])
+    fields = [
+        pa.field(name, column.type, metadata={"unit": "1", "quantity": "state"}) for name, column in columns.items()
+    ]
+    return pa.table(list(columns.values()), pa.schema([schema.time_field(), *fields[1:]]))
+
+
+def trial(seed: int) -> tuple[dict[str, pa.Table], dict[str, Any]]:
+    """Return streams and attributes of one recording."""
+    attributes = {
+        "object": "cup" if seed % 2 else "box",
+        "mass_kg": 0.25 * seed,
+        "trial": seed,
+        "ok": True,
+        "code": "007",
+    }
+    return {"skin": skin(seed), "arm": arm(seed), "odd": odd(seed)}, attributes
+
+
+def write(folder: Path, given: Mapping[str, tuple[Tables, Mapping[str, Any]]]) -> Path:
+    """Write recordings as a dataset of the project in the working directory; return its directory."""
+    store = Store(Path(".tacpipe").absolute())
+    store.prepare()
+    recordings = {}
+    for name, (tables, attributes) in given.items():
+        shards = {
+            stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
+            for stream, table in sorted(tables.items())
+        }
+        recordings[name] = {"attributes": dict(sorted(attributes.items())), "shards": shards}
+    made = Manifest(ACQUIRE, 1, {}, recordings=recordings)
+    directory.change(store, folder, lambda: directory.Change(made))
+    return folder
+
+
+def trials(count: int = 2) -> dict[str, tuple[Tables, Mapping[str, Any]]]:
+    """Return so many recordings by name."""
+    return {f"trial-{number:02d}": trial(number) for number in range(count)}

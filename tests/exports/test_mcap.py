@@ -1,0 +1,125 @@
+"""MCAP files as rosbags and mcap's own reader read them: names, types, values to the bit, stamps, labels."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from tests.conftest import Lab
+from tests.exports import recordings
+
+
+def read(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Return log time and message of each topic, as rosbags reads them."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with AnyReader([path]) as reader:
+        last = 0
+        for connection, t_ns, raw in reader.messages():
+            assert t_ns >= last
+            last = t_ns
+            found.setdefault(connection.topic, []).append((t_ns, reader.deserialize(raw, connection.msgtype)))
+    return found
+
+
+def test_rosbags_reads_each_column_to_the_bit_with_its_stamps(rig: Lab) -> None:
+    rig.run("export mcap rec -o mcap")
+    found = read(rig.folder / "mcap/trial-01.mcap")
+    for stream, table in recordings.trial(1)[0].items():
+        messages = found[f"/{stream}"]
+        np.testing.assert_array_equal([t_ns for t_ns, _ in messages], table["t_ns"].to_numpy())
+        stamps = [one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for _, one in messages]
+        np.testing.assert_array_equal(stamps, table["t_ns"].to_numpy())
+        for name in table.column_names[1:]:
+            field = "force_x_n_2" if name == "Force X [N]" and "force_x_n" in table.column_names else name.lower()
+            field = {"Force X [N]": "force_x_n"}.get(name, field)
+            values = [getattr(one, field) for _, one in messages]
+            wanted = table[name].to_numpy(zero_copy_only=False)
+            if pa.types.is_string(table.schema.field(name).type):
+                assert values == wanted.tolist()
+            else:
+                assert np.array(values, wanted.dtype).tobytes() == wanted.tobytes()
+
+
+def test_a_pose_and_tactile_states_are_there_as_usual_messages_unless_they_are_not_wanted(rig: Lab) -> None:
+    rig.run("export mcap rec -o mcap")
+    found = read(rig.folder / "mcap/trial-00.mcap")
+    arm = recordings.arm(0)
+    np.testing.assert_array_equal(
+        [one.pose.position.y for _, one in found["/arm/pose"]], arm["position_y_m"].to_numpy()
+    )
+    np.testing.assert_array_equal(
+        [one.pose.orientation.w for _, one in found["/arm/pose"]], arm["orientation_w"].to_numpy()
+    )
+    np.testing.assert_array_equal(
+        [one.wrench.torque.z for _, one in found["/arm/wrench"]], arm["torque_z_nm"].to_numpy()
+    )
+    touch = [one.sensors[0].values for _, one in found["/skin/tactile"]]
+    np.testing.assert_array_equal(np.array(touch)[:, 5], recordings.skin(0)["taxel02_z"].to_numpy())
+    rig.run("export mcap rec -o bare --no-usual-messages")
+    assert set(read(rig.folder / "bare/trial-00.mcap")) == {"/skin", "/arm", "/odd"}
+
+
+def test_labels_and_columns_with_their_units_are_metadata(rig: Lab) -> None:
+    rig.run("export mcap rec -o mcap")
+    with (rig.folder / "mcap/trial-01.mcap").open("rb") as file:
+        reader = make_reader(file)
+        (record,) = reader.iter_metadata()
+        summary = reader.get_summary()
+    assert record.name == "tacpipe"
+    assert record.metadata["recording"] == "trial-01"
+    assert json.loads(record.metadata["attributes"]) == recordings.trial(1)[1]
+    assert summary is not None
+    channels = {one.topic: json.loads(one.metadata["tacpipe"]) for one in summary.channels.values()}
+    assert channels["/skin"]["stream"] == "skin"
+    assert channels["/skin"]["columns"][1] == {
+        "field": "taxel01_x",
+        "name": "taxel01_x",
+        "type": "uint16",
+        "about": {"unit": "count", "quantity": "tactile", "taxel": "1", "axis": "x"},
+    }
+    assert channels["/arm/pose"] == {"derived_from": "/arm"}
+    assert {one.encoding for one in summary.schemas.values()} == {"ros2msg"}
+
+
+def test_events_are_a_topic_in_the_order_of_time_and_missing_values_are_listed(lab: Lab) -> None:
+    t_ns = [recordings.START_NS + 5, recordings.START_NS]
+    events = pa.table({"t_ns": t_ns, "stream": ["skin", "arm"], "frames": pa.array([3, None], pa.int64())})
+    recordings.write(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {})})
+    ran = lab.run("export mcap rec -o mcap")
+    found = read(lab.folder / "mcap/a.mcap")["/events"]
+    assert [(at, one.stream, one.frames) for at, one in found] == [(t_ns[1], "arm", 0), (t_ns[0], "skin", 3)]
+    assert any("frames" in line and "events" in line for line in ran.err.splitlines())
+
+
+def test_a_stream_without_time_is_listed_as_not_carried(lab: Lab) -> None:
+    cloud = pa.table({"x_m": pa.array([0.5], pa.float32())})
+    recordings.write(lab.folder / "rec", {"a": ({"cloud": cloud, "skin": recordings.skin(1)}, {})})
+    assert "stream cloud" in lab.run("export mcap rec -o mcap").err
+    assert set(read(lab.folder / "mcap/a.mcap")) == {"/skin", "/skin/tactile"}
+
+
+def test_a_cloud_of_points_is_one_message_with_its_colours(lab: Lab) -> None:
+    points = {name: pa.array([0.5, -1.5], pa.float32()) for name in ("x_m", "y_m", "z_m")}
+    colours = {name: pa.array([1, 255], pa.uint8()) for name in ("red", "green", "blue")}
+    recordings.write(
+        lab.folder / "rec", {"a": ({"scene": pa.table({**points, **colours}), "skin": recordings.skin(1)}, {})}
+    )
+    assert "stream scene" in lab.run("export mcap rec -o mcap").err
+    ((t_ns, message),) = read(lab.folder / "mcap/a.mcap")["/scene"]
+    assert t_ns == recordings.skin(1)["t_ns"][0].as_py()
+    assert (message.width, message.height, message.point_step) == (2, 1, 16)
+    assert [(field.name, field.offset, field.datatype) for field in message.fields] == [
+        ("x", 0, 7),
+        ("y", 4, 7),
+        ("z", 8, 7),
+        ("rgb", 12, 7),
+    ]
+    made = message.data.view([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    assert made["z"].tolist() == [0.5, -1.5]
+    assert made["rgb"].tolist() == [0x010101, 0xFFFFFF]

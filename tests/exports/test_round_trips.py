@@ -1,0 +1,55 @@
+"""What was exported and ingested again has the same shards, by digest, and the same labels."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+import pytest
+
+import tacpipe
+from tacpipe.channels import schema
+from tests.conftest import Lab
+from tests.exports import recordings
+
+
+@pytest.mark.parametrize(
+    ("export", "ingest"),
+    [
+        ("csv rec", "table out --layout out/layout.toml"),
+        ("mcap rec", "mcap out"),
+        pytest.param("hdf5 rec", "hdf5 out", marks=pytest.mark.long),
+        pytest.param("lerobot rec --rate-hz 100", "lerobot out", marks=pytest.mark.long),
+    ],
+    ids=["csv", "mcap", "hdf5", "lerobot"],
+)
+def test_the_shards_are_the_same(rig: Lab, export: str, ingest: str) -> None:
+    rig.run(f"export {export} -o out")
+    rig.run(f"ingest {ingest} -o back")
+    given, back = tacpipe.open("rec"), tacpipe.open("back")
+    assert {one.name: one.digests for one in back} == {one.name: one.digests for one in given}
+    assert {one.name: dict(one.attributes) for one in back} == {one.name: dict(one.attributes) for one in given}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("export", ["zarr rec --rate-hz 100", "hdf5 rec --structure robomimic --rate-hz 100"])
+def test_frames_come_back_with_their_values_and_times(rig: Lab, export: str) -> None:
+    rig.run(f"export {export} -o out")
+    rig.run("synchronize rec -o sync --rate-hz 100")
+    rig.run(f"ingest {'zarr' if 'zarr' in export else 'hdf5'} out -o back")
+    for given, back in zip(tacpipe.open("sync"), tacpipe.open("back"), strict=True):
+        (stream,) = (one for one in back.streams if "skin_taxel01_x" in back.table(one).column_names)
+        table = back.table(stream)
+        assert table["t_ns"].equals(given.table()["t_ns"])
+        for name in ("skin_taxel01_x", "arm_position_z_m", "skin_gap"):
+            assert table[name].equals(given.table()[name])
+
+
+@pytest.mark.long
+def test_events_come_back(lab: Lab) -> None:
+    columns = {"stream": pa.array(["skin"]), "cause": pa.array(["link"]), "frames": pa.array([3])}
+    fields = [schema.time_field(), *(pa.field(name, column.type) for name, column in columns.items())]
+    events = pa.table([pa.array([recordings.START_NS]), *columns.values()], pa.schema(fields))
+    recordings.write(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {"object": "cup"})})
+    for export, ingest in (("mcap rec", "mcap"), ("hdf5 rec", "hdf5"), ("lerobot rec --rate-hz 100", "lerobot")):
+        lab.run(f"export {export} -o out-{ingest}")
+        lab.run(f"ingest {ingest} out-{ingest} -o back-{ingest}")
+        assert tacpipe.open(f"back-{ingest}")["a"].digests == tacpipe.open("rec")["a"].digests

@@ -1,0 +1,51 @@
+"""Zarr replay buffers as zarr reads them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+
+import tacpipe
+from tests.conftest import Lab
+from tests.exports import recordings
+
+
+def opened() -> Any:
+    """Return the store that was written."""
+    return zarr.open("buffer/replay.zarr", mode="r", zarr_format=2)
+
+
+def test_zarr_reads_the_frames_of_all_recordings_and_where_each_ends(rig: Lab) -> None:
+    rig.run("export zarr rec -o buffer --rate-hz 100 --actions arm")
+    rig.run("synchronize rec -o sync --rate-hz 100")
+    tables = [one.table() for one in tacpipe.open("sync")]
+    store = opened()
+    assert store["meta/episode_ends"][:].tolist() == np.cumsum([table.num_rows for table in tables]).tolist()
+    touch = np.concatenate([table["skin_taxel01_z"].to_numpy() for table in tables])
+    np.testing.assert_array_equal(store["data/skin_tactile"][:, 2], touch)
+    assert store["data/skin_tactile"].attrs["columns"][2] == "skin_taxel01_z"
+    np.testing.assert_array_equal(store["data/t_ns"][:], np.concatenate([table["t_ns"].to_numpy() for table in tables]))
+    assert store["data/actions"].shape == (sum(table.num_rows for table in tables), 13)
+    assert store["meta"].attrs["labels"]["trial-01"]["object"] == "cup"
+    assert store["meta"].attrs["rate_hz"] == 100
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_store_holds_nothing_that_zarr_does_not_know(rig: Lab) -> None:
+    rig.run("export zarr rec -o buffer --rate-hz 100")
+    assert list(opened().groups())
+
+
+def test_recordings_of_other_channels_are_refused_by_name(lab: Lab) -> None:
+    both = {"skin": recordings.skin(1), "arm": recordings.arm(1)}
+    given: dict[str, Any] = {"a": ({"skin": recordings.skin(1)}, {}), "b": (both, {})}
+    recordings.write(lab.folder / "rec", given)
+    ran = lab.call("export zarr rec -o buffer --rate-hz 100")
+    assert ran.code == 2
+    assert "b" in ran.err.split()
+    ran = lab.run("export zarr rec -o buffer --rate-hz 100 --common")
+    assert "arm_position_x_m" not in opened()["data/skin_tactile"].attrs["columns"]
+    assert any("not carried" in line and "columns" in line for line in ran.err.splitlines())
