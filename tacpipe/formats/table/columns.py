@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +16,19 @@ from tacpipe.printable import listed, plain
 
 TIME = "t_ns"
 TYPES = {
-    **{name: getattr(pa, name)() for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64")},
-    **{"float32": pa.float32(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()},
+    **{
+        name: getattr(pa, name)() for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
+    },
+    **{
+        "float32": pa.float32(),
+        "float64": pa.float64(),
+        "bool": pa.bool_(),
+        "text": pa.string(),
+        "binary": pa.binary(),
+    },
 }
+Declared = Mapping[str, pa.Field]  # by the name of a column: its type and what its metadata say
+NOTHING: Declared = {}
 
 
 @dataclass(frozen=True)
@@ -43,10 +53,12 @@ class CellError(ValueError):
         self.row = row
 
 
-def chosen(stream: Stream, names: Sequence[str], path: Path) -> list[Chosen]:
+def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared = NOTHING) -> list[Chosen]:
     """Return the columns to read among those that ``path`` has, in the file's order.
 
-    Raises `TacpipeError` for a column that no rule matches, a rule that matches none, and two columns of one name.
+    ``declared`` are the columns that the file itself describes: where no rule matches they are read as it says, and a rule
+    replaces only what it states. Raises `TacpipeError` for a column that neither describes, a rule that matches none, and
+    two columns of one name.
     """
     found: list[Chosen] = []
     used = set()
@@ -54,13 +66,15 @@ def chosen(stream: Stream, names: Sequence[str], path: Path) -> list[Chosen]:
         matches = ((rule, pattern.match(rule.match, name)) for rule in stream.columns)
         rule, values = next(((rule, values) for rule, values in matches if values is not None), (None, {}))
         if rule is None or values is None:
-            raise TacpipeError(
-                f"{path} has a column {plain(name)}, which no entry of [streams.{stream.name}] columns matches. "
-                f'Add {{ match = "{plain(name)}", quantity = "…" }} or {{ match = "{plain(name)}", skip = true }}.'
-            )
+            if name not in declared:
+                raise TacpipeError(
+                    f"{path} has a column {plain(name)}, which no entry of [streams.{stream.name}] columns matches. "
+                    f'Add {{ match = "{plain(name)}", quantity = "…" }} or {{ match = "{plain(name)}", skip = true }}.'
+                )
+            rule, values = Column(match=name), {}
         used.add(rule)
         if not rule.skip:
-            found.append(Chosen(name, _field(rule, name, values), rule))
+            found.append(Chosen(name, _field(rule, name, values, declared.get(name)), rule))
     idle = [rule.match for rule in stream.columns if rule not in used]
     if idle:
         raise TacpipeError(
@@ -78,22 +92,29 @@ def chosen(stream: Stream, names: Sequence[str], path: Path) -> list[Chosen]:
     return found
 
 
-def _field(rule: Column, name: str, values: dict[str, str]) -> pa.Field:
+def _field(rule: Column, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
     made = pattern.filled(rule.name, values) if rule.name else name.strip()
     about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values}
-    return pa.field(made, TYPES[rule.type], metadata={key: value for key, value in about.items() if value})
+    about = {key: value for key, value in about.items() if value}
+    if declared is None:
+        return pa.field(made, TYPES[rule.type or "float64"], metadata=about)
+    kind = TYPES[rule.type] if rule.type else (declared.type if rule.scale == 1.0 else pa.float64())
+    own = {key.decode(): value.decode() for key, value in (declared.metadata or {}).items()}
+    return pa.field(made, kind, metadata={**own, **about})
 
 
-def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool) -> pa.Array:
+def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool, inf_allowed: bool = False) -> pa.Array:
     """Return a parsed column as its declared type, scaled; a missing value is NaN in floats and empty in text.
 
     Raises `CellError` for a value that is missing where there is no NaN, infinite, or beyond the type; and for NaN unless
     ``nan_allowed``, since a cell that says so may stand for a sensor that failed.
     """
-    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     kind = one.field.type
-    if pa.types.is_string(kind):
-        return array.cast(kind).fill_null("")
+    if column.type == kind and pa.types.is_binary(kind):  # of chunks, since an array of bytes has 2 GiB at most
+        return column
+    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    if pa.types.is_string(kind) or pa.types.is_binary(kind):
+        return array.cast(kind).fill_null("" if pa.types.is_string(kind) else b"")
     if not pa.types.is_floating(kind):
         if array.null_count:
             row = int(array.is_null().to_numpy(zero_copy_only=False).argmax())
@@ -105,7 +126,7 @@ def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool) -> pa.Arr
             raise CellError(row, f"holds {array[row].as_py()}, which is not {kind}") from None
     values = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
     missing = array.is_null().to_numpy(zero_copy_only=False)
-    bad = np.isinf(values) | (np.isnan(values) & ~missing & (not nan_allowed))
+    bad = (np.isinf(values) & (not inf_allowed)) | (np.isnan(values) & ~missing & (not nan_allowed))
     if bad.any():
         row = int(bad.argmax())
         raise CellError(row, f"holds {values[row]}. Declare it in missing if it is to be read as a missing value")

@@ -18,9 +18,6 @@ from tacpipe.formats.table import layout as layouts
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, RecordingOutput, Source, Values, stage
 
-WITHIN = "recording"  # among a source's values: what its rows hold in the column that names recordings
-LABELS = "labels"
-
 
 @dataclass(frozen=True)
 class Params:
@@ -41,24 +38,18 @@ class Params:
 
 def discover(params: Params, source: Path) -> dict[str, Source]:
     """Return the files and labels of each recording below ``source``."""
-    from tacpipe.formats.table import labels, recordings
+    from tacpipe.formats.table import contained, recordings
 
     layout = params.parsed()
-    found = recordings.found(layout, source)
-    labelled = labels.found(layout, source, found)
-    return {
-        one.name: Source(
-            one.files, {LABELS: labelled[one.name], **({} if one.within is None else {WITHIN: one.within})}
-        )
-        for one in found
-    }
+    return contained.sources(layout, source, recordings.found(layout, source))
 
 
 def preview(params: Params, source: Path) -> str:
     """Return what would be read, in words."""
-    from tacpipe.formats.table import preview
+    from tacpipe.formats.table import preview, recordings
 
-    return preview.text(params.parsed(), source)
+    layout = params.parsed()
+    return preview.text(layout, source, recordings.found(layout, source))
 
 
 def guess(source: Path) -> str:
@@ -77,10 +68,6 @@ def table(params: Params, files: Files, values: Values) -> RecordingOutput:
 
     Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
     """
-    from tacpipe.formats.table import reading
+    from tacpipe.formats.table import contained
 
-    layout = params.parsed()
-    streams = {
-        one.name: reading.table(files[one.name], one, values.get(WITHIN)) for one in layout.streams if one.name in files
-    }
-    return RecordingOutput(streams, dict(values[LABELS]))
+    return contained.recording(params.parsed(), None, files, values)

@@ -13,16 +13,31 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tacpipe.errors import UsageError
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Time
 from tacpipe.formats.table import pattern
 from tacpipe.io import regular
 from tacpipe.plugins import fields
-from tacpipe.plugins.constraints import NonNegativeInt, Rate
+from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.printable import excerpt, plain
 
 MOST_BYTES = 1 << 20  # of a layout file
-Format = Literal["csv", "parquet", "npz", "jsonl"]
-Kind = Literal["int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float32", "float64", "bool", "text"]
-TimeUnit = Literal["s", "ms", "us", "ns", "iso8601"]
+Format = Literal["csv", "parquet", "npz", "jsonl", "mcap", "rosbag", "hdf5", "zarr", "xdf", "lerobot"]
+Kind = Literal[
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "float32",
+    "float64",
+    "bool",
+    "text",
+    "binary",
+]
 EXTENSIONS: Mapping[str, Format] = {
     ".csv": "csv",
     ".tsv": "csv",
@@ -33,19 +48,11 @@ EXTENSIONS: Mapping[str, Format] = {
     ".ndjson": "jsonl",
 }
 GZIP = ".gz"
+FILE = "file"  # the placeholder of a container's name, where containers are found by their format
 UNKNOWN = "?"  # what a guessed layout could not know
 
 
-@dataclass(frozen=True)
-class Time:
-    """Where the stamps of a stream come from: a column, or a rate."""
-
-    column: str = ""
-    unit: TimeUnit = "s"
-    rate_hz: Rate | None = None
-    origin: Literal["unix", "start"] = "unix"  # what a number counts from: 1970, or the start of the recording
-    zone: str = "UTC"  # of ISO 8601 stamps that name none, as Europe/Berlin
-    start: str = ""  # UTC, ISO 8601: the first stamp of recordings that count from their start
+DECLARED = Time()  # neither a column nor a rate: as a container declares it
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class Column:
     name: str = ""  # pattern; empty: as in the file
     quantity: str = ""
     unit: str = ""
-    type: Kind = "float64"
+    type: Kind | None = None  # None: as a container declares it, else float64
     scale: float = 1.0  # a value is what the file holds times this
     component: str = ""
     skip: bool = False
@@ -75,10 +82,11 @@ class Stream:
     """One stream of each recording."""
 
     name: str
-    files: str
-    time: Time
-    columns: tuple[Column, ...]
+    files: str = ""  # empty: each container found in the folder
+    time: Time = DECLARED  # without a column or a rate: as the container declares it
+    columns: tuple[Column, ...] = ()  # of a container: where what it declares is to be replaced
     format: Format | None = None  # None: by the extension
+    source: str = ""  # the topic, group or dataset inside a container
     separator: str = ""  # empty: a comma, or a tab in a .tsv
     decimal: Literal[".", ","] = "."
     comment: str = ""  # what lines begin with that hold no row
@@ -88,6 +96,11 @@ class Stream:
     recording: str = ""  # the column that names the recording, where a file holds many
     long: Long | None = None
     optional: bool = False  # whether recordings without this stream are read
+
+    @property
+    def contained(self) -> bool:
+        """Whether the stream is one of several in a container."""
+        return self.format in kinds.KINDS
 
     def format_of(self, path: Path) -> Format:
         """Return the format of a file: the layout's, or that of its extension. Raises `UsageError` where neither says."""
@@ -134,8 +147,15 @@ class Layout:
     attributes: Mapping[str, str | int | float | bool] = field(default_factory=dict)
 
     @property
+    def found_by_format(self) -> bool:
+        """Whether recordings are the containers in a folder, rather than files that match patterns."""
+        return all(not one.files for one in self.streams)
+
+    @property
     def placeholders(self) -> tuple[str, ...]:
         """The placeholders that every stream which must be there has, in the order of the first."""
+        if self.found_by_format:
+            return ()
         required = [one for one in self.streams if not one.optional] or list(self.streams)
         shared = set.intersection(*(set(pattern.placeholders(one.files)) for one in required))
         return tuple(name for name in pattern.placeholders(required[0].files) if name in shared)
@@ -162,8 +182,12 @@ def parse(text: str, where: str = "The layout") -> Layout:
     return of(tables, where)
 
 
-def of(tables: Mapping[str, Any], where: str = "The layout") -> Layout:
-    """Return the layout that these tables of TOML are."""
+def of(tables: Mapping[str, Any], where: str = "The layout", container: Format | None = None) -> Layout:
+    """Return the layout that these tables of TOML are.
+
+    Of a layout for a ``container`` format streams have that format where they name none, and need neither files, time
+    nor columns, as the container declares them; without a stream it is about all that a container holds.
+    """
     _refuse_unknown(tables, where)
     for key in tables:
         if key not in ("recordings", "streams", "labels", "attributes"):
@@ -171,7 +195,7 @@ def of(tables: Mapping[str, Any], where: str = "The layout") -> Layout:
                 f"{where}: there is no table [{plain(key)}]; there are recordings, streams, labels, attributes."
             )
     streams = _table(tables.get("streams", {}), where, "streams")
-    if not streams:
+    if not streams and container is None:
         raise UsageError(f"{where} has no stream. Add a table such as [streams.skin] with files, time and columns.")
     recordings = _table(tables.get("recordings", {}), where, "recordings")
     for key in recordings:
@@ -182,12 +206,16 @@ def of(tables: Mapping[str, Any], where: str = "The layout") -> Layout:
     if not isinstance(labels, list):
         raise UsageError(f"{where}: labels is a list of tables. Write [[labels]].")
     made = Layout(
-        tuple(_stream(stream, value, where) for stream, value in streams.items()),
+        tuple(_stream(stream, value, where, container) for stream, value in streams.items()),
         name,
         tuple(_labels(one, f"{where}, [[labels]] {number}") for number, one in enumerate(labels, 1)),
         _attributes(_table(tables.get("attributes", {}), where, "attributes"), where),
     )
-    pattern.filled(name, dict.fromkeys([*made.placeholders, "recording"], "x"))
+    named = [one.name for one in made.streams if one.files]
+    if named and len(named) < len(made.streams):
+        raise UsageError(f"{where}: [streams.{named[0]}] has files and others have none. Give files to all of them.")
+    known = [*made.placeholders, "recording", *((FILE,) if made.found_by_format else ())]
+    pattern.filled(name, dict.fromkeys(known, "x"))
     return made
 
 
@@ -203,19 +231,19 @@ def _refuse_unknown(value: Any, where: str) -> None:
             _refuse_unknown(one, f"{where}, {plain(key)}")
 
 
-def _stream(name: str, value: Any, where: str) -> Stream:
+def _stream(name: str, value: Any, where: str, container: Format | None) -> Stream:
     where = f"{where}, [streams.{plain(name)}]"
     values = dict(_table(value, where, ""))
     if not name.isidentifier():
         raise UsageError(f"{where}: a stream's name is letters, digits and underscores, as it becomes a file's name.")
-    if "time" not in values:
-        raise UsageError(
-            f'{where}: time must be given, as time = {{ column = "t", unit = "s" }} or {{ rate_hz = 100 }}.'
-        )
-    values["time"] = _time(_table(values["time"], where, "time"), f"{where}, time")
+    if container is not None:
+        values.setdefault("format", container)
+    _expect_given(values, where, container)
+    if "time" in values:
+        values["time"] = _time(_table(values["time"], where, "time"), f"{where}, time")
     columns = values.get("columns", [])
-    if not isinstance(columns, list) or not columns:
-        raise UsageError(f'{where}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
+    if not isinstance(columns, list):
+        raise UsageError(f"{where}: columns is {excerpt(columns)}; it must be a list of tables.")
     values["columns"] = tuple(_column(one, f"{where}, columns {number}") for number, one in enumerate(columns, 1))
     if "long" in values:
         values["long"] = fields.filled(Long, _table(values["long"], where, "long"), f"{where}, long", "entry")
@@ -228,6 +256,28 @@ def _stream(name: str, value: Any, where: str) -> Stream:
         raise UsageError(f"{where}: separator and decimal are both {made.decimal!r}; a number could not be read.")
     pattern.placeholders(made.files)
     return made
+
+
+def _expect_given(values: Mapping[str, Any], where: str, container: Format | None) -> None:
+    """Raise `UsageError` for an entry that is missing: a container declares what a table does not."""
+    if values.get("format") in kinds.KINDS:
+        if not values.get("source"):
+            raise UsageError(f"{where}: source must be given: the topic, group or stream inside the file.")
+        if values.get("recording"):
+            raise UsageError(f"{where}: recording is for tables; a container names the recordings in it itself.")
+        if "files" not in values and container is None:
+            raise UsageError(f'{where}: files must be given, as files = "{{trial}}.{values["format"]}".')
+        return
+    if values.get("source"):
+        raise UsageError(f"{where}: source is for containers ({', '.join(kinds.KINDS)}). Set format to one of them.")
+    if "files" not in values:
+        raise UsageError(f"{where}: entry files must be given.")
+    if "time" not in values:
+        raise UsageError(
+            f'{where}: time must be given, as time = {{ column = "t", unit = "s" }} or {{ rate_hz = 100 }}.'
+        )
+    if not values.get("columns"):
+        raise UsageError(f'{where}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
 
 
 def _time(values: Mapping[str, Any], where: str) -> Time:
@@ -244,7 +294,7 @@ def _time(values: Mapping[str, Any], where: str) -> Time:
 def _column(value: Any, where: str) -> Column:
     made: Column = fields.filled(Column, _table(value, where, ""), where, "entry")
     pattern.filled(made.name, dict.fromkeys(pattern.placeholders(made.match), "x"))
-    if made.type in ("bool", "text") and made.scale != 1.0:
+    if made.type in ("bool", "text", "binary") and made.scale != 1.0:
         raise UsageError(f"{where}: scale is {made.scale}; only numbers have one.")
     return made
 

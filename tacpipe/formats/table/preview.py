@@ -10,9 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tacpipe.formats.table import labels, reading, recordings
+from tacpipe.formats.table import labels, reading
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
+from tacpipe.formats.table.recordings import CONTAINER, Source
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed
 
@@ -48,7 +49,8 @@ def of(table: pa.Table) -> Read:
     for field in table.schema:
         if field.name == TIME or pa.types.is_string(field.type):
             continue
-        ends = pc.min_max(table.column(field.name)).as_py()
+        column = table.column(field.name)
+        ends = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
         about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
         columns[field.name] = (
             about.get("quantity", ""),
@@ -67,22 +69,28 @@ def of(table: pa.Table) -> Read:
     )
 
 
-def text(layout: Layout, folder: Path) -> str:
-    """Return what would be read as lines: all recordings and labels, and the first recording's streams in full."""
-    sources = recordings.found(layout, folder)
-    labelled = labels.found(layout, folder, sources)
+def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | None = None) -> str:
+    """Return what would be read as lines: all recordings and labels, and the first recording's streams in full.
+
+    ``kind`` is the format of containers whose streams are read as they declare them where the layout has none.
+    """
+    labelled = labels.found(layout, folder if folder.is_dir() else folder.parent, sources)
     count = f"{len(sources)} recording{'s' * (len(sources) != 1)}"
     lines = [f"{count}: {listed([one.name for one in sources], 6)}"]
     lines += _labels(labelled)
     first = sources[0]
     lines.append(f"\n{first.name}, the first:")
-    for stream in layout.streams:
-        if stream.name not in first.files:
-            lines.append(f"  {stream.name}: not there")
+    if layout.streams:
+        found = reading.recorded(layout.streams, first.files, first.within)
+    else:
+        found = reading.all_of(str(kind), first.files[CONTAINER], first.within)
+    for name in [one.name for one in layout.streams] or found.streams:
+        if name not in found.streams:
+            lines.append(f"  {name}: not there")
             continue
-        table = reading.table(first.files[stream.name], stream, first.within)
-        lines += _stream(stream.name, table, first.files[stream.name])
-    return "\n".join(lines)
+        lines += _stream(name, found.streams[name], first.files[name if layout.streams else CONTAINER])
+    lines += [f"  attribute {name}: {value}" for name, value in found.attributes.items()]
+    return "\n".join([*lines, *(f"  {one}" for one in found.notes)])
 
 
 def _labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:
@@ -108,11 +116,16 @@ def _stream(name: str, table: pa.Table, path: Path) -> list[str]:
         least = min(found.columns[column][3] for column in columns)
         most = max(found.columns[column][4] for column in columns)
         about = f"{quantity or 'no quantity'}, {unit or 'no unit'}, {kind}"
-        lines.append(f"    {len(columns)} x {about}, from {least:.6g} to {most:.6g}: {listed(columns, COLUMNS)}")
+        measure = " bytes" if kind == "binary" else ""
+        lines.append(
+            f"    {len(columns)} x {about}, from {least:.6g} to {most:.6g}{measure}: {listed(columns, COLUMNS)}"
+        )
     shown = table.column_names[: COLUMNS + 1]
     rows = table.slice(0, ROWS).select(shown).to_pylist()
     return lines + ["    " + "  ".join(map(_cell, row.values())) for row in rows]
 
 
 def _cell(value: object) -> str:
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
     return f"{value:.7g}" if isinstance(value, float) else str(value)

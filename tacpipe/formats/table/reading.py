@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,13 +15,18 @@ import pyarrow.compute as pc
 from tacpipe.arrays import Indices, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Contents, SourceStream
 from tacpipe.formats.table import binary, columns, stamps
-from tacpipe.formats.table.columns import TIME, CellError, Chosen
+from tacpipe.formats.table.columns import TIME, CellError, Chosen, Declared
 from tacpipe.formats.table.layout import Stream
 from tacpipe.formats.table.text import TextTable
+from tacpipe.io import parquet
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals.resampling import uniform_grid
 
+SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
 Place = Callable[[int], str]  # of a row in a block: how errors name it
 
 
@@ -41,6 +47,27 @@ class Rows(Protocol):
         """How a row is named in errors."""
 
 
+@dataclass(frozen=True)
+class ContainedRows:
+    """The rows of a stream that was read from a container."""
+
+    path: Path
+    source: str
+    table: pa.Table
+
+    def names(self) -> list[str]:
+        """Return the names of the columns."""
+        return list(self.table.column_names)
+
+    def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
+        """Yield all rows of the columns that ``types`` names."""
+        yield self.table.select(list(types))
+
+    def place(self, index: int) -> str:
+        """Return how the row ``index`` (from 0) is named in errors."""
+        return f"{plain(self.source)}, row {index + 1}"
+
+
 def opened(path: Path, stream: Stream) -> Rows:
     """Return the reader of a file of this stream."""
     kind = stream.format_of(path)
@@ -55,8 +82,100 @@ def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
     Raises `TacpipeError`, naming file, row and column, for what is not as the layout says, for stamps that run backwards,
     and for a file without rows.
     """
-    file = opened(path, stream)
-    names = file.names()
+    return _table(opened(path, stream), stream, recording, columns.NOTHING)
+
+
+def contained(path: Path, found: SourceStream, stream: Stream) -> pa.Table:
+    """Return a stream that was read from the container at ``path`` as a table with ``t_ns``; raises as `table` does.
+
+    Where the layout's ``stream`` states neither time nor columns, they are as the container declares them. What the
+    container states of the column with the stamps is stated of ``t_ns``.
+    """
+    stream = stream if stream.time.given else replace(stream, time=found.time)
+    if not stream.time.given:
+        raise TacpipeError(
+            f"{path} does not say when the rows of {plain(found.source)} were measured. Give time in "
+            f"[streams.{stream.name}]: a column, or rate_hz."
+        )
+    declared = {one.name: one for one in found.table.schema}
+    for one in found.table.schema:
+        if one.type not in columns.TYPES.values():
+            raise TacpipeError(f"{path}: column {plain(one.name)} of {plain(found.source)} holds {one.type}.")
+    made = _table(ContainedRows(path, found.source, found.table), stream, None, declared)
+    stamped = declared.get(stream.time.column)
+    about = {key.decode(): value.decode() for key, value in (stamped.metadata or {}).items()} if stamped else {}
+    return parquet.with_metadata(made, {TIME: {k: v for k, v in about.items() if k not in ("unit", "quantity")}})
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was read of one recording."""
+
+    streams: Mapping[str, pa.Table]
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # that containers state
+    notes: Sequence[str] = ()  # what was left out or is missing
+
+
+def recorded(streams: Sequence[Stream], paths: Mapping[str, Path], within: str | None) -> Recorded:
+    """Return the recording whose files are ``paths`` by stream; ``within`` is its name where a file holds many.
+
+    Streams of one container are read in one pass. Raises as `table` does, and for a stream that its container lacks,
+    unless it is optional.
+    """
+    tables: dict[str, pa.Table] = {}
+    attributes: dict[str, Attribute] = {}
+    notes: list[str] = []
+    together: dict[tuple[str, Path], list[Stream]] = {}
+    for stream in streams:
+        if stream.name not in paths:
+            continue
+        if stream.contained:
+            together.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
+        else:
+            tables[stream.name] = table(paths[stream.name], stream, within)
+    for (kind, path), several in together.items():
+        contents = kinds.opened(kind, path).read([one.source for one in several], within)
+        there = {one.source: one for one in contents.streams}
+        for stream in several:
+            if stream.source in there:
+                tables[stream.name] = contained(path, there[stream.source], stream)
+            elif not stream.optional:
+                raise _lacking(path, stream, contents, kinds.opened(kind, path).look(within))
+        attributes |= contents.attributes
+        notes += contents.notes
+    return Recorded({one.name: tables[one.name] for one in streams if one.name in tables}, attributes, notes)
+
+
+def all_of(kind: str, path: Path, within: str | None) -> Recorded:
+    """Return all that can be read of a container, or of its episode ``within``; what cannot is named in the notes.
+
+    It is an attribute of the recording too: ``skipped``. Raises `TacpipeError` where nothing can be read.
+    """
+    contents = kinds.opened(kind, path).read(None, within)
+    notes = [*contents.notes, *(f"{path}: {plain(one)} is left out: {why}." for one, why in contents.skipped.items())]
+    tables = {}
+    for found in contents.streams:
+        if found.table.num_rows:
+            tables[found.name] = contained(path, found, Stream(found.name, source=found.source))
+    if not tables:
+        raise TacpipeError(" ".join([f"{path} holds no stream that can be read.", *notes]))
+    skipped = "; ".join(f"{plain(one)}: {why}" for one, why in contents.skipped.items())
+    return Recorded(tables, {**contents.attributes, **({SKIPPED: skipped} if skipped else {})}, notes)
+
+
+def _lacking(path: Path, stream: Stream, contents: Contents, look: Contents) -> TacpipeError:
+    """Return the error for a stream of a layout that its container does not have."""
+    why = contents.skipped.get(stream.source) or look.skipped.get(stream.source)
+    if why:
+        return TacpipeError(f"{path}: {plain(stream.source)} of [streams.{stream.name}] cannot be read: {why}.")
+    return TacpipeError(
+        f"{path} has no {plain(stream.source)}, which [streams.{stream.name}] names; it has "
+        f"{listed([one.source for one in look.streams], 6)}. Correct source, or set optional = true."
+    )
+
+
+def _table(file: Rows, stream: Stream, recording: str | None, declared: Declared) -> pa.Table:
+    path, names = file.path, file.names()
     apart = [name for name in (stream.time.column, stream.recording) if name]
     if stream.long is not None:
         apart += [stream.long.channel, stream.long.value]
@@ -67,9 +186,12 @@ def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
         )
     if stream.long is not None:
         return _long(file, stream, recording)
-    wanted = columns.chosen(stream, [name for name in names if name not in apart], path)
+    wanted = columns.chosen(stream, [name for name in names if name not in apart], path, declared)
     types = {**_types(file, stream), **{one.name: one.read_as for one in wanted}}
-    blocks = [_converted(stream, block, wanted, place) for block, place in _blocks(file, stream, types, recording)]
+    as_is = bool(declared)  # a container's own NaN and infinity are values
+    blocks = [
+        _converted(stream, block, wanted, place, as_is) for block, place in _blocks(file, stream, types, recording)
+    ]
     return _finished(pa.concat_tables(blocks) if blocks else None, file, stream, recording)
 
 
@@ -101,7 +223,7 @@ def _blocks(
         yield (block.take(pa.array(rows)) if stream.recording else block), place
 
 
-def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place) -> pa.Table:
+def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place, as_is: bool) -> pa.Table:
     """Return a block with stamps and declared types."""
     made = {}
     if stream.time.column:
@@ -109,7 +231,7 @@ def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Pla
     for one in wanted:
         try:
             made[one.field.name] = columns.converted(
-                block.column(one.name), one, "nan" in map(str.lower, stream.missing)
+                block.column(one.name), one, as_is or "nan" in map(str.lower, stream.missing), as_is
             )
         except CellError as error:
             raise TacpipeError(f"{place(error.row)}, column {plain(one.name)} {error}.") from error
@@ -153,8 +275,8 @@ def _finished(made: pa.Table | None, file: Rows, stream: Stream, recording: str 
             f"cut the file where its clock was set."
         )
     if stream.time.origin == "start":
-        field = schema.time_field("from the start of the recording")
-        return made.set_column(0, field, pa.array(t_ns + start_ns))
+        counted = schema.time_field("from the start of the recording")
+        return made.set_column(0, counted, pa.array(t_ns + start_ns))
     return made
 
 

@@ -9,10 +9,13 @@ from pathlib import Path
 
 from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.formats.containers import kinds
 from tacpipe.formats.table import pattern, reading
-from tacpipe.formats.table.layout import Layout, Stream
+from tacpipe.formats.table.layout import FILE, Format, Layout, Stream
 from tacpipe.io import files as file_system
 from tacpipe.printable import listed, plain
+
+CONTAINER = "container"  # among a source's files: the one that holds all streams
 
 
 @dataclass(frozen=True)
@@ -31,9 +34,11 @@ def found(layout: Layout, folder: Path) -> list[Source]:
     Raises `UsageError` where none is found, where one lacks a stream that is not optional, where two files of one stream
     belong to one recording, and where two recordings get one name.
     """
+    if layout.found_by_format:
+        raise UsageError("The layout has no stream with files.")
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a folder. Give the folder that the patterns of the layout start from.")
-    every = [Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names]
+    every = _every(layout, folder)
     matched = {stream.name: _matched(stream, every) for stream in layout.streams}
     _refuse_idle(layout, matched, every, folder)
     shared = layout.placeholders
@@ -66,6 +71,43 @@ def found(layout: Layout, folder: Path) -> list[Source]:
     return sorted(sources, key=lambda one: one.name)
 
 
+def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
+    """Return the recordings in the containers of a format at or below ``source``, sorted by name.
+
+    They are named after their file, and after the episode where it holds several. Raises `UsageError` where there is no
+    container, and where two recordings get one name.
+    """
+    paths = kinds.found(kind, source)
+    if not paths:
+        raise UsageError(f"{source} holds no {kind}: there are no {kinds.described(kind)}.")
+    sources = []
+    for path, stem in kinds.names(paths, source).items():
+        stem = os.fsencode(stem).decode(errors="replace")
+        files = {one.name: path for one in layout.streams} or {CONTAINER: path}
+        for episode in kinds.opened(kind, path).episodes() or (None,):
+            values = {FILE: stem, **({} if episode is None else {"recording": episode})}
+            plain_name = stem if episode is None else f"{stem}-{episode}"
+            name = recording_names.valid(pattern.filled(layout.name, values) if layout.name else plain_name)
+            if not name:
+                raise UsageError(f"{path} gives no name for a recording. Set name in [recordings], or rename the file.")
+            sources.append(Source(name, files, {}, episode))
+    recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
+    return sorted(sources, key=lambda one: one.name)
+
+
+def _every(layout: Layout, folder: Path) -> list[Path]:
+    """Return what patterns are matched with: all files below a folder, and folders that are containers of the layout."""
+    containers = {str(one.format) for one in layout.streams if one.contained}
+    found: list[Path] = []
+    for place, folders, names in file_system.walk(folder):
+        if any(kinds.is_one(kind, Path(place)) for kind in containers):
+            found.append(Path(place))
+            folders.clear()
+            continue
+        found += [Path(place, name) for name in names]
+    return [path.relative_to(folder) for path in found]
+
+
 def _matched(stream: Stream, every: list[Path]) -> list[tuple[Path, Mapping[str, str]]]:
     found: list[tuple[Path, Mapping[str, str]]] = []
     for path in every:
@@ -86,26 +128,31 @@ def _refuse_idle(layout: Layout, matched: Mapping[str, object], every: list[Path
 
 def _named(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[Source]:
     """Return the recording of these files, or those that they hold."""
-    several = [one for one in layout.streams if one.recording and one.name in files]
-    if not several:
+    several = [one for one in layout.streams if (one.recording or one.contained) and one.name in files]
+    within = {one.name: found for one in several if (found := _within(files[one.name], one)) is not None}
+    if not within:
         return [Source(_name(layout, values, files), files, values)]
-    within: dict[str, set[str]] = {one.name: _within(files[one.name], one) for one in several}
     first = next(iter(within.values()))
     for stream, names in within.items():
         if names != first:
             odd = sorted(names ^ first)
             raise UsageError(
-                f"{files[stream]} and {files[several[0].name]} hold different recordings: {listed(odd, 3)} is in one "
+                f"{files[stream]} and {files[next(iter(within))]} hold different recordings: {listed(odd, 3)} is in one "
                 f"of them alone."
             )
     return [Source(_name(layout, {**values, "recording": one}, files), files, values, one) for one in sorted(first)]
 
 
-def _within(path: Path, stream: Stream) -> set[str]:
-    """Return what the column ``recording`` of a file holds."""
+def _within(path: Path, stream: Stream) -> set[str] | None:
+    """Return the recordings that a file holds: what is in its column ``recording``, or a container's episodes.
+
+    None of a container that is one recording.
+    """
     import pyarrow as pa
     import pyarrow.compute as pc
 
+    if stream.contained:
+        return set(kinds.opened(str(stream.format), path).episodes()) or None
     file = reading.opened(path, stream)
     if stream.recording not in file.names():
         raise TacpipeError(

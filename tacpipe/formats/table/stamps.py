@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tacpipe.arrays import Bools, Int64s, Times
-from tacpipe.formats.table.layout import TimeUnit
+from tacpipe.formats.containers.container import TimeUnit
 
 IN_RANGE = "a time before the year 2262"  # where 64 bits of nanoseconds end
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds

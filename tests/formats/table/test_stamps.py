@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tacpipe.formats.containers.container import TimeUnit
 from tacpipe.formats.table import stamps
-from tacpipe.formats.table.layout import TimeUnit
 
 YEAR_2262_NS = 2**63 - 1
 

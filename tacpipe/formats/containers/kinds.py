@@ -1,0 +1,112 @@
+"""Which containers there are: how their files are recognised, and what opens them."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from tacpipe.formats.containers.container import Container
+from tacpipe.io import files as file_system
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A format of containers: files with an ending, folders with a mark, or both."""
+
+    opener: str  # module:function, imported when a file is opened, as it may need an extra
+    endings: tuple[str, ...] = ()  # of files, in lower case
+    marks: tuple[str, ...] = ()  # a folder that holds one of these files is one container
+
+
+KINDS: Mapping[str, Kind] = {
+    "mcap": Kind("tacpipe.formats.bags.container:opened_mcap", (".mcap",)),
+    "rosbag": Kind("tacpipe.formats.bags.container:opened", (".bag", ".db3", ".mcap"), ("metadata.yaml",)),
+    "hdf5": Kind("tacpipe.formats.hdf5:opened", (".hdf5", ".h5")),
+    "zarr": Kind("tacpipe.formats.zarr:opened", (".zarr.zip",), (".zgroup", ".zarray", "zarr.json")),
+    "xdf": Kind("tacpipe.formats.xdf:opened", (".xdf", ".xdfz", ".xdf.gz")),
+    "lerobot": Kind("tacpipe.formats.lerobot:opened", (), ("meta/info.json",)),
+}
+
+
+def opened(kind: str, path: Path) -> Container:
+    """Return the container at ``path``."""
+    module, _, function = KINDS[kind].opener.partition(":")
+    return cast(Container, getattr(importlib.import_module(module), function)(path))
+
+
+def is_one(kind: str, path: Path) -> bool:
+    """Return whether a path looks like a container of this kind."""
+    if path.is_dir():
+        return any((path / mark).is_file() for mark in KINDS[kind].marks)
+    return path.name.lower().endswith(KINDS[kind].endings)
+
+
+def found(kind: str, source: Path) -> list[Path]:
+    """Return the containers of this kind at or below ``source``, sorted; what lies within one is part of it."""
+    paths: list[Path] = [] if source.is_dir() else [source]
+    for place, folders, names in file_system.walk(source) if source.is_dir() else ():
+        if is_one(kind, Path(place)):
+            paths.append(Path(place))
+            folders.clear()
+            continue
+        paths += [Path(place, name) for name in names if name.lower().endswith(KINDS[kind].endings)]
+    return sorted(paths)
+
+
+def described(kind: str) -> str:
+    """Return how containers of this kind are recognised, for errors."""
+    one = KINDS[kind]
+    parts = [f"files named *{ending}" for ending in one.endings] + [f"folders with {mark}" for mark in one.marks]
+    return " or ".join(parts)
+
+
+def members(path: Path) -> dict[str, Path]:
+    """Return the files of a container: "" and its path, or of a folder each file by its path within."""
+    if not path.is_dir():
+        return {"": path}
+    return {
+        Path(place, name).relative_to(path).as_posix(): Path(place, name)
+        for place, _, names in file_system.walk(path)
+        for name in sorted(names)
+    }
+
+
+def names(paths: Sequence[Path], source: Path) -> dict[Path, str]:
+    """Return a name for each container: that of its file without the ending, with folders above where two share one."""
+    stems = {path: _stem(path) for path in paths}
+    shared = [stem.casefold() for stem in stems.values()]
+    return {
+        path: stem if shared.count(stem.casefold()) == 1 else "-".join([*path.relative_to(source).parts[:-1], stem])
+        for path, stem in stems.items()
+    }
+
+
+def _stem(path: Path) -> str:
+    ending = max(
+        (one for kind in KINDS.values() for one in kind.endings if path.name.lower().endswith(one)), key=len, default=""
+    )
+    return path.resolve().name.removesuffix(ending) if path.is_dir() else path.name[: len(path.name) - len(ending)]
+
+
+def identifiers(sources: Sequence[str]) -> dict[str, str]:
+    """Return a stream's name for each source: an identifier, no two alike but for case.
+
+    >>> identifiers(["/left/skin", "/joint_states", "left.skin", "3d"])
+    {'/left/skin': 'left_skin', '/joint_states': 'joint_states', 'left.skin': 'left_skin_2', '3d': 'stream_3d'}
+    """
+    made: dict[str, str] = {}
+    taken: set[str] = set()
+    for source in sources:
+        letters = "".join(one if one.isascii() and (one.isalnum() or one == "_") else " " for one in source)
+        name = "_".join(letters.split()).strip("_") or "stream"
+        name = f"stream_{name}" if name[0].isdigit() else name
+        number = 2
+        candidate = name
+        while candidate.casefold() in taken:
+            candidate, number = f"{name}_{number}", number + 1
+        taken.add(candidate.casefold())
+        made[source] = candidate
+    return made

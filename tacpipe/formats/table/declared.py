@@ -1,0 +1,96 @@
+"""The layout of a container as the file itself declares it, written out so that it can be changed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+
+from tacpipe.errors import UsageError
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Contents, SourceStream, Time
+from tacpipe.formats.table import pattern
+from tacpipe.formats.table.columns import TYPES
+from tacpipe.printable import plain
+
+_KINDS = {kind: name for name, kind in TYPES.items()}
+
+
+def layout(kind: str, source: Path) -> str:
+    """Return the text of the layout that says what the first container at or below ``source`` declares.
+
+    Given back with ``--layout`` it reads the same. Raises `UsageError` where there is no container.
+    """
+    paths = kinds.found(kind, source)
+    if not paths:
+        raise UsageError(f"{source} holds no {kind}: there are no {kinds.described(kind)}.")
+    file = kinds.opened(kind, paths[0])
+    return of(file.look(next(iter(file.episodes()), None)), f"tacpipe ingest {kind}", paths[0])
+
+
+def of(contents: Contents, command: str, path: Path) -> str:
+    """Return the text of the layout that says what a container declares; ``command`` is the one that reads it."""
+    parts = [
+        f"# What {plain(path.name)} itself declares. Change what is wrong, remove streams that are not wanted, then look:\n"
+        f"#   {command} FOLDER --layout THIS --dry-run"
+    ]
+    parts += [f"# {plain(source)} is left out: {why}" for source, why in contents.skipped.items()]
+    parts += [_stream(one) for one in contents.streams]
+    return "\n\n".join(parts) + "\n"
+
+
+def _stream(one: SourceStream) -> str:
+    rows = "" if one.rows is None else f"  # {one.rows} rows"
+    lines = [f"[streams.{one.name}]", f"source = {_quoted(one.source)}{rows}"]
+    lines.append(f"time = {_time(one.time)}" if one.time.given else 'time = { rate_hz = "?" }  # the file does not say')
+    fields = [field for field in one.table.schema if field.name != one.time.column]
+    rules = [f"    {rule}" for rule in _rules(fields)]
+    return "\n".join([*lines, *(["columns = [", *rules, "]"] if rules else [])])
+
+
+def _time(time: Time) -> str:
+    entries = [("column", time.column), ("unit", time.unit if time.column else "s"), ("origin", time.origin)]
+    entries += [("zone", time.zone), ("start", time.start)]
+    default = Time(unit="s" if not time.column else "iso8601" if time.unit == "s" else "s")  # a unit is always written
+    written = [f"{key} = {_quoted(value)}" for key, value in entries if value != getattr(default, key)]
+    written += [] if time.rate_hz is None else [f"rate_hz = {time.rate_hz:g}"]
+    return "{ " + ", ".join(written) + " }"
+
+
+def _rules(fields: Sequence[pa.Field]) -> list[str]:
+    """Return an entry for each set of columns whose names differ in numbers alone and that are declared alike."""
+    fields = [field for field in fields if not set("{}*") & set(field.name)]  # these are left as they are declared
+    alike: dict[tuple[str, str, str, str], list[str]] = {}
+    for field in fields:
+        about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        declared = (about.get("quantity", ""), about.get("unit", ""), _KINDS.get(field.type, ""))
+        alike.setdefault((re.sub(r"\d+", "*", field.name), *declared), []).append(field.name)
+    patterns = {
+        found: names for found, names in alike.items() if len(names) > 1 and _matches_only(found[0], fields, names)
+    }
+    exact = [((name, *found[1:]), [name]) for found, names in alike.items() if found not in patterns for name in names]
+    return [_rule(*found) for found, _ in [*exact, *patterns.items()]]
+
+
+def _matches_only(text: str, fields: Sequence[pa.Field], names: Sequence[str]) -> bool:
+    return [field.name for field in fields if pattern.match(text, field.name) is not None] == list(names)
+
+
+def _rule(match: str, quantity: str, unit: str, kind: str) -> str:
+    unknown = kind not in ("text", "binary") and [
+        name for name, value in (("quantity", quantity), ("unit", unit)) if not value
+    ]
+    entries = [("match", match), ("quantity", quantity), ("unit", unit), ("type", kind)]
+    comment = f"  # the file does not say: {', '.join(unknown)}" if unknown else ""
+    return (
+        "{ "
+        + ", ".join(f"{key} = {_quoted(value)}" for key, value in entries if value or key in (unknown or ()))
+        + f" }},{comment}"
+    )
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=not text.isprintable())

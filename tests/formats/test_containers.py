@@ -1,0 +1,155 @@
+"""What all formats of containers share, with a container of the tests' own."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.kinds import Kind
+from tacpipe.formats.table import contained, layout, recordings
+from tacpipe.formats.table.contained import Command, Params
+from tacpipe.plugins.stage import RecordingOutput
+from tests.formats import fake_container
+
+COMMAND = Command("xdf")
+NONE = Params()
+
+
+@pytest.fixture(autouse=True)
+def _fake(monkeypatch: pytest.MonkeyPatch) -> None:
+    kind = Kind("tests.formats.fake_container:opened", endings=(".fake", ".fake.json"), marks=("meta/mark",))
+    monkeypatch.setattr(kinds, "KINDS", {"xdf": kind})
+
+
+def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
+    return {name: COMMAND.read(params, one.files, one.values) for name, one in COMMAND.discover(params, folder).items()}
+
+
+def given(text: str) -> Params:
+    return Params(json.dumps(tomllib.loads(text)))
+
+
+def test_without_a_layout_streams_are_as_their_file_declares_them(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "day" / "run 1.fake")
+    found = read(tmp_path)["run-1"]
+    table = found.streams["skin"]
+    assert table.column("t_ns").to_pylist() == [10**9, 2 * 10**9]
+    assert table.schema.field("t_ns").metadata == {b"unit": b"ns", b"quantity": b"time", b"clock": b"header stamp"}
+    assert table.schema.field("t2").type == pa.float32()
+    assert table.schema.field("t2").metadata == {b"quantity": b"tactile", b"taxel": b"7"}
+    assert str(table.column("t1").to_pylist()) == "[0.5, nan]"
+    assert found.attributes == {"robot": "panda"}
+
+
+def test_a_rule_replaces_what_it_states_and_nothing_else(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "a.fake")
+    params = given('[streams.pad]\nsource = "/skin"\ncolumns = [{ match = "t{taxel}", unit = "N" }]')
+    (found,) = read(tmp_path, params).values()
+    field = found.streams["pad"].schema.field("t2")
+    assert field.type == pa.float32()
+    assert field.metadata == {b"quantity": b"tactile", b"taxel": b"2", b"unit": b"N"}
+
+
+def test_a_layout_of_a_table_reads_a_container_beside_a_csv(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "t1" / "skin.fake")
+    (tmp_path / "t1" / "arm.csv").write_text("time,x\n1,5\n")
+    text = """
+    [streams.skin]
+    files = "{trial}/skin.fake"
+    format = "xdf"
+    source = "/skin"
+    [streams.arm]
+    files = "{trial}/arm.csv"
+    time = { column = "time" }
+    columns = [{ match = "x" }]
+    """
+    made = layout.parse(text)
+    found = contained.sources(made, tmp_path, recordings.found(made, tmp_path))
+    output = contained.recording(made, None, found["t1"].files, found["t1"].values)
+    assert {name: table.num_rows for name, table in output.streams.items()} == {"skin": 2, "arm": 1}
+    assert output.attributes == {"robot": "panda", "trial": "t1"}
+
+
+def test_episodes_inside_a_file_are_recordings(tmp_path: Path) -> None:
+    stamps = {"stamp": [1, 2], "t1": [1, 2]}
+    episodes = {"demo_0": {"/skin": stamps}, "demo_1": {"/skin": {"stamp": [7], "t1": [7]}}}
+    fake_container.write(tmp_path / "all.fake", episodes=episodes)
+    assert {name: one.streams["skin"].num_rows for name, one in read(tmp_path).items()} == {
+        "all-demo_0": 2,
+        "all-demo_1": 1,
+    }
+    named = given('[recordings]\nname = "{recording}-of-{file}"')
+    assert sorted(read(tmp_path, named)) == ["demo_0-of-all", "demo_1-of-all"]
+
+
+def test_what_cannot_be_read_is_named_in_notes_and_in_the_attributes(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "a.fake", skipped={"/odd": "its encoding is foo"}, notes=["cut off"])
+    (found,) = read(tmp_path).values()
+    assert found.attributes["skipped"] == "/odd: its encoding is foo"
+    assert found.notes[0] == "cut off" and "/odd" in found.notes[1] and "foo" in found.notes[1]
+
+
+def test_a_stream_that_is_not_there_is_an_error_with_the_reason_unless_it_is_optional(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "a.fake", skipped={"/odd": "its encoding is foo"})
+    for source, named in (("/odd", "encoding is foo"), ("/no", "it has /skin")):
+        text = f'[streams.s]\nsource = "{source}"\n[streams.skin]\nsource = "/skin"\n'
+        with pytest.raises(TacpipeError, match=named):
+            read(tmp_path, given(text))
+    optional = given('[streams.s]\nsource = "/no"\noptional = true\n[streams.skin]\nsource = "/skin"')
+    assert list(read(tmp_path, optional)["a"].streams) == ["skin"]
+
+
+def test_a_guess_given_back_reads_the_same(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "a.fake")
+    guessed = COMMAND.guess(tmp_path)
+    (plain,) = read(tmp_path).values()
+    (again,) = read(tmp_path, given(guessed)).values()
+    assert again.streams["skin"].schema.equals(plain.streams["skin"].schema, check_metadata=True)
+    assert again.streams["skin"].drop("t1").equals(plain.streams["skin"].drop("t1"))
+
+
+def test_a_dry_run_describes_streams_and_what_is_left_out(tmp_path: Path) -> None:
+    fake_container.write(tmp_path / "a.fake", skipped={"/odd": "its encoding is foo"})
+    text = COMMAND.preview(NONE, tmp_path)
+    assert "skin: 2 rows" in text and "/odd" in text and "panda" in text
+
+
+def test_files_of_one_name_are_named_with_their_folders(tmp_path: Path) -> None:
+    for place in ("monday/run.fake", "tuesday/run.fake", "tuesday/other.fake.json"):
+        fake_container.write(tmp_path / place)
+    assert sorted(COMMAND.discover(NONE, tmp_path)) == ["monday-run", "other", "tuesday-run"]
+
+
+def test_a_folder_with_a_mark_is_one_container_whose_files_all_count(tmp_path: Path) -> None:
+    for name in ("meta/mark", "data/a.fake", "data/b.fake"):
+        (tmp_path / "set" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "set" / name).write_text("{}")
+    assert kinds.found("xdf", tmp_path) == kinds.found("xdf", tmp_path / "set") == [tmp_path / "set"]
+    files = contained.members({"container": tmp_path / "set"})
+    assert sorted(files) == ["container/data/a.fake", "container/data/b.fake", "container/meta/mark"]
+    assert contained.containers(files) == {"container": tmp_path / "set"}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('[streams.s]\nsource = ""', "source"),
+        ('[streams.s]\nsource = "/a"\nrecording = "x"', "recording"),
+        ('[streams.s]\nsource = "/a"\nfiles = "a.fake"\n[streams.r]\nsource = "/b"', "files"),
+        ('[streams.s]\nsource = "/a"\nformat = "csv"', "source"),
+    ],
+)
+def test_a_wrong_layout_of_a_container_is_one_sentence(text: str, named: str) -> None:
+    with pytest.raises(UsageError, match=named):
+        COMMAND.parsed(given(text))
+
+
+def test_a_folder_without_containers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"\.fake"):
+        COMMAND.discover(NONE, tmp_path)
