@@ -203,8 +203,7 @@ def _numbers(words: Sequence[Sequence[str]], decimal: str, missing: Sequence[str
     except (ValueError, OverflowError):
         return None, np.zeros(0, dtype=bool)
     written = [[bool(re.fullmatch(r"[+-]?\d+", word)) for word in row] for row in plain]
-    whole: Bools = np.array(written).all(axis=0)
-    return numbers, whole
+    return numbers, np.asarray(np.array(written).all(axis=0))
 
 
 def _names(
