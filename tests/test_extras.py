@@ -23,7 +23,7 @@ from tacpipe.plugins import extras, registry
 from tests import without_extras
 from tests.clouds import shapes
 from tests.conftest import Lab, forget, tacpipe
-from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.promises.warm import Warm, serving
 from tests.recording.live import stream
 
@@ -43,6 +43,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "ingest vision2tactile grasps -o {o}",
     "ingest table tables --layout tables/layout.toml -o {o}",
     "ingest table tables --guess",
+    "ingest xdf sessions -o {o}",
     "version",
     "synchronize data/recordings -o {o} --rate-hz 20",
     "segment contacts data/synced -o {o} --pad-s 0.4",
@@ -84,6 +85,8 @@ LACK = {  # and for each that does need one, with that extra
     "acquire ws.toml -o {o}": "devices",
     "acquire can.toml -o {o}": "devices",
     "acquire camera.toml -o {o}": "clouds",
+    "acquire lsl.toml -o {o}": "lsl",
+    "sensors probe lsl:wrist": "lsl",
     "sensors probe": "devices",
     "sensors probe /dev/null": "devices",
     "sensors probe hid:16c0:0486": "devices",
@@ -98,6 +101,7 @@ RIGS = {
     "ws": ("xela", "ws:127.0.0.1:1"),
     "can": ("icub-skin", "can:virtual:none"),
     "camera": ("clouds", "camera:0"),
+    "lsl": ("lsl", "lsl:wrist"),
 }
 INPUTS = (
     "simulate material --trials 2 -o data/touched",
@@ -127,6 +131,11 @@ def prepare(folder: Path) -> None:
     (folder / "tables" / "a.csv").write_text("time,x\n0,1\n1,2\n")
     layout = '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "time" }\ncolumns = [{ match = "x" }]\n'
     (folder / "tables" / "layout.toml").write_text(layout)
+    (folder / "sessions").mkdir()
+    session = xdf_writer.Writer()
+    session.stream(1, "force")
+    session.numbers(1, "float32", [1.0, 1.01], [[0.5], [0.75]])
+    session.write(folder / "sessions" / "a.xdf")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
 

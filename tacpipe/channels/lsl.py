@@ -10,6 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
+from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt, plain
 
@@ -38,6 +41,7 @@ QUANTITIES = {  # of the type of a channel, or of a stream whose channels have n
     "eeg": "voltage", "emg": "voltage", "voltage": "voltage", "markers": "text", "current": "current",
 }  # fmt: skip
 COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
+LATEST_S = 9e9  # that nanoseconds in 64 bits hold
 MOST_CHANNELS = 1 << 16
 MOST_BYTES = 1 << 24  # of a description
 
@@ -138,6 +142,17 @@ def _quantity(own: str, kind: str, label: str) -> tuple[str, str]:
     parted = COMPONENT.fullmatch(label.strip())
     vector = quantity in ("force", "torque", "position", "orientation", "velocity", "acceleration", "angular_velocity")
     return quantity, parted[2].lower() if parted and vector else ""
+
+
+def nanoseconds(seconds: Floats) -> Int64s:
+    """Return LSL's seconds as whole nanoseconds, their whole part apart: a product of all digits would be rounded.
+
+    >>> nanoseconds(np.array([1.5, 41037.236252649])).tolist()
+    [1500000000, 41037236252649]
+    """
+    whole = np.floor(seconds)
+    found: Int64s = whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)
+    return found
 
 
 def identifiers(labels: Sequence[str]) -> list[str]:

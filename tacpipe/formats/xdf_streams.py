@@ -34,7 +34,6 @@ STAMP = "lsl_ns"
 RAW = "t_device_ns"
 OFFSETS = " clock offsets"  # what the name of a stream's offsets ends with
 CLOCK = "LSL's, of the computer that recorded"
-LATEST_S = 9e9  # that nanoseconds in 64 bits hold
 
 
 @dataclass
@@ -224,9 +223,9 @@ def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | s
     Instead a reason where that cannot be known.
     """
     raw_s = np.concatenate(stream.stamps)
-    if not (np.abs(raw_s) < LATEST_S).all():
-        return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < LATEST_S)][0]))} is not a time in seconds"
-    raw_ns = _ns(raw_s)
+    if not (np.abs(raw_s) < lsl.LATEST_S).all():
+        return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.LATEST_S)][0]))} is not a time in seconds"
+    raw_ns = lsl.nanoseconds(raw_s)
     measured = _measured(stream)
     facts: dict[str, Attribute] = {}
     described: list[str] = []
@@ -257,11 +256,11 @@ def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | s
 def _measured(stream: _Stream) -> Int64s:
     """Return the clock offsets (measurement, reading and offset in ns) that are numbers."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
-    return np.column_stack([_ns(column) for column in offsets_s[_sound(offsets_s)].T])
+    return np.column_stack([lsl.nanoseconds(column) for column in offsets_s[_sound(offsets_s)].T])
 
 
 def _sound(offsets_s: Floats) -> AnyArray:
-    return np.asarray((np.abs(offsets_s) < LATEST_S).all(axis=1))
+    return np.asarray((np.abs(offsets_s) < lsl.LATEST_S).all(axis=1))
 
 
 def _reset_row(stream: _Stream, raw_ns: Times, measured: Int64s, first: int) -> int:
@@ -282,17 +281,10 @@ def _reset_row(stream: _Stream, raw_ns: Times, measured: Int64s, first: int) -> 
     return max(low - 1, 0) + jump + 1
 
 
-def _ns(seconds: Floats) -> Int64s:
-    """Return seconds as whole nanoseconds, their whole part apart: a product of all digits would be rounded."""
-    whole = np.floor(seconds)
-    found: Int64s = whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)
-    return found
-
-
 def _table(stream: _Stream, t_ns: Times) -> pa.Table:
     values = np.concatenate(stream.values)
     fields: list[pa.Field] = [_time_field(STAMP), _time_field(RAW)]
-    columns: list[Any] = [pa.array(t_ns), pa.array(_ns(np.concatenate(stream.stamps)))]
+    columns: list[Any] = [pa.array(t_ns), pa.array(lsl.nanoseconds(np.concatenate(stream.stamps)))]
     taken = [STAMP, RAW, "t_ns"]
     for place, channel in enumerate(stream.about.channels):
         name = channel.name if channel.name not in taken else f"{channel.name}_channel"
@@ -312,7 +304,7 @@ def _offsets_table(stream: _Stream) -> pa.Table:
     """Return the clock offsets as they were measured: when on both clocks, and what was to be added."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
     offsets_s = offsets_s[_sound(offsets_s)]
-    sent_ns, offset_ns = _ns(offsets_s[:, 0]), _ns(offsets_s[:, 1])
+    sent_ns, offset_ns = (lsl.nanoseconds(column) for column in offsets_s.T)
     field = pa.field("offset_s", pa.float64(), metadata={"unit": "s", "quantity": "time"})
     columns = [pa.array(np.maximum.accumulate(sent_ns + offset_ns)), pa.array(sent_ns), pa.array(offsets_s[:, 1])]
     return pa.Table.from_arrays(columns, schema=pa.schema([_time_field(STAMP), _time_field(RAW), field]))

@@ -22,6 +22,7 @@ PACKETS = (
     "can",
     "folder",
     "camera",
+    "lsl",
 )  # kinds of links whose chunks have a size that states
 MOST = 1 << 18  # bytes that are looked at
 CERTAIN = 0.8  # fraction of the bytes beyond chance from which on there is no doubt

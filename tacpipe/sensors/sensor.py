@@ -103,6 +103,8 @@ class Sensor:
     described: ClassVar[bool] = False  # its frames are what the rig file states, so that those of any board may fit
     guesses: ClassVar[Mapping[str, str]] = {}  # what a probe's guess of each of its options rests on
 
+    incomplete: ClassVar[bool] = False  # options are missing that the device itself states when it is opened
+
     rate_hz: float  # samples a second; 0: none is known
     baud: int  # of a serial port
 

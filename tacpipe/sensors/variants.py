@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from tacpipe.sensors import lines_guess
+from tacpipe.sensors import lines_guess, lsl
 from tacpipe.sensors.framing import Chunks
 
 Options = dict[str, Any]
@@ -32,6 +32,8 @@ def of(kind: str, data: Chunks) -> list[Options]:
     """
     if kind == "lines":  # arrivals state more than bytes: the rate, and which number is a clock
         return lines_guess.of(data)
+    if kind == "lsl":
+        return lsl.options(data)
     return VARIANTS[kind](data.data) if kind in VARIANTS else [{}]
 
 

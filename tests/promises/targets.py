@@ -37,7 +37,7 @@ from tacpipe.plugins.stage import Source
 from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
-from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.promises import decoding
 from tests.sensors.test_every_sensor import CASES
 
@@ -261,12 +261,26 @@ def _tables(folder: Path) -> None:
     (folder / "a.yaml").write_text("material: cork\nforce: 2.5\n")
 
 
+def _session(folder: Path) -> None:
+    session = xdf_writer.Writer()
+    session.stream(1, "force", "int16", 2)
+    session.stream(2, "marks", "string", rate_hz=0)
+    for start in range(3):
+        session.offset(1, float(start), 0.5)
+        session.numbers(1, "int16", [start + 0.1, None, start + 0.3], [[start, 1], [2, 3], [4, 5]])
+        session.texts(2, [start + 0.2], ["go"])
+        session.boundary()
+    session.footer(1, 9)
+    session.write(folder / "a.xdf")
+
+
 PARAMS = {"table": {"layout": json.dumps(tomllib.loads(LAYOUT))}}  # of formats that need some
 TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of each format
     "biotac-slide": _biotac,
     "roboskin": _roboskin,
     "table": _tables,
     "vision2tactile": _grasps,
+    "xdf": _session,
     "xela-flat": lambda folder: xela_files.write_flat(folder / "data_sample_a"),
     "xela-psc": lambda folder: xela_files.write_psc(folder / "data_sample_a"),
 }

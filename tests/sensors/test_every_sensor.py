@@ -53,6 +53,12 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # settings that change a se
             "suffix": ";",
         },
     ),
+    "lsl of forces": (
+        "lsl",
+        {"channels": [{"name": f"f{axis}", "unit": "N", "quantity": "force", "component": axis} for axis in "xyz"]},
+    ),
+    "lsl of doubles": ("lsl", {"channels": [{"name": "a"}, {"name": "b"}], "format": "double64", "rate_hz": 250}),
+    "lsl of markers": ("lsl", {"channels": [{"name": "event"}], "format": "string"}),
     "optoforce of three axes": ("optoforce", {"axes": 3}),
     "spacemouse that splits": ("spacemouse", {"split": True}),
     "tfmini, the original": ("tfmini", {"model": "original"}),

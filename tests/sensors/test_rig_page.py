@@ -60,7 +60,15 @@ def test_the_rig_files_are_rigs() -> None:
 
     streams = {name: stream for block in told for name, stream in rig.parse(block).streams.items()}
 
-    assert [stream.kind for stream in streams.values()] == ["xela", "ati-netft", "tap", "generic"]
+    assert [stream.kind for stream in streams.values()] == [
+        "xela",
+        "ati-netft",
+        "tap",
+        "lsl",
+        "lsl",
+        "lines",
+        "generic",
+    ]
 
 
 def test_three_lines_of_python_send_what_a_tap_takes() -> None:

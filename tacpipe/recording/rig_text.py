@@ -1,4 +1,4 @@
-"""The text of a rig file, for a rig whose addresses were made by the emulator."""
+"""The text of a rig file, for a rig that is not as its file states: of the emulator, or completed by its devices."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from tacpipe.io import toml
 from tacpipe.recording.rig import Rig
 
 
-def text(rig: Rig) -> str:
+def of(rig: Rig) -> str:
     """Return the TOML of a rig; `tacpipe.recording.rig.parse` reads it."""
     parts = [f"master = {toml.value(rig.master)}\n"]
     if rig.labels:
