@@ -33,6 +33,7 @@ from tacpipe.signals import clock_offsets, clocks
 STAMP = "lsl_ns"
 RAW = "t_device_ns"
 OFFSETS = " clock offsets"  # what the name of a stream's offsets ends with
+UNDESCRIBED = "the file does not describe it"
 CLOCK = "LSL's, of the computer that recorded"
 
 
@@ -76,7 +77,26 @@ class _Read:
     streams: dict[int, _Stream] = field(default_factory=dict)
     unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
     header: bytes = b""
-    notes: list[str] = field(default_factory=list)
+    damage: list[Damage] = field(default_factory=list)
+    cut_at: int | None = None  # where the chunk begins that the file ends within
+
+    def notes(self, path: Path) -> list[str]:
+        """Return what is missing, in words."""
+        found = []
+        if self.damage:
+            size, first = sum(one.bytes for one in self.damage), self.damage[0].at
+            places = (
+                f"in {len(self.damage)} places, the first at byte {first:,},"
+                if len(self.damage) > 1
+                else f"from byte {first:,} on"
+            )
+            found.append(f"{path}: {size:,} bytes {places} are not XDF and were left out.")
+        if self.cut_at is not None:
+            found.append(f"{path} was cut off at byte {self.cut_at:,}, within a chunk; what stands before is read.")
+        undescribed = sum(why == UNDESCRIBED for why in self.unknown.values())
+        if undescribed:
+            found.append(f"{path} has samples of {undescribed} streams that it does not describe; they were left out.")
+        return found
 
 
 @dataclass(frozen=True)
@@ -103,7 +123,8 @@ class XdfFile:
         names = kinds.identifiers([one for source in named.values() for one in (source, source + OFFSETS)])
         found: list[SourceStream] = []
         attributes = _attributes(read.header)
-        notes, skipped = list(read.notes), {f"stream {number}": why for number, why in read.unknown.items()}
+        notes = read.notes(self.path)
+        skipped = {f"stream {number}": why for number, why in read.unknown.items() if why != UNDESCRIBED}
         for number, source in named.items():
             stream = read.streams[number]
             if not stream.rows:
@@ -129,7 +150,7 @@ class XdfFile:
         read = _Read()
         try:
             for chunk in xdf_chunks.chunks(_content(self.path)):
-                _take(read, chunk, self.path)
+                _take(read, chunk)
         except (OSError, zlib.error) as error:
             raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
         except TacpipeError as error:
@@ -158,13 +179,13 @@ def _decompressed(path: Path) -> bytes:
     return bytes(unpacked)
 
 
-def _take(read: _Read, chunk: Chunk | Damage, path: Path) -> None:
+def _take(read: _Read, chunk: Chunk | Damage) -> None:
     """Take a chunk into what was read."""
     if isinstance(chunk, Damage):
-        read.notes.append(f"{path}: {chunk.bytes:,} bytes from byte {chunk.at:,} on are not XDF and were left out.")
+        read.damage.append(chunk)
         return
     if not chunk.whole:
-        read.notes.append(f"{path} was cut off at byte {chunk.at:,}, within a chunk; what stands before is read.")
+        read.cut_at = chunk.at
     if chunk.tag == xdf_chunks.FILE_HEADER:
         read.header = chunk.content
     elif chunk.stream is None:
@@ -175,7 +196,7 @@ def _take(read: _Read, chunk: Chunk | Damage, path: Path) -> None:
         except TacpipeError as error:
             read.unknown[chunk.stream] = str(error)
     elif chunk.stream not in read.streams:
-        read.unknown.setdefault(chunk.stream, "the file does not describe it")
+        read.unknown.setdefault(chunk.stream, UNDESCRIBED)
     elif chunk.tag == xdf_chunks.SAMPLES:
         read.streams[chunk.stream].take(chunk.content)
     elif chunk.tag == xdf_chunks.CLOCK_OFFSET and len(chunk.content) >= 16:
