@@ -93,13 +93,15 @@ class _Stream:
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     """Bring the streams of each recording onto one clock.
 
-    Returns one table over the time that all streams cover, one row a grid point, with masks of repeats and gaps.
+    Returns one table over the time that all streams cover, one row a grid point, with masks of repeats and gaps. Streams of
+    images or text alone, and those of a single row, have no values between their samples: they stay in the recordings.
     """
     import pyarrow as pa
 
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
 
-    found = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
+    every = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
+    found = {name: columns for name, columns in every.items() if _is_signal(columns)} or every
     streams: dict[str, _Stream] = {}
     for name, stored in found.items():
         streams[name] = _stream(recording.name, name, stored, params.clock)
@@ -109,6 +111,8 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     grid_ns, rows = _grid(recording.name, params, streams, master)
     columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {"grid": params.grid, "grid_master": master.name}
+    if left := [name for name in every if name not in found]:
+        attributes["not_synchronized"] = _list(left)
     attributes["grid_rate_hz"] = params.rate_hz if params.grid == "uniform" else round(mean_rate_hz(grid_ns), 3)
     for name, stream in streams.items():
         exact = _rows_at(stream.t_ns, grid_ns, rows)
@@ -124,6 +128,17 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
         stream.columns.forget()
     arrays = [pa.array(values, kind.type) for kind, values in columns]
     return RecordingOutput(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
+
+
+def _is_signal(columns: Columns) -> bool:
+    """Return whether a stream has numbers over time, and no column of bytes."""
+    import pyarrow as pa
+
+    channels = [field for field in columns.schema if field.name not in ("t_ns", UNCERTAIN)]
+    if columns.num_rows == 1 or any(pa.types.is_binary(field.type) for field in channels):
+        return False
+    times = [field.name for field in channels if (field.metadata or {}).get(b"quantity") == b"time"]
+    return any(not pa.types.is_string(field.type) and field.name not in times for field in channels)
 
 
 def _stream(recording: str, name: str, columns: Columns, clock: str) -> _Stream:

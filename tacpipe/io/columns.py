@@ -16,7 +16,7 @@ class Columns:
     """The columns of one stream, read as those of a `pyarrow.Table`; what was decoded last is kept.
 
     A stream of up to `BLOCK_BYTES` is decoded whole when its first column is asked for, a larger one in blocks of
-    neighbouring columns. Raises `DamagedError` as `from_parquet` does.
+    neighbouring columns, and one of bytes, as of images, alone. Raises `DamagedError` as `from_parquet` does.
     """
 
     def __init__(self, content: bytes, block_bytes: int = BLOCK_BYTES) -> None:
@@ -54,7 +54,7 @@ def _blocks(schema: pa.Schema, rows: int, block_bytes: int) -> list[Sequence[str
     found: list[list[str]] = []
     room = 0
     for field in schema:
-        needed = rows * _width_bytes(field.type)
+        needed = rows * (block_bytes if pa.types.is_binary(field.type) else _width_bytes(field.type))
         if not found or needed > room:
             found.append([])
             room = block_bytes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,6 +20,11 @@ from tacpipe.printable import plain
 ROW_GROUP_ROWS = 1 << 20
 HELD_SHARE = 0.25  # above this share of repeated rows zstd beats delta packing; measured, docs/format.md
 LARGE_BYTES = 1 << 25  # in memory
+BATCH_ROWS = 1024  # Arrow's own
+PAGE_BYTES = 1 << 20  # of encoded frames; a batch of 1024 of them could be beyond the 2 GiB that a page may have
+GROUP_BYTES = 1 << 28  # of encoded frames in a group of rows
+TRIED_BYTES = 1 << 20  # of encoded frames that are compressed to see whether it is worth it
+WORTH = 0.95  # of their size
 ZSTD_LEVEL = 3
 ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
 _CLOCKS = ("t_ns", "t_device_ns", "seq")
@@ -38,7 +44,13 @@ def to_parquet(table: pa.Table) -> bytes:
     """
     held = _held_share(table) > HELD_SHARE
     encoding, compression_level = {}, {}
+    compression = dict.fromkeys(table.column_names, "zstd")
+    value_bytes = max(
+        [_mean_bytes(table.column(field.name)) for field in table.schema if _holds_bytes(field)], default=0
+    )
     for field in table.schema:
+        if _holds_bytes(field) and _compressed_already(table.column(field.name)):
+            compression[field.name] = "none"
         delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not held)
         compression_level[field.name] = ZSTD_LEVEL if delta or not held else ZSTD_LEVEL_HELD
         if pa.types.is_floating(field.type):
@@ -55,13 +67,14 @@ def to_parquet(table: pa.Table) -> bytes:
         bare.schema,
         use_dictionary=False,
         column_encoding=encoding,
-        compression="zstd",
-        compression_level=compression_level,
+        compression=compression,
+        compression_level={name: level for name, level in compression_level.items() if compression[name] == "zstd"},
+        write_batch_size=max(1, min(BATCH_ROWS, PAGE_BYTES // max(value_bytes, 1))),  # a page has whole batches
         write_statistics=False,
         write_page_checksum=True,
         store_schema=False,
     ) as writer:
-        writer.write_table(bare, row_group_size=ROW_GROUP_ROWS)
+        writer.write_table(bare, row_group_size=max(1, min(ROW_GROUP_ROWS, GROUP_BYTES // max(value_bytes, 1))))
         writer.add_key_value_metadata({_KEY: _fields_to_json(table.schema)})
     content: bytes = sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
     return content
@@ -127,6 +140,24 @@ def _unread(size: int, error: Exception) -> TacpipeError:
     if memory.scarce() and (short := memory.shortage(error)) is not None:
         return short
     return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
+
+
+def _holds_bytes(field: pa.Field) -> bool:
+    return bool(pa.types.is_binary(field.type) or pa.types.is_large_binary(field.type))
+
+
+def _mean_bytes(column: pa.ChunkedArray) -> int:
+    return int(sum(chunk.nbytes for chunk in column.chunks) / max(len(column), 1))
+
+
+def _compressed_already(column: pa.ChunkedArray) -> bool:
+    """Return whether bytes are such that zstd saves next to nothing, as of JPEG images."""
+    content = bytearray()
+    for value in itertools.chain.from_iterable(column.chunks):
+        content += (value.as_py() or b"")[: TRIED_BYTES - len(content)]
+        if len(content) >= TRIED_BYTES:
+            break
+    return len(content) > 0 and len(pa.Codec("zstd", 1).compress(bytes(content), asbytes=True)) > WORTH * len(content)
 
 
 def _held_share(table: pa.Table) -> float:

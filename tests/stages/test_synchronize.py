@@ -308,3 +308,16 @@ def test_half_a_quaternion_is_refused(shard: Recording) -> None:
     t_ms = np.arange(0, 100, 7)
     with pytest.raises(TacpipeError, match="needs x, y, z and w once each"):
         run(shard({"xela1": uskin(t_ms), "robot": robot(t_ms).drop_columns(["orientation_w"])}))
+
+
+def test_images_text_and_single_rows_neither_bound_the_grid_nor_stand_on_it(shard: Recording) -> None:
+    t_ns = np.arange(100) * 10_000_000
+    skin = pa.table({"t_ns": t_ns, "a": pa.array(np.arange(100), pa.int32())})
+    camera = pa.table({"t_ns": t_ns[:3], "data": pa.array([b"x"] * 3, pa.binary()), "width": pa.array([1] * 3)})
+    note = pa.table({"t_ns": t_ns[5:6], "data": ["hello"]})
+    still = pa.table({"t_ns": t_ns[:1], "position_x_m": [0.5]})
+    streams = {"skin": skin, "camera": camera, "note": note, "still": still}
+    table, attributes = run(shard(streams), master="skin", rate_hz=100.0)
+    assert table.column_names == ["t_ns", "skin_a", "skin_held", "skin_gap", "skin_dt_ns"]
+    assert table.num_rows == 100
+    assert attributes["not_synchronized"] == "camera, note, still"

@@ -10,6 +10,7 @@ from typing import cast
 
 from tacpipe.formats.containers.container import Container
 from tacpipe.io import files as file_system
+from tacpipe.io import regular
 
 
 @dataclass(frozen=True)
@@ -19,11 +20,17 @@ class Kind:
     opener: str  # module:function, imported when a file is opened, as it may need an extra
     endings: tuple[str, ...] = ()  # of files, in lower case
     marks: tuple[str, ...] = ()  # a folder that holds one of these files is one container
+    marked: bytes = b""  # what the first 4 KiB of such a file hold
 
 
 KINDS: Mapping[str, Kind] = {
-    "mcap": Kind("tacpipe.formats.bags.container:opened_mcap", (".mcap",)),
-    "rosbag": Kind("tacpipe.formats.bags.container:opened", (".bag", ".db3", ".mcap"), ("metadata.yaml",)),
+    "mcap": Kind("tacpipe.formats.bags.container:opened", (".mcap",)),
+    "rosbag": Kind(
+        "tacpipe.formats.bags.container:opened",
+        (".bag", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
+        ("metadata.yaml",),
+        b"rosbag2_bagfile_information",
+    ),
     "hdf5": Kind("tacpipe.formats.hdf5:opened", (".hdf5", ".h5")),
     "zarr": Kind("tacpipe.formats.zarr:opened", (".zarr.zip",), (".zgroup", ".zarray", "zarr.json")),
     "xdf": Kind("tacpipe.formats.xdf:opened", (".xdf", ".xdfz", ".xdf.gz")),
@@ -40,8 +47,15 @@ def opened(kind: str, path: Path) -> Container:
 def is_one(kind: str, path: Path) -> bool:
     """Return whether a path looks like a container of this kind."""
     if path.is_dir():
-        return any((path / mark).is_file() for mark in KINDS[kind].marks)
+        return any(_marks(path / mark, KINDS[kind].marked) for mark in KINDS[kind].marks)
     return path.name.lower().endswith(KINDS[kind].endings)
+
+
+def _marks(path: Path, content: bytes) -> bool:
+    if not content or not path.is_file():
+        return path.is_file()
+    with regular.failing(path), regular.opened(path) as file:
+        return content in file.read(4096)
 
 
 def found(kind: str, source: Path) -> list[Path]:

@@ -45,10 +45,15 @@ def of(contents: Contents, command: str, path: Path) -> str:
 def _stream(one: SourceStream) -> str:
     rows = "" if one.rows is None else f"  # {one.rows} rows"
     lines = [f"[streams.{one.name}]", f"source = {_quoted(one.source)}{rows}"]
-    lines.append(f"time = {_time(one.time)}" if one.time.given else 'time = { rate_hz = "?" }  # the file does not say')
-    fields = [field for field in one.table.schema if field.name != one.time.column]
+    declared = f"# time = {_time(one.time)}, if nothing else is written here"
+    lines.append(declared if one.time.given else 'time = { rate_hz = "?" }  # the file does not say')
+    fields = [field for field in one.table.schema if field.name != one.time.column and not _is_time(field)]
     rules = [f"    {rule}" for rule in _rules(fields)]
     return "\n".join([*lines, *(["columns = [", *rules, "]"] if rules else [])])
+
+
+def _is_time(field: pa.Field) -> bool:
+    return (field.metadata or {}).get(b"quantity") == b"time"
 
 
 def _time(time: Time) -> str:

@@ -1,0 +1,71 @@
+"""The records of a ROS 2 bag's SQLite file (.db3)."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.bags import ros
+from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
+from tacpipe.io import regular
+from tacpipe.printable import plain
+
+MAGIC = b"SQLite format 3\0"
+
+
+def records(path: Path) -> Iterator[Record]:
+    """Yield what a file holds, in the order in which it was written. Raises `TacpipeError` where it is not one."""
+    with regular.failing(path), regular.opened(path) as file:
+        magic = file.read(len(MAGIC))
+    if magic != MAGIC:
+        raise TacpipeError(f"{path} is not a SQLite file: it {'does not begin as one' if magic else 'is empty'}.")
+    with _connected(path) as connection:
+        try:
+            yield from _channels(connection)
+        except sqlite3.Error as error:
+            raise TacpipeError(f"{path} is not a bag of ROS 2: {plain(str(error), 120)}.") from error
+        try:
+            for number, log_ns, content in connection.execute(
+                "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
+            ):
+                yield Message(number, log_ns, log_ns, content)
+        except sqlite3.Error as error:
+            yield Damage(f"{path} is damaged ({plain(str(error), 120)}): what came after is missing.")
+
+
+@contextlib.contextmanager
+def _connected(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a file without changing it; what was not yet moved from its log (-wal) is read from a copy."""
+    log = path.with_name(f"{path.name}-wal")
+    with tempfile.TemporaryDirectory() if log.is_file() and log.stat().st_size else contextlib.nullcontext() as copies:
+        if copies is None:
+            address = f"file:{quote(str(path.absolute()))}?immutable=1"
+        else:
+            for one in (path, log):
+                shutil.copy(one, copies)
+            address = f"file:{quote(str(Path(copies, path.name)))}"
+        connection = sqlite3.connect(address, uri=True)
+        try:
+            yield connection
+        finally:
+            connection.close()
+
+
+def _channels(connection: sqlite3.Connection) -> Iterator[Record]:
+    definitions: dict[str, tuple[str, bytes]] = {}
+    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if "message_definitions" in tables:
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        definitions = {name: (kind, text.encode()) for name, kind, text in connection.execute(query)}
+    for number, topic, name, encoding in connection.execute("SELECT id, name, type, serialization_format FROM topics"):
+        kind, text = definitions.get(name, ("ros2msg", b""))
+        yield Channel(number, topic, ros.normal(name), encoding, kind, text)
+    if "schema" in tables:
+        for (distribution,) in connection.execute("SELECT ros_distro FROM schema"):
+            yield Metadata("rosbag2", {"ros_distro": distribution or ""})

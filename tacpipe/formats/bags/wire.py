@@ -1,0 +1,229 @@
+"""Where the values of a ROS message lie in its bytes, for many messages of one shape at once.
+
+A message has no table of contents: where a value lies depends on the lengths of all strings and sequences before it.
+Messages with the same lengths have the same *shape*, so the first is walked and all are rows of one matrix.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tacpipe.printable import plain
+
+Path = tuple[str | int, ...]  # field names and positions: ("transforms", 0, "header", "stamp")
+Types = Mapping[str, Sequence[tuple[str, Any]]]  # fields of each message type, as rosbags' typestore describes them
+Matrix = npt.NDArray[np.uint8]  # (message, byte)
+NUMBERS = {
+    **{"bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"},
+}
+STAMPS = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+TEXT = "text"
+MOST_LEAVES = 1 << 16  # of a message
+_BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags.interfaces.Nodetype
+
+
+class WireError(ValueError):
+    """Why a message cannot be decoded."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A value, or an array of numbers, and where it lies."""
+
+    path: Path
+    kind: str  # a ROS type of `NUMBERS`, "text" or "stamp"
+    offset: int  # bytes from the start
+    count: int | None  # of an array; of a text its bytes; None: a single number
+    within: tuple[tuple[int, str], ...]  # message types around it: length of their path, name
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How messages are written: ROS 1, or CDR of one byte order."""
+
+    order: str = "<"  # as numpy has it
+    start: int = 0  # where the message begins, and alignment counts from
+    aligned: bool = False
+    terminated: bool = False  # whether texts end with a zero byte
+
+
+ROS1 = Encoding()
+
+
+def encoding_of(message: bytes) -> Encoding:
+    """Return how a CDR message is written. Raises `WireError` for an encapsulation that ROS 2 does not write."""
+    kind = bytes(message[:2])
+    if kind not in (b"\x00\x00", b"\x00\x01"):
+        raise WireError(f"its encapsulation is {kind.hex() or 'missing'}, not CDR's 0000 or 0001")
+    return Encoding("<" if kind[1] else ">", 4, aligned=True, terminated=True)
+
+
+@dataclass
+class Shape:
+    """Leaves of messages of one size, and the length words that make it so."""
+
+    encoding: Encoding
+    size: int
+    leaves: list[Leaf] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)  # offsets of the 4-byte words that hold a length
+    first: bytes = b""
+
+    def text(self, leaf: Leaf) -> str:
+        """Return a text of the first message."""
+        return self.first[leaf.offset : leaf.offset + (leaf.count or 0)].decode(errors="replace")
+
+    def numbers(self, leaf: Leaf, matrix: Matrix) -> npt.NDArray[Any]:
+        """Return a number (message,), an array of numbers (message, position), or stamps (message,) in nanoseconds."""
+        order = self.encoding.order
+        if leaf.kind == "stamp":
+            # ROS 1 has unsigned seconds, an unset stamp of ROS 2 may be negative: both fit 32 bits until 2038
+            seconds = _view(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
+            return seconds * 10**9 + _view(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
+        kind = np.dtype(f"{order}{NUMBERS[leaf.kind]}")
+        values = _view(matrix, leaf.offset, 1 if leaf.count is None else leaf.count, kind)
+        values = values.astype(kind.newbyteorder("="), copy=False)
+        return values[:, 0] if leaf.count is None else values
+
+
+def _view(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) -> npt.NDArray[Any]:
+    width = np.dtype(kind).itemsize * count
+    if not width:
+        return np.empty((len(matrix), 0), kind)
+    return np.ascontiguousarray(matrix[:, offset : offset + width]).view(kind)
+
+
+def shapes(
+    messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, known: list[Shape]
+) -> Iterator[tuple[Shape, npt.NDArray[np.int64], Matrix]]:
+    """Yield the messages of each shape: the shape, which messages (message,), and their bytes (message, byte).
+
+    ``known`` are shapes of messages before; new ones are added. Raises `WireError` where a message is not of its type.
+    """
+    sizes = np.fromiter(map(len, messages), np.int64, len(messages))
+    different, first = np.unique(sizes, return_index=True)
+    for size in different[np.argsort(first)]:
+        rows = np.flatnonzero(sizes == size)
+        content = messages[int(rows[0])] if len(rows) == 1 else b"".join([messages[row] for row in rows.tolist()])
+        matrix = np.frombuffer(content, np.uint8).reshape(len(rows), int(size))
+        candidates = [shape for shape in known if shape.size == size]
+        while len(rows):
+            shape = next(iter(candidates), None)
+            if shape is None:
+                shape = walked(matrix[0].tobytes(), types, name, encoding)
+                known.append(shape)
+            candidates = candidates[1:]
+            same = _alike(shape, matrix)
+            if same.all():
+                yield shape, rows, matrix
+                break
+            if same.any():
+                yield shape, rows[same], matrix[same]
+                rows, matrix = rows[~same], matrix[~same]
+
+
+def _alike(shape: Shape, matrix: Matrix) -> npt.NDArray[np.bool_]:
+    first = np.frombuffer(shape.first, np.uint8)
+    same = np.ones(len(matrix), bool)
+    for offset in shape.lengths:
+        same &= (matrix[:, offset : offset + 4] == first[offset : offset + 4]).all(axis=1)
+    return same
+
+
+def walked(message: bytes, types: Types, name: str, encoding: Encoding) -> Shape:
+    """Return the shape of a message. Raises `WireError` where its bytes do not fit its type."""
+    shape = Shape(encoding, len(message), first=message)
+    try:
+        end = _Walk(message, types, shape).message(name, (), (), encoding.start)
+    except (struct.error, KeyError, RecursionError) as error:
+        wrong = (
+            f"the type {plain(str(error.args[0]))} is not defined" if isinstance(error, KeyError) else "it ends early"
+        )
+        raise WireError(f"a message is not a {plain(name)}: {wrong}") from error
+    if end > len(message) or len(message) - end > 3 + (not encoding.aligned) * -3:
+        raise WireError(f"a message is not a {plain(name)}: it has {len(message)} bytes, its values take {end}")
+    return shape
+
+
+@dataclass
+class _Walk:
+    content: bytes
+    types: Types
+    shape: Shape
+
+    def message(self, name: str, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
+        """Walk the fields of a message that begins at ``at``; return where it ends."""
+        if name in STAMPS:
+            at = self._aligned(at, 4)
+            self._add(Leaf(path, "stamp", at, None, within))
+            return at + 8
+        within = (*within, (len(path), name))
+        for field_name, description in self.types[name]:
+            if field_name == "structure_needs_at_least_one_member":
+                at += self.shape.encoding.aligned  # ROS 1 writes nothing for an empty message
+                continue
+            at = self._field(description, (*path, field_name), within, at)
+        return at
+
+    def _field(self, description: Any, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
+        node, inner = int(description[0]), description[1]
+        if node == _NAME:
+            return self.message(inner, path, within, at)
+        if node == _BASE:
+            return self._single(inner[0], path, within, at)
+        element: Any = inner[0]
+        count: int = inner[1]
+        if node != _ARRAY:
+            count, at = self._length(at)
+        kind = element[1][0] if int(element[0]) == _BASE else ""
+        if kind in NUMBERS:
+            width = np.dtype(NUMBERS[kind]).itemsize
+            at = self._aligned(at, width) if count else at
+            if at + width * count > len(self.content):
+                raise struct.error
+            self._add(Leaf(path, kind, at, count, within))
+            return at + width * count
+        if count > len(self.content):
+            raise struct.error
+        for position in range(count):
+            at = self._field(element, (*path, position), within, at)
+        return at
+
+    def _single(self, kind: str, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
+        if kind == "string":
+            length, at = self._length(at)
+            if at + length > len(self.content):
+                raise struct.error
+            self._add(Leaf(path, TEXT, at, max(length - self.shape.encoding.terminated, 0), within))
+            return at + length
+        if kind not in NUMBERS:
+            raise WireError(f"its field {'.'.join(map(str, path))} is a {plain(kind)}, which is not read")
+        width = np.dtype(NUMBERS[kind]).itemsize
+        at = self._aligned(at, width)
+        if at + width > len(self.content):
+            raise struct.error
+        self._add(Leaf(path, kind, at, None, within))
+        return at + width
+
+    def _length(self, at: int) -> tuple[int, int]:
+        at = self._aligned(at, 4)
+        length: int
+        (length,) = struct.unpack_from(f"{self.shape.encoding.order}I", self.content, at)
+        self.shape.lengths.append(at)
+        return length, at + 4
+
+    def _aligned(self, at: int, width: int) -> int:
+        start = self.shape.encoding.start
+        gap = -(at - start) % width if self.shape.encoding.aligned else 0
+        return at + gap
+
+    def _add(self, leaf: Leaf) -> None:
+        if len(self.shape.leaves) >= MOST_LEAVES:
+            raise WireError(f"a message has more than {MOST_LEAVES} values")
+        self.shape.leaves.append(leaf)
