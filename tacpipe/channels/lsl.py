@@ -42,6 +42,7 @@ QUANTITIES = {  # of the type of a channel, or of a stream whose channels have n
 }  # fmt: skip
 COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
 LATEST_S = 9e9  # that nanoseconds in 64 bits hold
+TAXEL = re.compile(r".*?(\d+)(?:[_ .]?([xyz]))?")
 MOST_CHANNELS = 1 << 16
 MOST_BYTES = 1 << 24  # of a description
 
@@ -54,6 +55,14 @@ class Channel:
     unit: str = ""
     quantity: str = ""
     component: str = ""
+    taxel: str = ""  # number of a tactile channel in its array, from its label
+    axis: str = ""  # of a tactile channel
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What a field of this channel states, without what is not known."""
+        found = {key: getattr(self, key) for key in ("unit", "quantity", "component", "taxel", "axis")}
+        return {key: value for key, value in found.items() if value}
 
 
 @dataclass(frozen=True)
@@ -125,7 +134,11 @@ def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: b
         unit = "" if own is None else own.findtext("unit", "").strip()
         quantity, component = _quantity("" if own is None else own.findtext("type", ""), kind, labels[place])
         known = UNITS.get(unit.lower(), unit)
-        found.append(Channel(name, "1" if text else known, "text" if text else quantity, "" if text else component))
+        if text:
+            found.append(Channel(name, "1", "text"))
+            continue
+        taxel = TAXEL.fullmatch(labels[place].lower()) if quantity == "tactile" and described else None
+        found.append(Channel(name, known, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ())))
     return tuple(found)
 
 

@@ -309,9 +309,8 @@ def _table(stream: _Stream, t_ns: Times) -> pa.Table:
     taken = [STAMP, RAW, "t_ns"]
     for place, channel in enumerate(stream.about.channels):
         name = channel.name if channel.name not in taken else f"{channel.name}_channel"
-        about = {"quantity": channel.quantity, "unit": channel.unit, "component": channel.component}
         kind = pa.string() if stream.about.is_text else pa.from_numpy_dtype(stream.about.dtype)
-        fields.append(pa.field(name, kind, metadata={key: value for key, value in about.items() if value}))
+        fields.append(pa.field(name, kind, metadata=channel.metadata))
         columns.append(pa.array(values[:, place], kind))
     return pa.Table.from_arrays(columns, schema=pa.schema(fields))
 

@@ -80,8 +80,9 @@ class Lsl(Sensor):
         found = []
         for channel in self.channels:
             unit, quantity = channel.unit or "1", channel.quantity or ("text" if self._is_text else "state")
-            about = {"unit": unit, "quantity": quantity, "component": channel.component}
-            found.append(pa.field(channel.name, kind, metadata={key: value for key, value in about.items() if value}))
+            found.append(
+                pa.field(channel.name, kind, metadata={**channel.metadata, "unit": unit, "quantity": quantity})
+            )
         return [*found, pa.field(CORRECTION, pa.float64(), metadata={"unit": "s", "quantity": "time"})]
 
     def framer(self) -> Framer:
@@ -159,13 +160,9 @@ def options(data: Chunks) -> list[dict[str, Any]]:
 
 
 def _entry(channel: Channel, *, text: bool) -> dict[str, str]:
+    """Return a channel as a rig file has it; what is the same for every text is left out."""
     named = f"{channel.name}_channel" if channel.name in TAKEN else channel.name
-    about = {
-        "unit": "" if text else channel.unit,
-        "quantity": "" if text else channel.quantity,
-        "component": channel.component,
-    }
-    return {"name": named, **{key: value for key, value in about.items() if value}}
+    return {"name": named, **({} if text else channel.metadata)}
 
 
 def _described(data: bytes) -> lsl.Description | None:

@@ -123,6 +123,15 @@ def test_after_a_reset_of_the_senders_clock_stamps_are_true_as_those_of_pyxdf_ar
     assert np.abs(stamps(found.streams["force"], "t_device_ns") - raw * 1e9).max() <= 1
 
 
+def test_labels_of_tactile_channels_state_taxel_and_axis(tmp_path: Path) -> None:
+    writer = Writer()
+    labels = [(f"pad {taxel}.{axis}", "counts", "") for taxel in (1, 12) for axis in "xz"]
+    writer.stream(1, "skin", "int16", 4, labels=labels, type_="Tactile")
+    writer.numbers(1, "int16", [1.0], [[1, 2, 3, 4]])
+    field = read(writer.write(tmp_path / "a.xdf")).streams["skin"].schema.field("pad_12_z")
+    assert field.metadata == {b"unit": b"count", b"quantity": b"tactile", b"taxel": b"12", b"axis": b"z"}
+
+
 def test_clock_offsets_are_a_stream_as_they_were_measured(tmp_path: Path) -> None:
     force(tmp_path / "run.xdf", 50e-6, noise_s=1e-3)
     table = read(tmp_path / "run.xdf").streams["force_clock_offsets"]
