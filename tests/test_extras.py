@@ -77,6 +77,9 @@ LACK = {  # and for each that does need one, with that extra
     "report results/forward -o {o}.html --traces 1": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
+    "ingest mcap bags -o {o}": "ros",
+    "ingest rosbag bags -o {o}": "ros",
+    "ingest rosbag bags --guess": "ros",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
@@ -136,6 +139,8 @@ def prepare(folder: Path) -> None:
     session.stream(1, "force")
     session.numbers(1, "float32", [1.0, 1.01], [[0.5], [0.75]])
     session.write(folder / "sessions" / "a.xdf")
+    (folder / "bags").mkdir()
+    (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
 

@@ -7,11 +7,13 @@ registered is here by itself, or a test says that it is missing.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import io
 import json
 import re
 import shutil
+import sqlite3
 import tempfile
 import tomllib
 from collections.abc import Callable, Sequence
@@ -38,6 +40,7 @@ from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
+from tests.formats.bags import writers
 from tests.promises import decoding
 from tests.sensors.test_every_sensor import CASES
 
@@ -274,9 +277,31 @@ def _session(folder: Path) -> None:
     session.write(folder / "a.xdf")
 
 
+def _bags(folder: Path) -> None:
+    types, types1 = writers.store(), writers.store(ros1=True)
+    for name, made in (("a", types), ("b", types), ("c.bag", types1)):
+        values = {"header": writers.header(made, writers.START_NS), "name": ["j"], "position": [1.5]}
+        message = writers.build(made, "sensor_msgs/msg/JointState", **values)
+        sent = [("/j", "sensor_msgs/msg/JointState", writers.START_NS + step, message) for step in range(3)]
+        if made is types1:
+            writers.ros1(folder / name, sent)
+        else:
+            writers.ros2(folder / name, sent, "mcap" if name == "a" else "sqlite3")
+    with contextlib.closing(sqlite3.connect(folder / "b" / "b.db3")) as connection:
+        connection.execute("PRAGMA page_size = 512")  # an input of a fuzzer is small
+        connection.execute("VACUUM")
+
+
+def _mcap(folder: Path) -> None:
+    sent = [(writers.START_NS + step, {"v": step, "p": {"x": 1.5}}) for step in range(3)]
+    writers.mcap_json(folder / "a.mcap", {"/a": sent}, metadata={"material": "cork"})
+
+
 PARAMS = {"table": {"layout": json.dumps(tomllib.loads(LAYOUT))}}  # of formats that need some
 TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of each format
     "biotac-slide": _biotac,
+    "mcap": _mcap,
+    "rosbag": _bags,
     "roboskin": _roboskin,
     "table": _tables,
     "vision2tactile": _grasps,

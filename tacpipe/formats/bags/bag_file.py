@@ -115,8 +115,9 @@ def _sized(file: BinaryIO, size: int, most: int | None = None) -> bytes:
 def _content(path: Path, file: BinaryIO, size: int) -> tuple[bytes, bool]:
     """Return what follows its own length, or as much as is there, and whether it is all."""
     length = _length(file)
-    memory.require(min(length, size - file.tell()), f"A chunk of {path}")
-    content = file.read(length)
+    there = min(length, size - file.tell())
+    memory.require(there, f"A chunk of {path}")
+    content = file.read(there)
     return content, len(content) == length
 
 

@@ -50,7 +50,6 @@ class Bag:
         return self._read(sources, None)
 
     def _read(self, sources: Collection[str] | None, most: int | None) -> Contents:
-        extras.require("Reading bags and MCAP files", "rosbags", "mcap")
         with contextlib.ExitStack() as stack:
             files, messages_compressed, notes = _files(self.path, stack)
             reading = _Reading(sources, messages_compressed)
@@ -61,7 +60,8 @@ class Bag:
 
 
 def opened(path: Path) -> Bag:
-    """Return the bag at ``path``."""
+    """Return the bag at ``path``. Raises `MissingModuleError` where a library is missing."""
+    extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard")
     return Bag(path)
 
 
@@ -70,27 +70,24 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
     if not path.is_dir():
         return [_unpacked(path, stack)], False, []
     about = _described(path / "metadata.yaml")
-    names = [Path(str(name)).name for name in about.get("relative_file_paths") or ()]
-    there = [path / name for name in names if (path / name).is_file()]
-    notes = (
-        [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."]
-        if (missing := [name for name in names if not (path / name).is_file()])
-        else []
-    )
+    listing = about.get("relative_file_paths")
+    names = [Path(str(name)).name for name in listing] if isinstance(listing, list) else []
+    missing = [name for name in names if not (path / name).is_file()]
+    notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
+    there = [path / name for name in names if name not in missing]
+    there = there or sorted(one for one in path.iterdir() if _ending(one) in READERS)  # renamed since
     if not there:
-        raise TacpipeError(
-            f"{path} holds none of the files that its metadata.yaml names ({listed(names, 3) or 'none'})."
-        )
-    unknown = [
-        one.name for one in there if one.with_suffix("" if one.suffix == ZSTD else one.suffix).suffix not in READERS
-    ]
-    if unknown:
-        storage = about.get("storage_identifier")
-        raise TacpipeError(
-            f"{path}: {plain(unknown[0])} is of the storage {excerpt(storage)}; mcap and sqlite3 are read."
-        )
+        raise TacpipeError(f"{path} holds no file of a bag; its metadata.yaml names {listed(names, 3) or 'none'}.")
+    if unknown := [one.name for one in there if _ending(one) not in READERS]:
+        storage = excerpt(about.get("storage_identifier"))
+        raise TacpipeError(f"{path}: {plain(unknown[0])} is of the storage {storage}; mcap and sqlite3 are read.")
     compressed = str(about.get("compression_mode") or "").lower() == "message"
     return [_unpacked(one, stack) for one in there], compressed, notes
+
+
+def _ending(path: Path) -> str:
+    """Return the ending of a file, that below .zstd where it is compressed as a whole."""
+    return (path.with_suffix("") if path.suffix.lower() == ZSTD else path).suffix.lower()
 
 
 def _described(path: Path) -> dict[str, Any]:

@@ -46,8 +46,9 @@ def records(path: Path) -> Iterator[Record]:
                         raise _BrokenError(CUT_OFF)
                     file.seek(length, io.SEEK_CUR)
                     continue
-                memory.require(min(length, size - file.tell()), f"A record of {path}")
-                content = file.read(length)
+                there = min(length, size - file.tell())
+                memory.require(there, f"A record of {path}")
+                content = file.read(there)
                 if kind == CHUNK:
                     yield from reader.chunk(content, whole=len(content) == length)
                 elif len(content) == length:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from tacpipe.formats.bags.wire import TEXT, Leaf, Path, Shape
 
 MOST_COLUMNS = 4096  # of a stream; longer arrays of bytes are one column of bytes
-STAMP, FRAME = "header_ns", "frame_id"
 _XYZ = ("x", "y", "z")
+_STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))  # Foxglove's own messages and logs have no header
+_FRAMES = (("header", "frame_id"), ("frame_id",))
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,9 @@ def part(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> Part:
     several = {name for name, _ in places if sum(other == name for other, _ in places) > 1}
     for leaf in leaves:
         path = leaf.path[start:]
-        if path[-2:] == ("header", "stamp") and len(path) == 2:
+        if leaf.kind == "stamp" and path in _STAMPS:
             made.stamp = leaf
-        elif path == ("header", "frame_id"):
+        elif path in _FRAMES:
             made.frame = leaf
         elif path == ("header", "seq"):
             made.columns.append(Column("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
@@ -196,7 +197,7 @@ class _Joints:
 
 def _joint(leaf: Leaf, index: int, number: int, joint: str) -> Column:
     name, quantity, unit = _JOINT[str(leaf.path[0])]
-    if _SLIDES.search(joint):  # its unit would be m; a message does not say which joints slide
+    if _SLIDES.search(joint):  # its unit would be m; a message does not state which joints slide
         name, unit = f"joint{{}}_{leaf.path[0]}", ""
     return Column(name.format(number), leaf, index, _about(quantity, unit, joint=joint))
 

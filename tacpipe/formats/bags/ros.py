@@ -77,7 +77,7 @@ class Ros:
     types: Types
     cdr: bool
     _meaning: meanings.Meaning | None = None
-    _shapes: dict[bytes, list[Shape]] = field(default_factory=dict)  # by the first bytes, which say the byte order
+    _shapes: dict[bytes, list[Shape]] = field(default_factory=dict)  # by the first bytes, which state the byte order
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages, those of one shape together; raises `TopicError` where they are not of the type."""

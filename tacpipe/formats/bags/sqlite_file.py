@@ -16,6 +16,7 @@ from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Re
 from tacpipe.io import regular
 from tacpipe.printable import plain
 
+_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the second where a message of SQLite quotes damaged text
 MAGIC = b"SQLite format 3\0"
 
 
@@ -28,14 +29,17 @@ def records(path: Path) -> Iterator[Record]:
     with _connected(path) as connection:
         try:
             yield from _channels(connection)
-        except sqlite3.Error as error:
+        except _ERRORS as error:
             raise TacpipeError(f"{path} is not a bag of ROS 2: {plain(str(error), 120)}.") from error
         try:
             for number, log_ns, content in connection.execute(
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
             ):
+                if not (isinstance(number, int) and isinstance(log_ns, int) and isinstance(content, bytes)):
+                    yield Damage(f"{path} is damaged (a message has no time or no bytes): what came after is missing.")
+                    return
                 yield Message(number, log_ns, log_ns, content)
-        except sqlite3.Error as error:
+        except _ERRORS as error:
             yield Damage(f"{path} is damaged ({plain(str(error), 120)}): what came after is missing.")
 
 
@@ -51,6 +55,7 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
                 shutil.copy(one, copies)
             address = f"file:{quote(str(Path(copies, path.name)))}"
         connection = sqlite3.connect(address, uri=True)
+        connection.text_factory = lambda content: content.decode(errors="replace")
         try:
             yield connection
         finally:
@@ -62,10 +67,10 @@ def _channels(connection: sqlite3.Connection) -> Iterator[Record]:
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "message_definitions" in tables:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        definitions = {name: (kind, text.encode()) for name, kind, text in connection.execute(query)}
+        definitions = {str(name): (str(kind), str(text).encode()) for name, kind, text in connection.execute(query)}
     for number, topic, name, encoding in connection.execute("SELECT id, name, type, serialization_format FROM topics"):
-        kind, text = definitions.get(name, ("ros2msg", b""))
-        yield Channel(number, topic, ros.normal(name), encoding, kind, text)
+        kind, text = definitions.get(str(name), ("ros2msg", b""))
+        yield Channel(number, str(topic), ros.normal(str(name)), str(encoding), kind, text)
     if "schema" in tables:
         for (distribution,) in connection.execute("SELECT ros_distro FROM schema"):
-            yield Metadata("rosbag2", {"ros_distro": distribution or ""})
+            yield Metadata("rosbag2", {"ros_distro": str(distribution or "")})

@@ -1,4 +1,4 @@
-"""Containers: files that hold several streams and say themselves what is in them, as a bag, an HDF5 file or an XDF file.
+"""Containers: files that hold several streams and their own description, as a bag, an HDF5 file or an XDF file.
 
 A container is read by a `tacpipe.formats.containers.container.Container`, which a format implements: its episodes, what a
 look at it shows, and the streams of one episode read in one pass. Each stream comes as a `SourceStream`: its name inside the

@@ -29,7 +29,7 @@ class Time:
 
     @property
     def given(self) -> bool:
-        """Whether it says where stamps come from."""
+        """Whether it states where stamps come from."""
         return bool(self.column) or self.rate_hz is not None
 
 

@@ -21,9 +21,9 @@ LABELS = "labels"
 
 @dataclass(frozen=True)
 class Params:
-    """What the files do not say of themselves."""
+    """What the files do not state of themselves."""
 
-    layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not say; --guess prints one
+    layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not state; --guess prints one
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Command:
         return preview.text(layout, source, self._found(layout, source), self.kind)
 
     def guess(self, source: Path) -> str:
-        """Return the text of the layout that says what the first file itself declares."""
+        """Return the text of the layout that states what the first file itself declares."""
         from tacpipe.formats.table import declared
 
         return declared.layout(self.kind, source)

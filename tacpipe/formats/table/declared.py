@@ -20,7 +20,7 @@ _KINDS = {kind: name for name, kind in TYPES.items()}
 
 
 def layout(kind: str, source: Path) -> str:
-    """Return the text of the layout that says what the first container at or below ``source`` declares.
+    """Return the text of the layout that states what the first container at or below ``source`` declares.
 
     Given back with ``--layout`` it reads the same. Raises `UsageError` where there is no container.
     """
@@ -32,7 +32,7 @@ def layout(kind: str, source: Path) -> str:
 
 
 def of(contents: Contents, command: str, path: Path) -> str:
-    """Return the text of the layout that says what a container declares; ``command`` is the one that reads it."""
+    """Return the text of the layout that states what a container declares; ``command`` is the one that reads it."""
     parts = [
         f"# What {plain(path.name)} itself declares. Change what is wrong, remove streams that are not wanted, then look:\n"
         f"#   {command} FOLDER --layout THIS --dry-run"
@@ -46,7 +46,7 @@ def _stream(one: SourceStream) -> str:
     rows = "" if one.rows is None else f"  # {one.rows} rows"
     lines = [f"[streams.{one.name}]", f"source = {_quoted(one.source)}{rows}"]
     declared = f"# time = {_time(one.time)}, if nothing else is written here"
-    lines.append(declared if one.time.given else 'time = { rate_hz = "?" }  # the file does not say')
+    lines.append(declared if one.time.given else 'time = { rate_hz = "?" }  # not in the file')
     fields = [field for field in one.table.schema if field.name != one.time.column and not _is_time(field)]
     rules = [f"    {rule}" for rule in _rules(fields)]
     return "\n".join([*lines, *(["columns = [", *rules, "]"] if rules else [])])
@@ -89,7 +89,7 @@ def _rule(match: str, quantity: str, unit: str, kind: str) -> str:
         name for name, value in (("quantity", quantity), ("unit", unit)) if not value
     ]
     entries = [("match", match), ("quantity", quantity), ("unit", unit), ("type", kind)]
-    comment = f"  # the file does not say: {', '.join(unknown)}" if unknown else ""
+    comment = f"  # not in the file: {', '.join(unknown)}" if unknown else ""
     return (
         "{ "
         + ", ".join(f"{key} = {_quoted(value)}" for key, value in entries if value or key in (unknown or ()))

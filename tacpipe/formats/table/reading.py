@@ -94,7 +94,7 @@ def contained(path: Path, found: SourceStream, stream: Stream) -> pa.Table:
     stream = stream if stream.time.given else replace(stream, time=found.time)
     if not stream.time.given:
         raise TacpipeError(
-            f"{path} does not say when the rows of {plain(found.source)} were measured. Give time in "
+            f"{path} does not state when the rows of {plain(found.source)} were measured. Give time in "
             f"[streams.{stream.name}]: a column, or rate_hz."
         )
     declared = {one.name: one for one in found.table.schema}

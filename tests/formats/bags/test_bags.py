@@ -375,6 +375,29 @@ def test_metadata_that_names_a_missing_file_is_noted_and_the_others_are_read(tmp
     assert any("a_1.db3" in one for one in contents.notes)
 
 
+def test_a_folder_whose_file_was_renamed_is_read_and_says_so(tmp_path: Path) -> None:
+    bag = writers.ros2(tmp_path / "a", arm(TYPES), "sqlite3")
+    (bag / "a.db3").rename(bag / "b.db3")
+    contents = read(bag)
+    assert len(contents.streams) == 2
+    assert any("a.db3" in one for one in contents.notes)
+    (bag / "b.db3").unlink()
+    with pytest.raises(TacpipeError, match=r"a\.db3"):
+        read(bag)
+
+
+@pytest.mark.parametrize(
+    "text", ["rosbag2_bagfile_information: 5", "rosbag2_bagfile_information: {relative_file_paths: 5}"]
+)
+def test_metadata_that_are_none_are_refused_or_passed_over(tmp_path: Path, text: str) -> None:
+    bag = writers.ros2(tmp_path / "a", arm(TYPES), "sqlite3")
+    (bag / "metadata.yaml").write_text(text)
+    try:
+        assert len(read(bag).streams) == 2
+    except TacpipeError as error:
+        assert "metadata.yaml" in str(error)
+
+
 def test_a_split_bag_is_one_recording(tmp_path: Path) -> None:
     whole, half = arm(TYPES), FRAMES // 2 * 2
     bag = writers.ros2(tmp_path / "a", whole[:half], "sqlite3")
