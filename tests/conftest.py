@@ -77,13 +77,18 @@ def name_signals() -> None:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--every", type=int, default=1, help="Run one of so many of the tests that were chosen.")
+    parser.addoption("--slow", default="1/1", help="K/N: of those marked long or rig, run each Nth from the Kth.")
 
 
 @pytest.hookimpl(trylast=True)  # after markers chose what runs
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     every: int = config.getoption("--every")
-    config.hook.pytest_deselected(items=[item for number, item in enumerate(items) if number % every])
-    items[:] = items[::every]
+    first, _, share = config.getoption("--slow").partition("/")
+    slow = [item for item in items if item.get_closest_marker("long") or item.get_closest_marker("rig")]
+    left = {id(item) for number, item in enumerate(slow, 1) if (number - int(first)) % int(share)}
+    left |= {id(item) for number, item in enumerate(items) if number % every}
+    config.hook.pytest_deselected(items=[item for item in items if id(item) in left])
+    items[:] = [item for item in items if id(item) not in left]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -168,12 +173,12 @@ def lab(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, call: Cal
     forget()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project in which the forward chain has run; tests may add to it, but change nothing that is there."""
     from tests import chain
 
-    folder = tmp_path_factory.mktemp("chained") / "project"  # a worker's own: nobody else's commands run there
+    folder = tmp_path_factory.mktemp("chained") / "project"  # a module's own: no other's results lie in its store
     return shutil.copytree(made_once(tmp_path_factory, "chain", chain.run), folder, symlinks=True)
 
 
