@@ -248,6 +248,11 @@ BOARDS: dict[str, dict[str, Any]] = {
         "prefix": "$SKIN,",
         "sum": {"kind": "xor8", "begin": "$"},
     },
+    "a dollar and a sum": {
+        "columns": [{"name": "taxel{1..4}"}],
+        "prefix": "$",
+        "sum": {"kind": "xor8", "begin": "$"},
+    },
     "a CRC": {
         "columns": [{"name": "taxel{1..4}", "type": "i32", "unit": "count"}],
         "sum": {"kind": "crc16-modbus", "mark": ","},
