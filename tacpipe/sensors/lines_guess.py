@@ -92,7 +92,8 @@ def _lines(data: Chunks) -> tuple[list[str], Times]:
     stop = data.data.rfind(b"\n")
     raw = data.data[: stop + 1].split(b"\n")[:-1]
     ends = np.cumsum([len(line) + 1 for line in raw]) - 1 if raw else np.zeros(0, dtype=np.int64)
-    raw, ends = raw[1 : MOST + 1], ends[1 : MOST + 1]
+    first = int(not (raw and raw[0].startswith(tuple(mark.encode() for mark in COMMENTS))))  # others may be cut off
+    raw, ends = raw[first : MOST + 1], ends[first : MOST + 1]
     try:
         lines = [line.strip().decode("ascii") for line in raw]
     except UnicodeDecodeError:

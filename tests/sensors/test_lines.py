@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -10,7 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tacpipe.cli import sensors
 from tacpipe.errors import UsageError
+from tacpipe.links.probing import Report
+from tacpipe.links.recognition import recognise
 from tacpipe.recording import rig
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors import lines_guess
@@ -303,3 +307,18 @@ def test_a_header_that_the_board_prints_names_the_columns() -> None:
 )
 def test_what_is_no_lines_of_numbers_gives_no_guess(text: bytes) -> None:
     assert lines_guess.of(Chunks.of([(0, text)] if text else [])) == []
+
+
+def test_what_a_probe_prints_is_a_rig_file_that_reads_the_board_and_says_what_is_a_guess() -> None:
+    board = lines(**BOARDS["counter and clock"], prefix="$SKIN,", sum={"kind": "xor8", "begin": "$"}, comments=["#"])
+    count = np.arange(200)
+    counts = np.random.default_rng(1).integers(-500, 500, (200, 2)).astype(np.int32)
+    encoded = [b"# boot of the board", *board.encode(Samples((counts,), seq=count, t_device_ns=count * 10**7))]
+    data = Chunks.of([(row * 10**7, line + b"\r\n") for row, line in enumerate(encoded)])
+
+    text = sensors._text(Report("serial:/dev/ttyACM0", recognise(data, "serial"), 9600, heard=len(data.data)))
+
+    stanza = text[text.index("[[stream]]") :]
+    found = rig.parse(stanza).streams["lines"]
+    assert found.sensor == dataclasses.replace(board, baud=9600)
+    assert [line.split("=")[0].strip() for line in stanza.split("\n") if "# a guess" in line] == ["sequence", "clock"]
