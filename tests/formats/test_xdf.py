@@ -48,11 +48,14 @@ def stamps(table: pa.Table, name: str = "t_ns") -> Any:
     return table.column(name).to_numpy()
 
 
-def force(path: Path, drift: float = 0.0, set_by_s: float = 0.0, rows: int = 6000, noise_s: float = 0.0) -> Any:
-    """Write a stream of 100 Hz whose clock drifts, and is set halfway; return the true times in seconds."""
+def force(
+    path: Path, drift: float = 0.0, set_by_s: float = 0.0, rows: int = 6000, noise_s: float = 0.0, later: int = 0
+) -> Any:
+    """Write a stream of 100 Hz whose clock drifts, and is set ``later`` rows than halfway; return the true times in s."""
     true_s = 1000.0 + np.arange(rows) / 100
     sent_s = 50_000.0 + (true_s - 1000.0) / (1 + drift)
-    sent_s[rows // 2 :] += set_by_s
+    reset = rows // 2 + later
+    sent_s[reset:] += set_by_s
     writer = Writer()
     writer.stream(1, "force", "float32", 3, labels=[("Fx", "N", ""), ("Fy", "newtons", ""), ("Fz", "N", "")])
     for start in range(0, rows, 50):
@@ -107,11 +110,12 @@ def test_stamps_on_the_recorders_clock_are_true_and_near_those_of_pyxdf(tmp_path
     assert found.attributes["force_lsl_clock_resets"] == 0
 
 
+@pytest.mark.parametrize("later", [0, 1, 237, 499])
 @pytest.mark.parametrize("set_by_s", [-49_000.0, -60.0, 500.0])
 def test_after_a_reset_of_the_senders_clock_stamps_are_true_as_those_of_pyxdf_are(
-    tmp_path: Path, set_by_s: float
+    tmp_path: Path, set_by_s: float, later: int
 ) -> None:
-    true_s = force(tmp_path / "run.xdf", 50e-6, set_by_s, rows=20_000, noise_s=50e-6)
+    true_s = force(tmp_path / "run.xdf", 50e-6, set_by_s, rows=20_000, noise_s=50e-6, later=later)
     found = read(tmp_path / "run.xdf")
     other = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
     t_s = stamps(found.streams["force"]) / 1e9
