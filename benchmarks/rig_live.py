@@ -22,7 +22,8 @@ import pyarrow as pa
 import tacpipe
 from tacpipe.cli.emulate import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import byte_faults, rig_file
+from tacpipe.recording import rig_text
+from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.testing import matching
@@ -57,7 +58,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="tacpipe-live-") as name:
         folder = Path(name)
         with Emulator(rig, faults=byte_faults.parse(chosen.faults), folder=folder / "emulated") as emulator:
-            (folder / "rig.toml").write_text(rig_file.text(emulator.rig))
+            (folder / "rig.toml").write_text(rig_text.of(emulator.rig))
             words = ["acquire", str(folder / "rig.toml"), "-o", str(folder / "rec"), "--quiet"]
             os.environ["TACPIPE_STORE"] = str(folder / "store")
             done = subprocess.run([str(BIN / "tacpipe"), *words, "--duration", str(60 * chosen.minutes)], check=False)

@@ -24,7 +24,7 @@ from tests import without_extras
 from tests.clouds import shapes
 from tests.commands import run as run_all
 from tests.conftest import Lab, forget
-from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.lerobot import files as lerobot_files
 from tests.promises.warm import Warm, serving
@@ -50,6 +50,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "export csv data/recordings -o {o}",
     "export card data/recordings -o {o}",
     "export lerobot data/synced -o {o}",
+    "ingest xdf sessions -o {o}",
     "version",
     "synchronize data/recordings -o {o} --rate-hz 20",
     "segment contacts data/synced -o {o} --pad-s 0.4",
@@ -101,6 +102,8 @@ LACK = {  # and for each that does need one, with that extra
     "acquire ws.toml -o {o}": "devices",
     "acquire can.toml -o {o}": "devices",
     "acquire camera.toml -o {o}": "clouds",
+    "acquire lsl.toml -o {o}": "lsl",
+    "sensors probe lsl:wrist": "lsl",
     "sensors probe": "devices",
     "sensors probe /dev/null": "devices",
     "sensors probe hid:16c0:0486": "devices",
@@ -115,6 +118,7 @@ RIGS = {
     "ws": ("xela", "ws:127.0.0.1:1"),
     "can": ("icub-skin", "can:virtual:none"),
     "camera": ("clouds", "camera:0"),
+    "lsl": ("lsl", "lsl:wrist"),
 }
 INPUTS = (
     "simulate material --trials 2 -o data/touched",
@@ -148,6 +152,11 @@ def prepare(folder: Path) -> None:
     array_files.replay(folder / "stores" / "replay.zarr")
     (folder / "rate.toml").write_text('[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n')
     lerobot_files.write_v2(folder / "sets" / "pick", episodes=1)
+    (folder / "sessions").mkdir()
+    session = xdf_writer.Writer()
+    session.stream(1, "force")
+    session.numbers(1, "float32", [1.0, 1.01], [[0.5], [0.75]])
+    session.write(folder / "sessions" / "a.xdf")
     (folder / "bags").mkdir()
     (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():

@@ -119,7 +119,7 @@ def add(program: typer.Typer, summary: str) -> None:
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe.datasets import directory
     from tacpipe.io.termination import Ended
-    from tacpipe.recording import appending, header, trials, triggers
+    from tacpipe.recording import appending, completing, header, trials, triggers
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import View
 
@@ -135,7 +135,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     store.prepare()
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
-    recorder = Recorder(rig)
+    recorder = Recorder(completing.completed(rig))
     with Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(ended)
         recorded, lost = trials.run(recorder, store, plan, view, ended)
@@ -190,10 +190,11 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     from dataclasses import asdict
 
     from tacpipe.io.termination import Ended
-    from tacpipe.recording import clock
+    from tacpipe.recording import clock, completing
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import line
 
+    rig = completing.completed(rig)
     recorder = Recorder(rig)
     with Ended() as ended, recorder.open():
         recorder.await_first(ended)

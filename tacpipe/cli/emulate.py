@@ -38,8 +38,9 @@ def emulate(
     from tacpipe.datasets import replacing
     from tacpipe.io.files import readable_errors, write_whole
     from tacpipe.io.termination import Ended
+    from tacpipe.recording import rig_text
     from tacpipe.recording.rig import read
-    from tacpipe.simulation.emulation import byte_faults, rig_file
+    from tacpipe.simulation.emulation import byte_faults
     from tacpipe.simulation.emulation.emulator import Emulator
 
     asked, wrong, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
@@ -47,7 +48,7 @@ def emulate(
     sys.setswitchinterval(SWITCH_S)
     with Ended() as ended, readable_errors(output):
         with Emulator(asked, seed, wrong, output) as emulator:
-            write_whole(str(path), rig_file.text(emulator.rig).encode(), f"{path}.draft")
+            write_whole(str(path), rig_text.of(emulator.rig).encode(), f"{path}.draft")
             terminal.result(path)
             for name, stream in emulator.rig.streams.items():
                 terminal.note(f"{name}: {stream.kind} at {stream.address}")

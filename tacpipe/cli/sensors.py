@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
+from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tacpipe.errors import DEVICE, TacpipeError
-from tacpipe.io import terminal
+from tacpipe.io import terminal, toml
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
@@ -135,9 +135,8 @@ def _text(report: Report) -> str:
     if not report.heard and not report.findings:
         return f"{report.address}: no bytes, whichever driver asked. Check that the device is switched on."
     if not report.findings:
-        return (
-            f"{report.address}: {report.heard:,} bytes came that match no driver; describe the sensor with `generic`."
-        )
+        described = f"{report.address}: {report.heard:,} bytes came that match no driver"
+        return f"{described}; describe the sensor with `generic`, or with `lines` if it sends text."
     first, *others = report.findings
     at = f" at {report.baud:,} baud" if report.baud else ""
     when = " once asked" if report.asked else ""
@@ -147,19 +146,31 @@ def _text(report: Report) -> str:
 
 
 def _stanza(report: Report) -> list[str]:
-    """Return what to write into a rig file for the likeliest sensor."""
+    """Return what to write into a rig file for the likeliest sensor, with what is a guess said to be one."""
     candidate = report.findings[0].candidate
     options = dict(candidate.options)
     if report.baud and report.baud != type(candidate.sensor).__dict__.get("baud"):
         options["baud"] = report.baud
-    written = ", ".join(f"{name} = {json.dumps(value)}" for name, value in options.items())
+    notes = candidate.sensor.guesses
     return [
         "[[stream]]",
         f'name = "{candidate.kind.replace("-", "_")}"',
         f'sensor = "{candidate.kind}"',
         f'transport = "{report.address}"',
-        *([f"options = {{ {written} }}"] if written else []),
+        *(_described(options, notes) if notes else [f"options = {toml.value(options)}"] if options else []),
     ]
+
+
+def _described(options: Mapping[str, Any], notes: Mapping[str, str]) -> list[str]:
+    """Return options as a table, one a line, a list of tables over several, each with what it rests on."""
+    lines = ["", "[stream.options]"]
+    for name, value in options.items():
+        note = f"  # {notes[name]}" if name in notes else ""
+        if isinstance(value, list) and any(isinstance(one, Mapping) for one in value):
+            lines += [f"{name} = [{note}", *(f"    {toml.value(one)}," for one in value), "]"]
+        else:
+            lines.append(f"{name} = {toml.value(value)}{note}")
+    return lines
 
 
 def _json(report: Report) -> dict[str, Any]:

@@ -19,6 +19,7 @@ SCHEMES = {
     "can": "can:socketcan:can0",
     "folder": "folder:/data/clouds",
     "camera": "camera:0",
+    "lsl": "lsl:NAME, or lsl:?type=Force&source_id=ft-7",
 }
 LONGEST = 4096  # characters of a place, as of a path
 

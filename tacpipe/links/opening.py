@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tacpipe.links import camera, can, folder, hid, serial_port, tcp, udp, websocket
+from tacpipe.links import camera, can, folder, hid, lsl, serial_port, tcp, udp, websocket
 from tacpipe.links.link import Address, Link
 from tacpipe.sensors.sensor import Sensor
 
@@ -18,6 +18,7 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
     "can": can.open_can,
     "folder": folder.open_folder,
     "camera": camera.open_camera,
+    "lsl": lsl.open_lsl,
 }
 
 

@@ -22,6 +22,7 @@ BOOT_S = 2.5  # that an Arduino may be silent for when its port is opened
 FIRST_S = 0.5  # that the first byte is awaited for, of a device that is awake
 LISTEN_S = 1.0  # from the first byte on
 REPLY_S = 0.5  # that a reply is awaited for
+TEXT_BAUDS = (9600, 57_600, 38_400, 230_400, 250_000, 500_000)  # that boards which print lines are set to
 REQUESTS = 20  # to a device that must be asked for each frame
 Progress = Callable[[str], None]
 
@@ -140,7 +141,7 @@ def _bauds(usb_id: str) -> list[int]:
     known = _by_usb(candidates(Chunks.of([]), "serial"), usb_id)
     counted = Counter(candidate.sensor.baud for candidate in {found.kind: found for found in known}.values())
     first = [candidate.sensor.baud for candidate in known if usb_id and usb_id in candidate.sensor.usb_ids]
-    return list(dict.fromkeys([*first, *(baud for baud, _ in counted.most_common())]))
+    return list(dict.fromkeys([*first, *(baud for baud, _ in counted.most_common()), *TEXT_BAUDS]))
 
 
 def _by_usb(found: list[Candidate], usb_id: str) -> list[Candidate]:

@@ -22,6 +22,7 @@ PACKETS = (
     "can",
     "folder",
     "camera",
+    "lsl",
 )  # kinds of links whose chunks have a size that states
 MOST = 1 << 18  # bytes that are looked at
 CERTAIN = 0.8  # fraction of the bytes beyond chance from which on there is no doubt
@@ -38,7 +39,11 @@ class Candidate:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        described = ", ".join(f"{name} = {value}" for name, value in self.options.items())
+        described = ", ".join(
+            f"{len(value)} {name}" if isinstance(value, list) else f"{name} = {value}"
+            for name, value in self.options.items()
+            if not isinstance(value, dict)
+        )
         return f"{self.kind} ({described})" if described else self.kind
 
 
@@ -97,25 +102,30 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[Candidate] | None = N
     if not data.data:
         return []
     data = _first(data)
-    shuffled = _shuffled(data)
+    shuffled, noise = _shuffled(data), _noise(data)
     found = []
     for candidate in candidates(data, scheme) if sensors is None else sensors:
         frames, part, rate_hz = _tried(candidate.sensor, data)
         if frames < FEWEST or part < POSSIBLE:
             continue
-        _, chance, _ = _tried(candidate.sensor, shuffled)
+        # Digits in any order are lines of one number: what is described by the bytes is compared with any bytes at all.
+        _, chance, _ = _tried(candidate.sensor, noise if candidate.sensor.described else shuffled)
         finding = Finding(candidate, frames, rate_hz, len(data.data), part, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
             found.append(finding)
     return sorted(found, key=_rank)
 
 
-def _rank(finding: Finding) -> tuple[float, float, float, int]:
-    """Return what findings are sorted by: evidence in steps, because a cut frame decides nothing, then the rate."""
+def _rank(finding: Finding) -> tuple[float, bool, float, float, int]:
+    """Return what findings are sorted by: evidence in steps, because a cut frame decides nothing, then the rate.
+
+    A product comes before a board that the bytes themselves describe.
+    """
     expected_hz = finding.candidate.sensor.rate_hz
     off = abs(np.log(finding.rate_hz / expected_hz)) if finding.rate_hz > 0 and expected_hz > 0 else np.inf
     return (
         -round(finding.evidence, 1),
+        finding.candidate.sensor.described,
         -round(finding.explained, 1),
         round(float(off), 1),
         len(finding.candidate.options),
@@ -138,6 +148,10 @@ def _first(data: Chunks) -> Chunks:
         return data
     count = max(1, int(np.searchsorted(np.cumsum(data.size), MOST, side="right")))
     return Chunks(data.t_ns[:count], data.size[:count], data.data[: int(data.size[:count].sum())])
+
+
+def _noise(data: Chunks) -> Chunks:
+    return Chunks(data.t_ns, data.size, np.random.default_rng(0).bytes(len(data.data)))
 
 
 def _shuffled(data: Chunks) -> Chunks:

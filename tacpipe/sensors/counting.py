@@ -35,7 +35,8 @@ class Counting:
     def __init__(self, modulus: int, rate_hz: float, step: int = 1) -> None:
         self.modulus, self.rate_hz, self.step = modulus, rate_hz, step
         self._last: tuple[int, int, int] | None = None  # highest count as sent, unrolled, and its arrival
-        self._before: int | None = None  # what was sent last before a reset, which may have been a single false count
+        # What was sent last before a reset, which may have been a single false count, and the places that this one took.
+        self._before: tuple[int, int] | None = None
         self._doubted = False  # whether the device may have begun anew since
 
     def reopened(self) -> None:
@@ -94,12 +95,13 @@ class Counting:
         return Counted(np.array([last_seq + steps]), np.array([steps - 1]), nothing, nothing, np.array([reset]))
 
     def _went_on(self, raw: int) -> int:
-        """Return by how much a count continues from where it was before a reset, 0 where it does not."""
+        """Return by how much a count continues behind a false one, as if that had been right; 0 where it does not."""
         if self._before is None:
             return 0
+        before, taken = self._before
         half = self.modulus // 2
-        steps, off = divmod((raw - self._before + half) % self.modulus - half, self.step)
-        return steps if not off and 0 < steps <= RESET_SLACK else 0
+        steps, off = divmod((raw - before + half) % self.modulus - half, self.step)
+        return max(1, steps - taken) if not off and 0 < steps <= RESET_SLACK else 0
 
     def _slowly(self, raw: Int64s, t_ns: Times, last_raw: int, last_seq: int, last_ns: int, *, first: bool) -> Counted:
         seq, missing = np.zeros(len(raw), dtype=np.int64), np.zeros(len(raw), dtype=np.int64)
@@ -115,14 +117,15 @@ class Counting:
             if first:
                 first, steps = False, 0
             elif went_on and steps != 1:
-                steps = max(1, went_on - 1)  # the false one has taken a place
+                steps = went_on
                 reset[row], missing[row] = True, steps - 1
             elif (
                 off
                 or steps > (RESET_TIMES * expected + RESET_SLACK if self.rate_hz else _most(at_ns - last_ns))
                 or (steps < 0 and (steps < -RESET_SLACK or at_ns - last_ns > LATE_NS))
             ):
-                steps, self._before = max(1, round(expected)), last_raw
+                steps = max(1, round(expected))
+                self._before = last_raw, steps
                 reset[row], missing[row] = True, steps - 1
             elif steps > 0:
                 missing[row] = steps - 1

@@ -291,17 +291,18 @@ class Generic(Sensor):
     def device(self) -> Device:
         """Return a board that streams from the start, or from when it hears ``start`` until it hears ``stop``."""
         start, stop = _bytes("start", self.start), _bytes("stop", self.stop)
-        return _Board(streaming=not start, start=start, stop=stop)
+        return Board(streaming=not start, start=start, stop=stop)
 
 
 @dataclass
-class _Board(Device):
+class Board(Device):
     """The board's side: streams after ``start`` and not after ``stop``, whichever was heard last."""
 
     start: bytes = b""
     stop: bytes = b""
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Take what the host wrote; nothing is replied."""
         self.heard += data
         started = self.heard.rfind(self.start) if self.start else -1
         stopped = self.heard.rfind(self.stop) if self.stop else -1

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 SPACES = b" \t\r\n"
+BLANKS = b" \t"  # that may stand around a separator
 NEWLINE = 0x0A
 MOST_BYTES = (1 << 31) - 1  # that 32-bit places in a text reach
 NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # of an XML text, between its marks
@@ -30,19 +31,46 @@ APART = b"\0"  # between texts: no XML holds it
 
 def of_lines(lines: Sequence[bytes], width: int) -> Floats | None:
     """Return the numbers (line, number) of lines that hold ``width`` each, with space between; None where one does not."""
+    texts = cells(lines, width)
+    numbers = None if texts is None else floats(texts)
+    return None if numbers is None else numbers.reshape(len(lines), width)
+
+
+def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Array | None:
+    """Return the cells of lines (line times cell), one after another; None where a line has not ``width`` of them.
+
+    ``separator`` is the byte between cells, which may have spaces around it; without one it is space of any length.
+
+    >>> cells([b"1, 2", b",-3"], 2, b",").to_pylist()
+    ['1', '2', '', '-3']
+    """
     text = b"\n".join(lines) + b"\n"
+    if not separator:
+        return _spaced_cells(text, len(lines), width)
+    blanks = BLANKS.replace(separator, b"")
+    if any(blank in text for blank in (b" ", b"\t") if blank in blanks):
+        if re.search(rb"[^\s%b][%b]+[^\s%b]" % (re.escape(separator), blanks, re.escape(separator)), text):
+            return None  # space within a cell
+        text = text.translate(None, blanks)
+    data = np.frombuffer(text, np.uint8)
+    marks = np.flatnonzero((data == separator[0]) | (data == NEWLINE))
+    if len(marks) != len(lines) * width or (data[marks[width - 1 :: width]] != NEWLINE).any():
+        return None
+    ends = marks - np.arange(len(marks))  # of cells within the text without its separators
+    return _texts(text.translate(None, separator + b"\n"), np.concatenate([[0], ends]))
+
+
+def _spaced_cells(text: bytes, count: int, width: int) -> pa.Array | None:
     data = np.frombuffer(text, np.uint8)
     spaces = np.flatnonzero(data <= SPACES[0])
     solid = text.translate(None, SPACES)
     if len(solid) + len(spaces) != len(text):
         return None  # another character below the space
-    ends = spaces - np.arange(len(spaces))  # of numbers within ``solid``, and again where spaces follow one another
+    ends = spaces - np.arange(len(spaces))  # of cells within ``solid``, and again where spaces follow one another
     last = np.flatnonzero(ends != np.concatenate([[0], ends[:-1]]))
-    if len(last) != len(lines) * width or (data[spaces[last[width - 1 :: width]]] != NEWLINE).any():
+    if len(last) != count * width or (data[spaces[last[width - 1 :: width]]] != NEWLINE).any():
         return None
-    texts = _texts(solid, np.concatenate([[0], ends[last]]))
-    numbers = None if texts is None else floats(texts)
-    return None if numbers is None else numbers.reshape(len(lines), width)
+    return _texts(solid, np.concatenate([[0], ends[last]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,28 +136,48 @@ def _texts(text: bytes, edges: Int64s) -> pa.Array | None:
 
 def taken(texts: pa.Array, rows: range) -> pa.Array:
     """Return some of the texts."""
+    return at(texts, np.arange(rows.start, rows.stop, rows.step))
+
+
+def at(texts: pa.Array, places: Int64s) -> pa.Array:
+    """Return the texts at some places."""
     import pyarrow as pa
 
-    places = np.arange(rows.start, rows.stop, rows.step)
     return texts.take(pa.Array.from_buffers(pa.int64(), len(places), [None, pa.py_buffer(places)]))
+
+
+def joined(texts: pa.Array) -> bytes:
+    """Return all texts as one, without anything between them."""
+    _, offsets, data = texts.buffers()
+    ends = np.frombuffer(offsets, np.int32)[texts.offset : texts.offset + len(texts) + 1]
+    return data.to_pybytes()[int(ends[0]) : int(ends[-1])] if data is not None else b""
+
+
+def replaced(texts: pa.Array, text: bytes) -> pa.Array:
+    """Return texts as long as these, cut from one that is as long as all of them."""
+    import pyarrow as pa
+
+    _, offsets, _ = texts.buffers()
+    ends = np.frombuffer(offsets, np.int32)[texts.offset : texts.offset + len(texts) + 1]
+    return pa.StringArray.from_buffers(len(texts), pa.py_buffer((ends - ends[0]).astype(np.int32)), pa.py_buffer(text))
 
 
 def floats(texts: pa.Array) -> Floats | None:
     """Return the numbers (text,) of texts; None where one is none."""
-    return _cast(texts, np.dtype(np.float64))
+    return cast(texts, np.dtype(np.float64))
 
 
 def wholes(texts: pa.Array) -> Int64s | None:
     """Return the whole numbers (text,) of texts; None where one is none."""
-    return _cast(texts, np.dtype(np.int64))
+    return cast(texts, np.dtype(np.int64))
 
 
-def _cast(texts: pa.Array, kind: np.dtype[Any]) -> AnyArray | None:
+def cast(texts: pa.Array, kind: np.dtype[Any]) -> AnyArray | None:
     """Return the numbers (text,) in the buffer that holds them: pyarrow would import pandas to make an array of them."""
     import pyarrow as pa
 
     try:
-        cast = texts.cast(kind.name)
+        numbers = texts.cast(kind.name)
     except pa.ArrowInvalid:
         return None
-    return np.frombuffer(cast.buffers()[1], kind, len(texts))
+    return np.frombuffer(numbers.buffers()[1], kind, len(texts))

@@ -100,6 +100,10 @@ class Sensor:
     exclusive: ClassVar[str] = ""  # what else cannot use the device meanwhile; a sentence, empty: nothing
     usb_ids: ClassVar[tuple[str, ...]] = ()  # "16d0:14cc": vendor and product, where the product has its own
     usage_page: ClassVar[int | None] = None  # of the HID interface that samples come by, where a device has several
+    described: ClassVar[bool] = False  # its frames are what the rig file states, so that those of any board may fit
+    guesses: ClassVar[Mapping[str, str]] = {}  # what a probe's guess of each of its options rests on
+
+    incomplete: ClassVar[bool] = False  # options are missing that the device itself states when it is opened
 
     rate_hz: float  # samples a second; 0: none is known
     baud: int  # of a serial port

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from tacpipe.sensors import lines_guess, lsl
 from tacpipe.sensors.framing import Chunks
 
 Options = dict[str, Any]
@@ -17,6 +18,7 @@ GRIDS = {
     1024: (32, 32),
 }  # taxels to rows and columns of boards that are known
 LEAST_TAXELS = 64  # of a board that is not known: many others mark their frames with the same two bytes
+LEAST_DEGC, MOST_DEGC = -40.0, 85.0  # that the magnetometers of an AnySkin work at
 MOST_TRIED = 3  # distances between marks, the commonest first
 
 
@@ -28,6 +30,10 @@ def of(kind: str, data: Chunks) -> list[Options]:
     >>> of("biotac", Chunks.of([]))
     [{}]
     """
+    if kind == "lines":  # arrivals state more than bytes: the rate, and which number is a clock
+        return lines_guess.of(data)
+    if kind == "lsl":
+        return lsl.options(data)
     return VARIANTS[kind](data.data) if kind in VARIANTS else [{}]
 
 
@@ -54,9 +60,19 @@ def _flexitac(data: bytes) -> list[Options]:
 def _anyskin(data: bytes) -> list[Options]:
     sizes = [distance - 2 for distance in distances(data, b"\r\n")]
     binary = [{"magnetometers": size // 16} for size in sizes if size and size % 16 == 0]
-    words = {len(line.split()) for line in data.split(b"\n")[1:4]}
-    text = [{"mode": "ascii", "magnetometers": count // 4} for count in sorted(words) if count and count % 4 == 0]
+    lines = [line.split() for line in data.split(b"\n")[1:4] if _has_temperatures(line.split())]
+    text = [{"mode": "ascii", "magnetometers": count // 4} for count in sorted({len(words) for words in lines})]
     return [*binary, *text] or [{}]
+
+
+def _has_temperatures(words: Sequence[bytes]) -> bool:
+    """Return whether every fourth word can be the temperature of a chip in degrees, as AnySkin sends it with decimals."""
+    try:
+        return len(words) % 4 == 0 < len(words) and all(
+            b"." in word and LEAST_DEGC <= float(word) <= MOST_DEGC for word in words[::4]
+        )
+    except ValueError:
+        return False
 
 
 def _justfloat(data: bytes) -> list[Options]:

@@ -39,7 +39,7 @@ from tacpipe.plugins.stage import Source
 from tacpipe.recording import header, rig, spool
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
-from tests.formats import grasp_files, slide_files, xela_files
+from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.bags import writers
 from tests.formats.lerobot import files as lerobot_files
@@ -280,6 +280,19 @@ def _episodes(folder: Path) -> None:
     lerobot_files.write_v3(folder / "three")
 
 
+def _session(folder: Path) -> None:
+    session = xdf_writer.Writer()
+    session.stream(1, "force", "int16", 2)
+    session.stream(2, "marks", "string", rate_hz=0)
+    for start in range(3):
+        session.offset(1, float(start), 0.5)
+        session.numbers(1, "int16", [start + 0.1, None, start + 0.3], [[start, 1], [2, 3], [4, 5]])
+        session.texts(2, [start + 0.2], ["go"])
+        session.boundary()
+    session.footer(1, 9)
+    session.write(folder / "a.xdf")
+
+
 def _bags(folder: Path) -> None:
     types, types1 = writers.store(), writers.store(ros1=True)
     for name, made in (("a", types), ("b", types), ("c.bag", types1)):
@@ -314,6 +327,7 @@ TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of 
     "roboskin": _roboskin,
     "table": _tables,
     "vision2tactile": _grasps,
+    "xdf": _session,
     "xela-flat": lambda folder: xela_files.write_flat(folder / "data_sample_a"),
     "xela-psc": lambda folder: xela_files.write_psc(folder / "data_sample_a"),
     "zarr": _stores,

@@ -211,6 +211,7 @@ CONSTRAINED: dict[str, Callable[[Columns, Sensor], Columns]] = {
 }
 CLOCKS = {  # tick in ns and modulus of device clocks that are coarser than 1 ns or go round
     "contactile": (1000, 1 << 50),
+    "lines": (1000, 1 << 32),
     "weiss-wts": (10_000, 1 << 32),
 }
 BY_OUTPUT: dict[str, Any] = {"kuka-rsi": [], "tap": [], "ur-rtde": np.zeros((0, 4), dtype=np.uint8)}  # and no frames
@@ -228,4 +229,15 @@ OPTIONS: dict[str, dict[str, Any]] = {  # of sensors that are nothing without
         "sum": {"kind": "sum16", "number": "check"},
     },
     "justfloat": {"channels": 20},
+    "lines": {
+        "rate_hz": 100,
+        "columns": [
+            {"name": "count", "type": "u16"},
+            {"name": "micros", "type": "u32"},
+            {"name": "taxel{1..6}", "type": "u16", "unit": "count"},
+            {"name": "tilt_{x,y,z}", "unit": "deg", "quantity": "angle"},
+        ],
+        "sequence": {"column": "count"},
+        "clock": {"column": "micros", "unit": "us"},
+    },
 }

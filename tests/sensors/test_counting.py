@@ -136,3 +136,14 @@ def test_a_program_of_unknown_rate_loses_what_its_count_says_up_to_what_time_all
         found = counting.feed(np.array([7 + gone]), np.array([round(gap_s * 1e9)]))
 
         assert found.missing.tolist() == [gone - 1] and not found.reset.any()
+
+
+def test_a_false_count_behind_a_lost_sample_costs_that_one_alone() -> None:
+    raw = np.array([9911, 9912, 999_914, 9915, 9916])  # 9913 is lost, 9914 garbled
+    t_ns = np.array([0, 10, 30, 40, 50]) * 1_000_000
+    counting = Counting(1 << 32, 100.0)
+
+    found = [counting.feed(raw[row : row + 1], t_ns[row : row + 1]) for row in range(len(raw))]
+
+    assert [int(one.seq[0]) for one in found] == [9911, 9912, 9914, 9915, 9916]
+    assert sum(int(one.missing.sum()) for one in found) == 1

@@ -23,6 +23,42 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # settings that change a se
     "biotac of three fingers": ("biotac", {"fingers": 3}),
     "contactile with slip": ("contactile", {"slip": True}),
     "icub-skin of the older configuration": ("icub-skin", {"old": True, "triangles": [0, 3]}),
+    "lines of NMEA": (
+        "lines",
+        {
+            "rate_hz": 100,
+            "columns": [{"name": "taxel{1..4}_{x,y,z}", "type": "i16"}, {"name": "load", "type": "f64"}],
+            "prefix": "$SKIN,",
+            "sum": {"kind": "xor8", "begin": "$"},
+        },
+    ),
+    "lines with a sum of 16 bits": (
+        "lines",
+        {
+            "rate_hz": 100,
+            "columns": [{"name": "ignored", "skip": True}, {"name": "taxel{1..8}"}],
+            "separator": " ",
+            "sum": {"kind": "crc16-modbus", "mark": " "},
+            "comments": ["#"],
+        },
+    ),
+    "lines with labels": (
+        "lines",
+        {
+            "rate_hz": 100,
+            "columns": [{"name": "force_{x,y,z}", "label": "F{x,y,z}=", "quantity": "force"}],
+            "separator": ";",
+            "decimal": ",",
+            "missing": ["ovf"],
+            "suffix": ";",
+        },
+    ),
+    "lsl of forces": (
+        "lsl",
+        {"channels": [{"name": f"f{axis}", "unit": "N", "quantity": "force", "component": axis} for axis in "xyz"]},
+    ),
+    "lsl of doubles": ("lsl", {"channels": [{"name": "a"}, {"name": "b"}], "format": "double64", "rate_hz": 250}),
+    "lsl of markers": ("lsl", {"channels": [{"name": "event"}], "format": "string"}),
     "optoforce of three axes": ("optoforce", {"axes": 3}),
     "spacemouse that splits": ("spacemouse", {"split": True}),
     "tfmini, the original": ("tfmini", {"model": "original"}),

@@ -49,9 +49,9 @@ def test_the_table_says_of_a_sensor_what_its_class_does(name: str) -> None:
 
     assert links.split(", ") == list(kind.links)
     assert exclusive == ("yes" if kind.exclusive else "no")
-    if name not in ("generic", "tap"):
+    if name not in ("generic", "lines", "tap"):
         assert (counts != "no") == (kind.counter is not None)
-    if name != "generic":
+    if name not in ("generic", "lines"):
         assert float(rate or 0) == kind.rate_hz
 
 
@@ -60,7 +60,15 @@ def test_the_rig_files_are_rigs() -> None:
 
     streams = {name: stream for block in told for name, stream in rig.parse(block).streams.items()}
 
-    assert [stream.kind for stream in streams.values()] == ["xela", "ati-netft", "tap", "generic"]
+    assert [stream.kind for stream in streams.values()] == [
+        "xela",
+        "ati-netft",
+        "tap",
+        "lsl",
+        "lsl",
+        "lines",
+        "generic",
+    ]
 
 
 def test_three_lines_of_python_send_what_a_tap_takes() -> None:

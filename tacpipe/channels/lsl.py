@@ -1,0 +1,185 @@
+"""The description of a stream of Lab Streaming Layer (LSL): its name, type, rate and channels, as its XML states them.
+
+An LSL outlet sends it, and an XDF file holds it: https://github.com/sccn/xdf/wiki/Specifications.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from tacpipe.arrays import Floats, Int64s
+from tacpipe.errors import TacpipeError
+from tacpipe.printable import excerpt, plain
+
+FORMATS = {  # as LSL names them, and as numpy does; LSL has no unsigned ones
+    "float32": "float32",
+    "double64": "float64",
+    "int8": "int8",
+    "int16": "int16",
+    "int32": "int32",
+    "int64": "int64",
+    "string": "text",
+}
+UNITS = {  # as LSL's own recommendations write them
+    "microvolts": "uV", "millivolts": "mV", "volts": "V", "newtons": "N", "newton": "N", "meters": "m", "millimeters": "mm",
+    "metres": "m", "degrees": "deg", "radians": "rad", "celsius": "degC", "seconds": "s", "milliseconds": "ms",
+    "microtesla": "uT", "pascals": "Pa", "pascal": "Pa", "counts": "count", "normalized": "1", "none": "1",
+    "meters/second": "m/s", "degrees/second": "deg/s", "radians/second": "rad/s", "meters/second^2": "m/s^2",
+}  # fmt: skip
+QUANTITIES = {  # of the type of a channel, or of a stream whose channels have none
+    "tactile": "tactile", "touch": "tactile", "taxel": "tactile", "pressure": "tactile", "skin": "tactile",
+    "force": "force", "torque": "torque", "moment": "torque", "position": "position", "orientation": "orientation",
+    "velocity": "velocity", "acceleration": "acceleration", "accelerometer": "acceleration", "acc": "acceleration",
+    "gyroscope": "angular_velocity", "gyro": "angular_velocity", "magnetometer": "magnetic_field",
+    "temperature": "temperature",
+    "jointposition": "joint_position", "jointvelocity": "joint_velocity", "jointtorque": "joint_torque", "angle": "angle",
+    "eeg": "voltage", "emg": "voltage", "voltage": "voltage", "markers": "text", "current": "current",
+}  # fmt: skip
+COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
+LATEST_S = 9e9  # that nanoseconds in 64 bits hold
+TAXEL = re.compile(r".*?(\d+)(?:[_ .]?([xyz]))?")
+MOST_CHANNELS = 1 << 16
+MOST_BYTES = 1 << 24  # of a description
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel of a stream."""
+
+    name: str  # an identifier, unique in its stream
+    unit: str = ""
+    quantity: str = ""
+    component: str = ""
+    taxel: str = ""  # number of a tactile channel in its array, from its label
+    axis: str = ""  # of a tactile channel
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What a field of this channel states, without what is not known."""
+        found = {key: getattr(self, key) for key in ("unit", "quantity", "component", "taxel", "axis")}
+        return {key: value for key, value in found.items() if value}
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a stream states of itself."""
+
+    name: str
+    kind: str  # its type, as "EEG" or "Markers"
+    format: str  # of `FORMATS`
+    rate_hz: float  # 0: irregular
+    channels: tuple[Channel, ...]
+    source_id: str = ""
+    uid: str = ""
+    host: str = ""
+
+    @property
+    def is_text(self) -> bool:
+        """Whether samples are texts: a stream of markers."""
+        return self.format == "string"
+
+    @property
+    def dtype(self) -> str:
+        """The type of a number, as numpy names it."""
+        return FORMATS[self.format]
+
+
+def parse(text: str | bytes) -> Description:
+    """Return the description in an ``<info>`` of LSL.
+
+    Raises `TacpipeError` for what is not one: no XML, no such format, a count of channels or a rate that is none.
+    """
+    if len(text) > MOST_BYTES:
+        raise TacpipeError(f"its description has {len(text):,} bytes, more than {MOST_BYTES:,}")
+    try:
+        root = ET.fromstring(text.decode(errors="replace") if isinstance(text, bytes) else text)
+    except (ET.ParseError, ValueError) as error:
+        raise TacpipeError(f"its description is not XML: {plain(str(error), 100)}") from error
+    form, count, rate = (
+        root.findtext(name, "").strip() for name in ("channel_format", "channel_count", "nominal_srate")
+    )
+    if form not in FORMATS:
+        raise TacpipeError(f"its channel_format is {excerpt(form)}, not one of {', '.join(FORMATS)}")
+    if not count.isdecimal() or not 1 <= int(count) <= MOST_CHANNELS:
+        raise TacpipeError(f"its channel_count is {excerpt(count)}, not between 1 and {MOST_CHANNELS:,}")
+    try:
+        rate_hz = float(rate or 0)
+    except ValueError:
+        rate_hz = -1.0
+    if not 0 <= rate_hz < 1e9:
+        raise TacpipeError(f"its nominal_srate is {excerpt(rate)}, not a rate in hertz")
+    found = {name: root.findtext(name, "").strip() for name in ("name", "type", "source_id", "uid", "hostname")}
+    channels = _channels(root.findall("desc/channels/channel"), int(count), found["type"], text=form == "string")
+    return Description(
+        found["name"], found["type"], form, rate_hz, channels, found["source_id"], found["uid"], found["hostname"]
+    )
+
+
+def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[Channel, ...]:
+    """Return ``count`` channels: as described where there are as many descriptions, or else numbered."""
+    labels = [one.findtext("label", "").strip() for one in described] if len(described) == count else []
+    if not all(labels) or not labels:
+        digits = max(2, len(str(count)))
+        plain_name = "event" if text else "value"
+        labels = [plain_name] if count == 1 else [f"{plain_name}{number:0{digits}d}" for number in range(1, count + 1)]
+    names = identifiers(labels)
+    found = []
+    for place, name in enumerate(names):
+        own = described[place] if len(described) == count else None
+        unit = "" if own is None else own.findtext("unit", "").strip()
+        quantity, component = _quantity("" if own is None else own.findtext("type", ""), kind, labels[place])
+        known = UNITS.get(unit.lower(), unit)
+        if text:
+            found.append(Channel(name, "1", "text"))
+            continue
+        taxel = TAXEL.fullmatch(labels[place].lower()) if quantity == "tactile" and described else None
+        found.append(Channel(name, known, quantity, component, *((taxel[1], taxel[2] or "") if taxel else ())))
+    return tuple(found)
+
+
+def _quantity(own: str, kind: str, label: str) -> tuple[str, str]:
+    """Return quantity and component of a channel by its type (PositionX), else by that of its stream.
+
+    >>> _quantity("PositionX", "MoCap", "left.x"), _quantity("", "Force", "Fz"), _quantity("", "", "a")
+    (('position', 'x'), ('force', 'z'), ('', ''))
+    """
+    parted = COMPONENT.fullmatch(own.strip())
+    if parted and parted[1].lower() in QUANTITIES:
+        return QUANTITIES[parted[1].lower()], parted[2].lower()
+    quantity = QUANTITIES.get(own.strip().lower()) or QUANTITIES.get(kind.strip().lower(), "")
+    parted = COMPONENT.fullmatch(label.strip())
+    vector = quantity in ("force", "torque", "position", "orientation", "velocity", "acceleration", "angular_velocity")
+    return quantity, parted[2].lower() if parted and vector else ""
+
+
+def nanoseconds(seconds: Floats) -> Int64s:
+    """Return LSL's seconds as whole nanoseconds, their whole part apart: a product of all digits would be rounded.
+
+    >>> nanoseconds(np.array([1.5, 41037.236252649])).tolist()
+    [1500000000, 41037236252649]
+    """
+    whole = np.floor(seconds)
+    found: Int64s = whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)
+    return found
+
+
+def identifiers(labels: Sequence[str]) -> list[str]:
+    """Return a name of small letters, digits and _ for each label, no two alike.
+
+    >>> identifiers(["Fx (N)", "fx_n", "3"])
+    ['fx_n', 'fx_n_2', 'c3']
+    """
+    made: list[str] = []
+    for label in labels:
+        name = re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_") or "channel"
+        name = name if name[0].isalpha() else f"c{name}"
+        candidate, number = name, 2
+        while candidate in made:
+            candidate, number = f"{name}_{number}", number + 1
+        made.append(candidate)
+    return made

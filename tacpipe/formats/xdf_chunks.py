@@ -1,0 +1,209 @@
+"""The chunks of an XDF file (Extensible Data Format, version 1.0), and the samples in them.
+
+Source: https://github.com/sccn/xdf/wiki/Specifications. After ``XDF:`` come chunks: their length, a tag of two bytes, and a
+content. A boundary chunk is written every few seconds, so that a reader finds its way again after bytes that are wrong.
+"""
+
+from __future__ import annotations
+
+import itertools
+import mmap
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, Floats
+from tacpipe.errors import TacpipeError
+
+Content = bytes | mmap.mmap
+
+MAGIC = b"XDF:"
+FILE_HEADER, STREAM_HEADER, SAMPLES, CLOCK_OFFSET, BOUNDARY, STREAM_FOOTER = range(1, 7)
+OF_A_STREAM = (STREAM_HEADER, SAMPLES, CLOCK_OFFSET, STREAM_FOOTER)
+MARK = bytes.fromhex("43 A5 46 DC CB F5 41 0F B3 0E D5 46 73 83 CB E4")  # content of a boundary chunk
+SIZES = {1: "<B", 4: "<I", 8: "<Q"}  # of a length, by the byte before it
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A chunk: ``content`` is what follows the tag, and the number of the stream where it has one."""
+
+    at: int  # where it begins in the file
+    tag: int
+    stream: int | None
+    content: bytes
+    whole: bool = True  # False: the file ends within it
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes that are no chunk."""
+
+    at: int
+    bytes: int
+
+
+def chunks(data: Content) -> Iterator[Chunk | Damage]:
+    """Yield the chunks of a file in their order, and what is none.
+
+    Raises `TacpipeError` for what does not begin as an XDF file does.
+    """
+    if data[: len(MAGIC)] != MAGIC:
+        raise TacpipeError(f"it begins with {data[:4]!r}, and an XDF file with {MAGIC!r}")
+    at = len(MAGIC)
+    while at < len(data):
+        found = _chunk(data, at)
+        if found is not None and found[0].whole:
+            chunk, at = found
+            if chunk.tag != BOUNDARY:
+                yield chunk
+            continue
+        again = data.find(MARK, at)
+        if found is not None and again < 0:  # the file was cut off
+            yield found[0]
+            return
+        stop = len(data) if again < 0 else again + len(MARK)
+        yield Damage(at, stop - at)
+        at = stop
+
+
+def _chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
+    """Return the chunk at a place and where the next one begins; None where there is none."""
+    length = varint(data, at)
+    if length is None:
+        return None
+    size, begin = length
+    stop = begin + size
+    if size < 2 or begin + 2 > len(data):
+        return None
+    (tag,) = struct.unpack_from("<H", data, begin)
+    head = 6 if tag in OF_A_STREAM else 2
+    if not FILE_HEADER <= tag <= STREAM_FOOTER or size < head or begin + head > len(data):
+        return None
+    stream = struct.unpack_from("<I", data, begin + 2)[0] if head == 6 else None
+    return Chunk(at, tag, stream, data[begin + head : stop], whole=stop <= len(data)), stop
+
+
+def varint(data: Content, at: int) -> tuple[int, int] | None:
+    """Return a length of 1, 4 or 8 bytes and where it ends; None where there is none.
+
+    >>> varint(b"\\x01\\x05...", 0), varint(b"\\x02\\x05", 0)
+    ((5, 2), None)
+    """
+    width = data[at] if at < len(data) else 0
+    if width not in SIZES or at + 1 + width > len(data):
+        return None
+    return struct.unpack_from(SIZES[width], data, at + 1)[0], at + 1 + width
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of one chunk: stamps in seconds as they are written, NaN where none is; and how many are missing."""
+
+    stamps: Floats  # (sample,)
+    values: AnyArray  # (sample, channel)
+    missing: int = 0
+
+
+def numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> Samples | None:
+    """Return the samples of a chunk of numbers, as many as are whole; None where even their count is not there."""
+    count = varint(content, 0)
+    if count is None:
+        return None
+    declared, begin = count
+    body = content[begin:]
+    wide = kind.newbyteorder("<")
+    for stamped in (declared, 1 if declared else 0, 0):  # all have a stamp, the first alone, none
+        found = _regular(body, wide, channels, declared, stamped)
+        if found is not None:
+            return found
+    return _irregular(body, wide, channels, declared)
+
+
+def _regular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int) -> Samples | None:
+    """Return samples of which the first ``stamped`` have a stamp and the others none; None where it is not so."""
+    full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
+    bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
+    if len(body) != stamped * full.itemsize + (count - stamped) * bare.itemsize:
+        return None
+    first = np.frombuffer(body, full, stamped)
+    rest = np.frombuffer(body, bare, count - stamped, offset=stamped * full.itemsize)
+    if (first["width"] != 8).any() or rest["width"].any():
+        return None
+    stamps = np.concatenate([first["stamp"], np.full(len(rest), np.nan)])
+    return Samples(stamps, np.concatenate([first["values"], rest["values"]]).astype(kind.newbyteorder("=")))
+
+
+def _irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> Samples:
+    """Return samples one by one, up to the first that is not whole."""
+    stamps, values, at, size = [], [], 0, channels * kind.itemsize
+    for _ in range(count):
+        stamp = _stamp(body, at)
+        if stamp is None or stamp[1] + size > len(body):
+            break
+        stamps.append(stamp[0])
+        values.append(body[stamp[1] : stamp[1] + size])
+        at = stamp[1] + size
+    read = np.frombuffer(b"".join(values), kind).reshape(-1, channels).astype(kind.newbyteorder("="))
+    return Samples(np.array(stamps, dtype=np.float64), read, count - len(stamps))
+
+
+def texts(content: bytes, channels: int) -> Samples | None:
+    """Return the samples of a chunk of texts, as many as are whole; None where even their count is not there."""
+    count = varint(content, 0)
+    if count is None:
+        return None
+    declared, at = count
+    stamps: list[float] = []
+    rows: list[list[str]] = []
+    while len(rows) < declared:
+        stamp = _stamp(content, at)
+        words = None if stamp is None else _words(content, stamp[1], channels)
+        if stamp is None or words is None:
+            break
+        stamps.append(stamp[0])
+        rows.append(words[0])
+        at = words[1]
+    table = np.array(list(itertools.chain(*rows)), dtype=object).reshape(-1, channels)
+    return Samples(np.array(stamps, dtype=np.float64), table, declared - len(rows))
+
+
+def _words(content: bytes, at: int, count: int) -> tuple[list[str], int] | None:
+    found = []
+    for _ in range(count):
+        length = varint(content, at)
+        if length is None or length[1] + length[0] > len(content):
+            return None
+        at = length[1] + length[0]
+        found.append(content[length[1] : at].decode(errors="replace"))
+    return found, at
+
+
+def _stamp(content: bytes, at: int) -> tuple[float, int] | None:
+    """Return a sample's stamp (NaN where it has none) and where its values begin; None where there is none."""
+    if at >= len(content) or content[at] not in (0, 8) or at + 1 + content[at] > len(content):
+        return None
+    if not content[at]:
+        return float("nan"), at + 1
+    return struct.unpack_from("<d", content, at + 1)[0], at + 9
+
+
+def deduced(stamps: Floats, last: float, period_s: float) -> Floats:
+    """Return stamps (sample,) with those filled in that are not written: a period after the one before.
+
+    >>> deduced(np.array([np.nan, 5.0, np.nan]), 1.0, 0.5).tolist()
+    [1.5, 5.0, 5.5]
+    """
+    absent = np.isnan(stamps)
+    if not absent.any():
+        return stamps
+    filled = stamps.copy()
+    written = np.flatnonzero(~absent).tolist()
+    before = [last, *stamps[written].tolist()]
+    edges = [-1, *written, len(stamps)]
+    for begin, (row, stop) in zip(before, itertools.pairwise(edges), strict=True):
+        steps = np.concatenate([[begin], np.full(stop - row - 1, period_s)])
+        filled[row + 1 : stop] = np.add.accumulate(steps)[1:]
+    return filled

@@ -1,0 +1,330 @@
+"""An XDF file as a container: each stream of LSL with its stamps on the recorder's clock, and the clock offsets beside it.
+
+``lsl_ns`` is when a sample was taken, on the clock of the computer that recorded: the stamp as it was sent, moved by our own
+fit of the offsets that were measured meanwhile. The stamp as it was sent stays in ``t_device_ns``. Both count from when a
+computer started, as LSL's clock does.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.arrays import AnyArray, Floats, Int64s, Times
+from tacpipe.channels import lsl
+from tacpipe.errors import TacpipeError
+from tacpipe.formats import xdf_chunks
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Contents, SourceStream, Time
+from tacpipe.formats.xdf_chunks import Chunk, Damage
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import excerpt, plain
+from tacpipe.signals import clock_offsets, clocks
+
+STAMP = "lsl_ns"
+RAW = "t_device_ns"
+OFFSETS = " clock offsets"  # what the name of a stream's offsets ends with
+UNDESCRIBED = "the file does not describe it"
+CLOCK = "LSL's, of the computer that recorded"
+
+
+@dataclass
+class _Stream:
+    """What was read of a stream so far."""
+
+    about: lsl.Description
+    stamps: list[Floats] = field(default_factory=list)
+    values: list[AnyArray] = field(default_factory=list)
+    offsets: list[tuple[float, float]] = field(default_factory=list)  # reading of the sender's clock, and what to add
+    rows_before: list[int] = field(default_factory=list)  # (offset,), samples that stand before it in the file
+    rows: int = 0
+    missing: int = 0  # samples of chunks that are not whole
+    declared: int | None = None  # samples that the footer counts
+
+    def take(self, content: bytes) -> None:
+        """Take the samples of a chunk."""
+        channels = len(self.about.channels)
+        found = (
+            xdf_chunks.texts(content, channels)
+            if self.about.is_text
+            else xdf_chunks.numbers(content, np.dtype(self.about.dtype), channels)
+        )
+        if found is None:
+            self.missing += 1
+            return
+        last = float(self.stamps[-1][-1]) if self.rows else 0.0
+        period_s = 1 / self.about.rate_hz if self.about.rate_hz else 0.0
+        self.missing += found.missing
+        if len(found.stamps):
+            self.stamps.append(xdf_chunks.deduced(found.stamps, last, period_s))
+            self.values.append(found.values)
+            self.rows += len(found.stamps)
+
+
+@dataclass
+class _Read:
+    """What was read of a file."""
+
+    streams: dict[int, _Stream] = field(default_factory=dict)
+    unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
+    header: bytes = b""
+    damage: list[Damage] = field(default_factory=list)
+    cut_at: int | None = None  # where the chunk begins that the file ends within
+
+    def notes(self, path: Path) -> list[str]:
+        """Return what is missing, in words."""
+        found = []
+        if self.damage:
+            size, first = sum(one.bytes for one in self.damage), self.damage[0].at
+            places = (
+                f"in {len(self.damage)} places, the first at byte {first:,},"
+                if len(self.damage) > 1
+                else f"from byte {first:,} on"
+            )
+            found.append(f"{path}: {size:,} bytes {places} are not XDF and were left out.")
+        if self.cut_at is not None:
+            found.append(f"{path} was cut off at byte {self.cut_at:,}, within a chunk; what stands before is read.")
+        undescribed = sum(why == UNDESCRIBED for why in self.unknown.values())
+        if undescribed:
+            found.append(f"{path} has samples of {undescribed} streams that it does not describe; they were left out.")
+        return found
+
+
+@dataclass(frozen=True)
+class XdfFile:
+    """An XDF file; `kinds.opened` gives one."""
+
+    path: Path
+
+    def episodes(self) -> Sequence[str]:
+        """Return nothing: a file is one recording."""
+        return ()
+
+    def look(self, episode: str | None) -> Contents:
+        """Return all that is in the file: it has no index, so a look reads it."""
+        return self.read(None, episode)
+
+    def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
+        """Return the streams, and for each whose clock was compared with the recorder's its offsets as another one.
+
+        Raises `TacpipeError` for a file that is not XDF.
+        """
+        read = self._read()
+        named = _sources(read.streams)
+        names = kinds.identifiers([one for source in named.values() for one in (source, source + OFFSETS)])
+        found: list[SourceStream] = []
+        attributes = _attributes(read.header)
+        notes = read.notes(self.path)
+        skipped = {f"stream {number}": why for number, why in read.unknown.items() if why != UNDESCRIBED}
+        for number, source in named.items():
+            stream = read.streams[number]
+            if not stream.rows:
+                skipped[source] = "it has no samples"
+                continue
+            made = _timed(stream)
+            if isinstance(made, str):
+                skipped[source] = made
+                continue
+            t_ns, facts, described = made
+            notes += [f"{self.path}: {plain(source)} {one}" for one in [*described, *_losses(stream)]]
+            attributes |= {f"{names[source]}_{name}": value for name, value in facts.items()}
+            table = _table(stream, t_ns)
+            found.append(SourceStream(source, names[source], Time(STAMP, "ns"), table, stream.rows))
+            if stream.offsets:
+                source += OFFSETS
+                offsets = _offsets_table(stream)
+                found.append(SourceStream(source, names[source], Time(STAMP, "ns"), offsets, offsets.num_rows))
+        chosen = [one for one in found if sources is None or one.source in sources]
+        return Contents(chosen, attributes, skipped, notes)
+
+    def _read(self) -> _Read:
+        read = _Read()
+        try:
+            for chunk in xdf_chunks.chunks(_content(self.path)):
+                _take(read, chunk)
+        except (OSError, zlib.error) as error:
+            raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
+        except TacpipeError as error:
+            raise TacpipeError(f"{self.path} is not an XDF file: {error}.") from error
+        return read
+
+
+def _content(path: Path) -> xdf_chunks.Content:
+    """Return the bytes of a file, decompressed; of a compressed one that was cut off those that are there."""
+    with path.open("rb") as file:
+        head = file.read(2)
+        if head == b"\x1f\x8b":
+            return _decompressed(path)
+        if not head:
+            return b""
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _decompressed(path: Path) -> bytes:
+    unpacked = bytearray()
+    data = path.read_bytes()
+    while data:
+        stream = zlib.decompressobj(wbits=31)  # of gzip, of which several may follow one another
+        unpacked += stream.decompress(data)
+        data = stream.unused_data
+    return bytes(unpacked)
+
+
+def _take(read: _Read, chunk: Chunk | Damage) -> None:
+    """Take a chunk into what was read."""
+    if isinstance(chunk, Damage):
+        read.damage.append(chunk)
+        return
+    if not chunk.whole:
+        read.cut_at = chunk.at
+    if chunk.tag == xdf_chunks.FILE_HEADER:
+        read.header = chunk.content
+    elif chunk.stream is None:
+        return
+    elif chunk.tag == xdf_chunks.STREAM_HEADER:
+        try:
+            read.streams[chunk.stream] = _Stream(lsl.parse(chunk.content))
+        except TacpipeError as error:
+            read.unknown[chunk.stream] = str(error)
+    elif chunk.stream not in read.streams:
+        read.unknown.setdefault(chunk.stream, UNDESCRIBED)
+    elif chunk.tag == xdf_chunks.SAMPLES:
+        read.streams[chunk.stream].take(chunk.content)
+    elif chunk.tag == xdf_chunks.CLOCK_OFFSET and len(chunk.content) >= 16:
+        one = read.streams[chunk.stream]
+        one.offsets.append(struct.unpack_from("<dd", chunk.content))
+        one.rows_before.append(one.rows)
+    elif chunk.tag == xdf_chunks.STREAM_FOOTER:
+        read.streams[chunk.stream].declared = _counted(chunk.content)
+
+
+def _counted(footer: bytes) -> int | None:
+    try:
+        text = ET.fromstring(footer.decode(errors="replace")).findtext("sample_count", "")
+    except ET.ParseError:
+        return None
+    return int(text) if text.isdecimal() else None
+
+
+def _sources(streams: Mapping[int, _Stream]) -> dict[int, str]:
+    """Return how each stream is named: by its name, with its number where two share one."""
+    named = {number: one.about.name or one.about.kind or f"stream {number}" for number, one in streams.items()}
+    several = list(named.values())
+    return {number: name if several.count(name) == 1 else f"{name} {number}" for number, name in named.items()}
+
+
+def _attributes(header: bytes) -> dict[str, Attribute]:
+    try:
+        stamp = ET.fromstring(header.decode(errors="replace")).findtext("datetime", "").strip()
+    except ET.ParseError:
+        return {}
+    return {"recorded_at": stamp} if stamp else {}
+
+
+def _losses(stream: _Stream) -> list[str]:
+    """Return what of a stream is not there, in words."""
+    found = [f"lacks {stream.missing} samples of a chunk that is not whole."] if stream.missing else []
+    if stream.declared is not None and stream.declared != stream.rows:
+        found.append(f"has {stream.rows:,} samples, and its footer counts {stream.declared:,}.")
+    return found
+
+
+def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | str:
+    """Return when samples were taken on the recorder's clock (sample,), facts about the clocks, and what is odd.
+
+    Instead a reason where that cannot be known.
+    """
+    raw_s = np.concatenate(stream.stamps)
+    if not (np.abs(raw_s) < lsl.LATEST_S).all():
+        return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.LATEST_S)][0]))} is not a time in seconds"
+    raw_ns = lsl.nanoseconds(raw_s)
+    measured = _measured(stream)
+    facts: dict[str, Attribute] = {}
+    described: list[str] = []
+    t_ns = raw_ns
+    if len(measured):
+        lines = clock_offsets.fit_offsets(measured[:, 0], measured[:, 1])
+        starts = [0, *(_reset_row(stream, raw_ns, measured, line.start) for line in lines[1:])]
+        t_ns = clock_offsets.host_times(lines, starts, raw_ns)
+        longest = max(lines, key=lambda line: line.stop - line.start)
+        facts = {"lsl_drift_ppm": round(longest.drift * 1e6, 3), "lsl_clock_resets": len(lines) - 1}
+    else:
+        described.append("has no clock offsets: its stamps are taken for the recorder's.")
+    back_ns = np.maximum.accumulate(t_ns) - t_ns
+    if back_ns.any():
+        rows = int(np.count_nonzero(back_ns))
+        if not len(measured) and back_ns.max() > clocks.STEP_NS and rows > len(t_ns) // 2:
+            row = int(back_ns.argmax())
+            return (
+                f"its clock went back by {back_ns[row] / 1e9:.6g} s at sample {row + 1}, and no clock offset says by how "
+                "much it was set"
+            )
+        described.append(
+            f"has {rows:,} stamps before the one above, by up to {back_ns.max() / 1e9:.6g} s: t_ns has that one for them."
+        )
+    return t_ns + back_ns, facts, described
+
+
+def _measured(stream: _Stream) -> Int64s:
+    """Return the clock offsets (measurement, reading and offset in ns) that are numbers."""
+    offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
+    return np.column_stack([lsl.nanoseconds(column) for column in offsets_s[_sound(offsets_s)].T])
+
+
+def _sound(offsets_s: Floats) -> AnyArray:
+    return np.asarray((np.abs(offsets_s) < lsl.LATEST_S).all(axis=1))
+
+
+def _reset_row(stream: _Stream, raw_ns: Times, measured: Int64s, first: int) -> int:
+    """Return the first sample after the sender's clock was reset: the measurement ``first`` is the first one after it.
+
+    It stands between that measurement and the one before, or, as samples are written late, the one behind.
+    """
+    sound = np.flatnonzero(_sound(np.array(stream.offsets, dtype=np.float64)))
+    rows = [*(stream.rows_before[place] for place in sound.tolist()), len(raw_ns)]
+    low, high = rows[first - 1], min(rows[first + 1], len(raw_ns))
+    steps = np.diff(raw_ns[max(low - 1, 0) : high])
+    if not len(steps):
+        return min(rows[first], len(raw_ns))
+    jump = int(np.abs(steps - np.median(steps)).argmax())
+    expected = measured[first, 0] - measured[first - 1, 0]
+    if abs(int(steps[jump])) < abs(int(expected)) / 2 and (steps >= 0).all():
+        return min(rows[first], len(raw_ns))  # no sample shows it: none was sent meanwhile
+    return max(low - 1, 0) + jump + 1
+
+
+def _table(stream: _Stream, t_ns: Times) -> pa.Table:
+    values = np.concatenate(stream.values)
+    fields: list[pa.Field] = [_time_field(STAMP), _time_field(RAW)]
+    columns: list[Any] = [pa.array(t_ns), pa.array(lsl.nanoseconds(np.concatenate(stream.stamps)))]
+    taken = [STAMP, RAW, "t_ns"]
+    for place, channel in enumerate(stream.about.channels):
+        name = channel.name if channel.name not in taken else f"{channel.name}_channel"
+        kind = pa.string() if stream.about.is_text else pa.from_numpy_dtype(stream.about.dtype)
+        fields.append(pa.field(name, kind, metadata=channel.metadata))
+        columns.append(pa.array(values[:, place], kind))
+    return pa.Table.from_arrays(columns, schema=pa.schema(fields))
+
+
+def _time_field(name: str) -> pa.Field:
+    about = {"unit": "ns", "quantity": "time", "clock": CLOCK if name == STAMP else "LSL's, of the sender"}
+    return pa.field(name, pa.int64(), metadata=about)
+
+
+def _offsets_table(stream: _Stream) -> pa.Table:
+    """Return the clock offsets as they were measured: when on both clocks, and what was to be added."""
+    offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
+    offsets_s = offsets_s[_sound(offsets_s)]
+    sent_ns, offset_ns = (lsl.nanoseconds(column) for column in offsets_s.T)
+    field = pa.field("offset_s", pa.float64(), metadata={"unit": "s", "quantity": "time"})
+    columns = [pa.array(np.maximum.accumulate(sent_ns + offset_ns)), pa.array(sent_ns), pa.array(offsets_s[:, 1])]
+    return pa.Table.from_arrays(columns, schema=pa.schema([_time_field(STAMP), _time_field(RAW), field]))

@@ -1,0 +1,194 @@
+"""A stream of Lab Streaming Layer (LSL), whose outlet states what its channels are.
+
+The link (`tacpipe.links.lsl`) gives packets of three kinds: ``D`` and the stream's description in XML, once when it opens;
+``S`` and samples of numbers; ``T`` and markers as JSON. Each packet of samples holds the stamps as the outlet sent them, on
+the sender's clock, and the correction that LSL itself measured last: what it adds to such a stamp for this computer's clock.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, Floats, Times
+from tacpipe.channels import lsl
+from tacpipe.channels.lsl import Channel
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.sensors.framing import Chunks, Framer
+from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.text_framer import TextFramer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DESCRIPTION, NUMBERS, TEXTS = b"D", b"S", b"T"
+HEAD = struct.Struct("<cdI")  # kind, correction in seconds (NaN: none yet), samples
+CORRECTION = "lsl_correction_s"
+TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "t_uncertain_ns", CORRECTION)
+Format = Literal["float32", "double64", "int8", "int16", "int32", "int64", "string"]
+
+
+@dataclass(frozen=True)
+class Lsl(Sensor):
+    """A stream of LSL. What is left out is as the outlet states it when `tacpipe acquire` begins."""
+
+    summary: ClassVar[str] = "A stream of Lab Streaming Layer (LSL): numbers or markers."
+    links: ClassVar[tuple[str, ...]] = ("lsl",)
+    described: ClassVar[bool] = True
+    guesses: ClassVar[Mapping[str, str]] = {
+        "channels": "as the outlet states; leave out to take what it states when a recording begins",
+    }
+
+    channels: tuple[Channel, ...] = ()  # of the stream, in their order; none: as the outlet states
+    format: Format = "float32"  # of a sample's values, as LSL names it; taken from the outlet with the channels
+    rate_hz: float = 0.0  # samples a second; 0: they come when they come
+
+    def __post_init__(self) -> None:
+        names = [channel.name for channel in self.channels]
+        for name in names:
+            if lsl.identifiers([name]) != [name] or name in TAKEN or names.count(name) > 1:
+                raise UsageError(
+                    f"lsl: {name!r} cannot name a channel; take small letters, digits and _, each name once, and none of "
+                    f"{', '.join(TAKEN)}."
+                )
+        if not 0 <= self.rate_hz < float("inf"):
+            raise UsageError(f"lsl: rate_hz is {self.rate_hz:g}; it must be 0 or above.")
+
+    @property
+    def incomplete(self) -> bool:  # type: ignore[override]
+        """Whether the channels are to be taken from the outlet."""
+        return not self.channels
+
+    @property
+    def _is_text(self) -> bool:
+        return self.format == "string"
+
+    @property
+    def _dtype(self) -> np.dtype[Any]:
+        return np.dtype(lsl.FORMATS[self.format]).newbyteorder("<")
+
+    def fields(self) -> list[pa.Field]:
+        """Return a field a channel, and ``lsl_correction_s``: what LSL adds to a stamp for this computer's clock."""
+        import pyarrow as pa
+
+        kind = pa.string() if self._is_text else pa.from_numpy_dtype(self._dtype.newbyteorder("="))
+        found = []
+        for channel in self.channels:
+            unit, quantity = channel.unit or "1", channel.quantity or ("text" if self._is_text else "state")
+            found.append(
+                pa.field(channel.name, kind, metadata={**channel.metadata, "unit": unit, "quantity": quantity})
+            )
+        return [*found, pa.field(CORRECTION, pa.float64(), metadata={"unit": "s", "quantity": "time"})]
+
+    def framer(self) -> Framer:
+        """Return a framer of the link's packets."""
+        return TextFramer(self._is_right)
+
+    def _is_right(self, packet: bytes) -> bool:
+        if packet[:1] == DESCRIPTION:
+            return _described(packet) is not None
+        found = self._opened(packet)
+        return found is not None and bool((np.abs(found[1]) < lsl.LATEST_S).all())
+
+    def _opened(self, packet: bytes) -> tuple[float, Floats, AnyArray] | None:
+        """Return correction, stamps (sample,) in seconds and values (sample, channel); None: no samples of this stream."""
+        if packet[:1] == (TEXTS if self._is_text else NUMBERS) and len(packet) >= HEAD.size:
+            _, correction, count = HEAD.unpack_from(packet)
+            stop = HEAD.size + 8 * count
+            if self._is_text:
+                values = _texts(packet[stop:], count, len(self.channels))
+            elif len(packet) == stop + count * len(self.channels) * self._dtype.itemsize:
+                values = np.frombuffer(packet, self._dtype, offset=stop).reshape(count, len(self.channels))
+            else:
+                values = None
+            if values is not None and count:
+                return correction, np.frombuffer(packet, "<f8", count, HEAD.size), values
+        return None
+
+    def decode(self, frames: Sequence[bytes]) -> Samples:
+        """Return the samples of packets, several each: channels and corrections, and the stamps as they were sent."""
+        found = [(row, self._opened(frame)) for row, frame in enumerate(frames)]
+        parts = [(row, one) for row, one in found if one is not None]
+        counts = [len(one[1]) for _, one in parts]
+        corrections = np.repeat([one[0] for _, one in parts], counts).astype(np.float64)[:, None]
+        kind = object if self._is_text else self._dtype.newbyteorder("=")
+        empty = np.zeros((0, len(self.channels)), dtype=kind)
+        values = np.concatenate([empty, *(one[2] for _, one in parts)]).astype(kind)
+        stamps = np.concatenate([np.zeros(0), *(one[1] for _, one in parts)])
+        blocks = (values, corrections) if self.channels else (corrections,)
+        return Samples(
+            (np.hstack(blocks),) if values.dtype == corrections.dtype else blocks,
+            t_device_ns=lsl.nanoseconds(stamps),
+            rows=np.repeat([row for row, _ in parts], counts).astype(np.int64),
+        )
+
+    def encode(self, samples: Samples) -> list[bytes]:
+        """Return a packet for each sample."""
+        assert samples.t_device_ns is not None
+        corrections = samples.values[-1][:, -1].tolist()
+        stamps: Times = samples.t_device_ns
+        return [
+            packet(
+                samples.values[0][row : row + 1, : len(self.channels)], stamps[row : row + 1] / 1e9, corrections[row]
+            )
+            for row in range(len(samples))
+        ]
+
+
+def packet(values: AnyArray, stamps: Floats, correction: float) -> bytes:
+    """Return the packet of samples (sample, channel), texts where they are objects, with their stamps in seconds."""
+    is_text = values.dtype.kind == "O"
+    head = HEAD.pack(TEXTS if is_text else NUMBERS, correction, len(stamps)) + stamps.astype("<f8").tobytes()
+    if is_text:
+        return head + json.dumps(values.tolist()).encode()
+    return head + np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
+
+
+def options(data: Chunks) -> list[dict[str, Any]]:
+    """Return the options of the stream whose description is among packets; none where none is."""
+    for one in data.packets():
+        found = _described(one) if one[:1] == DESCRIPTION else None
+        if found is not None:
+            channels = [_entry(channel, text=found.is_text) for channel in found.channels]
+            return [{"channels": channels, "format": found.format, "rate_hz": found.rate_hz}]
+    return []
+
+
+def _entry(channel: Channel, *, text: bool) -> dict[str, str]:
+    """Return a channel as a rig file has it; what is the same for every text is left out."""
+    named = f"{channel.name}_channel" if channel.name in TAKEN else channel.name
+    return {"name": named, **({} if text else channel.metadata)}
+
+
+def _described(data: bytes) -> lsl.Description | None:
+    try:
+        return lsl.parse(data[1:])
+    except TacpipeError:
+        return None
+
+
+def _texts(data: bytes, count: int, channels: int) -> AnyArray | None:
+    try:
+        rows = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(rows, list) or len(rows) != count:
+        return None
+    if not all(isinstance(row, list) and len(row) == channels for row in rows):
+        return None
+    if not all(isinstance(word, str) and _encodes(word) for row in rows for word in row):
+        return None
+    return np.array(rows, dtype=object).reshape(count, channels)
+
+
+def _encodes(word: str) -> bool:
+    try:
+        word.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

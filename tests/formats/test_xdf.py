@@ -1,0 +1,292 @@
+"""XDF files, written by hand from the specification, are read as they are, and as far as they go."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import logging
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import pyxdf
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.table.contained import Params
+from tacpipe.formats.xdf import COMMAND, xdf
+from tacpipe.plugins.stage import RecordingOutput
+from tests.formats.xdf_writer import Writer
+
+RNG = np.random.default_rng(8)
+SAMPLE_DATA = os.environ.get("TACPIPE_SAMPLE_DATA")
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> None:
+    logging.getLogger("pyxdf").setLevel(logging.CRITICAL)
+
+
+def read(path: Path, layout: str = "") -> RecordingOutput:
+    params = Params(json.dumps(tomllib.loads(layout)) if layout else "")
+    (source,) = COMMAND.discover(params, path.parent).values()
+    return xdf(params, source.files, source.values)
+
+
+def theirs(path: Path, **options: Any) -> dict[str, Mapping[str, Any]]:
+    """Return what pyxdf reads, by the name of the stream."""
+    options = {"synchronize_clocks": False, "dejitter_timestamps": False, **options}
+    streams, _ = pyxdf.load_xdf(str(path), **options)
+    return {one["info"]["name"][0]: one for one in streams}
+
+
+def stamps(table: pa.Table, name: str = "t_ns") -> Any:
+    return table.column(name).to_numpy()
+
+
+def force(
+    path: Path, drift: float = 0.0, set_by_s: float = 0.0, rows: int = 6000, noise_s: float = 0.0, later: int = 0
+) -> Any:
+    """Write a stream of 100 Hz whose clock drifts, and is set ``later`` rows than halfway; return the true times in s."""
+    true_s = 1000.0 + np.arange(rows) / 100
+    sent_s = 50_000.0 + (true_s - 1000.0) / (1 + drift)
+    reset = rows // 2 + later
+    sent_s[reset:] += set_by_s
+    writer = Writer()
+    writer.stream(1, "force", "float32", 3, labels=[("Fx", "N", ""), ("Fy", "newtons", ""), ("Fz", "N", "")])
+    for start in range(0, rows, 50):
+        if start % 500 == 0:
+            offset = true_s[start] - sent_s[start] + RNG.normal(0, noise_s)
+            writer.offset(1, sent_s[start], offset)
+        part = slice(start, start + 50)
+        writer.numbers(1, "float32", sent_s[part].tolist(), np.outer(np.arange(rows)[part], [1, 2, 3]))
+    writer.footer(1, rows)
+    writer.write(path)
+    return true_s
+
+
+def test_channels_have_the_names_units_and_values_that_the_file_states(tmp_path: Path) -> None:
+    force(tmp_path / "run.xdf", rows=1000)
+    found = read(tmp_path / "run.xdf")
+    table = found.streams["force"]
+    assert table.column_names == ["t_ns", "t_device_ns", "fx", "fy", "fz"]
+    assert table.schema.field("fy").metadata == {b"quantity": b"force", b"unit": b"N", b"component": b"y"}
+    assert table.schema.field("fz").type == pa.float32()
+    assert table.column("fz").to_pylist() == [3.0 * row for row in range(1000)]
+    assert found.attributes["recorded_at"] == "2026-05-04T10:00:00+0200"
+
+
+@pytest.mark.parametrize("kind", ["float32", "double64", "int8", "int16", "int32", "int64"])
+def test_stamps_and_values_are_those_that_pyxdf_reads_to_the_bit(tmp_path: Path, kind: str) -> None:
+    writer = Writer()
+    writer.stream(7, "a", kind, 2, rate_hz=250.0)
+    writer.numbers(7, kind, [10.0, None, None, None], [[1, -2], [3, 4], [5, 6], [100, -100]])
+    writer.boundary()
+    writer.numbers(7, kind, [None, 11.123456789, None], [[1, 1], [2, 2], [3, 3]])
+    writer.numbers(7, kind, [12.0, 12.5], [[4, 4], [5, 5]])
+    writer.numbers(7, kind, [None, None], [[6, 6], [7, 7]])
+    path = writer.write(tmp_path / "a.xdf")
+    table, other = read(path).streams["a"], theirs(path)["a"]
+    assert np.array_equal(stamps(table, "t_device_ns"), np.rint(other["time_stamps"] * 1e9))
+    assert np.array_equal(
+        np.column_stack([table.column(name) for name in ("value01", "value02")]), other["time_series"]
+    )
+    assert table.schema.field("value01").type == pa.from_numpy_dtype(other["time_series"].dtype)
+
+
+@pytest.mark.parametrize("drift", [0.0, 80e-6, -300e-6])
+def test_stamps_on_the_recorders_clock_are_true_and_near_those_of_pyxdf(tmp_path: Path, drift: float) -> None:
+    true_s = force(tmp_path / "run.xdf", drift, rows=30_000, noise_s=100e-6)
+    found = read(tmp_path / "run.xdf")
+    other = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
+    t_s = stamps(found.streams["force"]) / 1e9
+    assert np.abs(t_s - true_s).max() < 150e-6
+    assert np.abs(t_s - other).max() < 150e-6
+    assert found.attributes["force_lsl_drift_ppm"] == pytest.approx(drift * 1e6, abs=2)
+    assert found.attributes["force_lsl_clock_resets"] == 0
+
+
+@pytest.mark.parametrize("later", [0, 1, 237, 499])
+@pytest.mark.parametrize("set_by_s", [-49_000.0, -60.0, 500.0])
+def test_after_a_reset_of_the_senders_clock_stamps_are_true_as_those_of_pyxdf_are(
+    tmp_path: Path, set_by_s: float, later: int
+) -> None:
+    true_s = force(tmp_path / "run.xdf", 50e-6, set_by_s, rows=20_000, noise_s=50e-6, later=later)
+    found = read(tmp_path / "run.xdf")
+    other = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
+    t_s = stamps(found.streams["force"]) / 1e9
+    assert np.abs(t_s - true_s).max() < 300e-6
+    if abs(set_by_s) > 100:  # where both clocks show the same times, pyxdf takes one for the other
+        assert np.abs(t_s - other).max() < 300e-6
+    assert found.attributes["force_lsl_clock_resets"] == 1
+    raw = theirs(tmp_path / "run.xdf")["force"]["time_stamps"]
+    assert np.abs(stamps(found.streams["force"], "t_device_ns") - raw * 1e9).max() <= 1
+
+
+def test_labels_of_tactile_channels_state_taxel_and_axis(tmp_path: Path) -> None:
+    writer = Writer()
+    labels = [(f"pad {taxel}.{axis}", "counts", "") for taxel in (1, 12) for axis in "xz"]
+    writer.stream(1, "skin", "int16", 4, labels=labels, type_="Tactile")
+    writer.numbers(1, "int16", [1.0], [[1, 2, 3, 4]])
+    field = read(writer.write(tmp_path / "a.xdf")).streams["skin"].schema.field("pad_12_z")
+    assert field.metadata == {b"unit": b"count", b"quantity": b"tactile", b"taxel": b"12", b"axis": b"z"}
+
+
+def test_clock_offsets_are_a_stream_as_they_were_measured(tmp_path: Path) -> None:
+    force(tmp_path / "run.xdf", 50e-6, noise_s=1e-3)
+    table = read(tmp_path / "run.xdf").streams["force_clock_offsets"]
+    other = theirs(tmp_path / "run.xdf")["force"]
+    assert table.column("offset_s").to_pylist() == other["clock_values"]
+    assert np.allclose(stamps(table, "t_device_ns") / 1e9, other["clock_times"], atol=1e-9)
+
+
+def test_markers_are_events_as_text(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(3, "Trial markers", "string", rate_hz=0, type_="Markers")
+    writer.texts(3, [5.0, 6.25], ["grasp ✓", ""])
+    writer.texts(3, [7.0], ["x" * 300])
+    table = read(writer.write(tmp_path / "a.xdf")).streams["Trial_markers"]
+    assert table.column("event").to_pylist() == ["grasp ✓", "", "x" * 300]
+    assert table.schema.field("event").metadata[b"quantity"] == b"text"
+    assert stamps(table).tolist() == [5 * 10**9, 6_250_000_000, 7 * 10**9]
+
+
+def test_streams_of_one_name_and_channels_without_labels_are_told_apart_by_number(tmp_path: Path) -> None:
+    writer = Writer()
+    for number in (4, 9):
+        writer.stream(number, "skin", "int16", 3, type_="Tactile")
+        writer.numbers(number, "int16", [1.0, 2.0], np.full((2, 3), number))
+    found = read(writer.write(tmp_path / "a.xdf")).streams
+    assert sorted(found) == ["skin_4", "skin_9"]
+    assert found["skin_9"].column("value03").to_pylist() == [9, 9]
+    assert found["skin_9"].schema.field("value01").metadata[b"quantity"] == b"tactile"
+
+
+def test_a_stream_without_samples_is_named_and_a_file_of_such_alone_refused(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(1, "silent")
+    writer.footer(1, 0)
+    path = writer.write(tmp_path / "a.xdf")
+    with pytest.raises(TacpipeError, match="silent"):
+        read(path)
+    writer.stream(2, "loud")
+    writer.numbers(2, "float32", [1.0], np.ones((1, 1)))
+    found = read(writer.write(path))
+    assert list(found.streams) == ["loud"]
+    assert "silent" in str(found.attributes["skipped"])
+
+
+def test_a_file_that_was_cut_off_gives_what_stands_before_wherever_it_is_cut(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(1, "a", "int16", 2)
+    writer.stream(2, "m", "string", rate_hz=0)
+    for start in range(0, 40, 8):
+        rows = np.arange(start, start + 8)
+        writer.numbers(1, "int16", (100 + rows / 100).tolist(), np.column_stack([rows, -rows]))
+        writer.texts(2, [100 + start / 100], [f"m{start}"])
+        writer.offset(1, 100 + start / 100, 0.0)
+        writer.boundary()
+    whole = writer.bytes
+    first = whole.index(writer.parts[3]) + 24
+    path = tmp_path / "a.xdf"
+    seen = set()
+    for stop in range(first, len(whole), 5):
+        path.write_bytes(whole[:stop])
+        found = read(path)
+        values = found.streams["a"].column("value01").to_pylist()
+        assert values == list(range(len(values)))
+        assert stop == len(whole) or found.notes or whole[:stop].endswith(tuple(writer.parts))
+        seen.add(len(values))
+    assert seen == set(range(1, 41))
+
+
+def test_bytes_that_are_wrong_cost_what_stands_up_to_the_next_boundary(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(1, "a", "int32", 1)
+    for start in range(0, 30, 10):
+        writer.numbers(1, "int32", (start + np.arange(10)).tolist(), np.arange(start, start + 10)[:, None])
+        writer.boundary()
+    broken = bytearray(writer.bytes)
+    place = writer.bytes.index(writer.parts[4])
+    broken[place] = 77  # the length of the second chunk of samples
+    path = tmp_path / "a.xdf"
+    path.write_bytes(broken)
+    found = read(path)
+    assert found.streams["a"].column("value").to_pylist() == [*range(10), *range(20, 30)]
+    assert any(f"{place:,}" in note for note in found.notes)
+
+
+def test_samples_that_the_footer_counts_and_the_file_lacks_are_named(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(1, "a", "int32", 1)
+    writer.numbers(1, "int32", [1.0], np.ones((1, 1)))
+    writer.footer(1, 12)
+    assert any("12" in note for note in read(writer.write(tmp_path / "a.xdf")).notes)
+
+
+def test_a_clock_that_goes_back_without_a_measurement_is_not_read_as_if_it_had_not(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(1, "a", "int32", 1)
+    writer.stream(2, "b", "int32", 1)
+    writer.numbers(1, "int32", [500.0, 500.01, 3.0, 3.01, 3.02], np.ones((5, 1)))
+    writer.numbers(2, "int32", [1.0, 1.02, 1.01, 1.03], np.ones((4, 1)))
+    found = read(writer.write(tmp_path / "a.xdf"))
+    assert list(found.streams) == ["b"]
+    assert "sample 3" in str(found.attributes["skipped"])
+    assert stamps(found.streams["b"]).tolist() == [10**9, 1_020_000_000, 1_020_000_000, 1_030_000_000]
+    assert stamps(found.streams["b"], "t_device_ns").tolist() == [10**9, 1_020_000_000, 1_010_000_000, 1_030_000_000]
+
+
+@pytest.mark.parametrize("name", ["a.xdfz", "a.xdf.gz"])
+def test_a_compressed_file_reads_the_same(tmp_path: Path, name: str) -> None:
+    force(tmp_path / "plain.xdf", rows=200)
+    plain = read(tmp_path / "plain.xdf").streams["force"]
+    content = (tmp_path / "plain.xdf").read_bytes()
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed" / name).write_bytes(gzip.compress(content))
+    assert read(tmp_path / "packed" / name).streams["force"].equals(plain)
+    (tmp_path / "packed" / name).write_bytes(gzip.compress(content)[:-200])
+    assert 0 < read(tmp_path / "packed" / name).streams["force"].num_rows <= 200
+
+
+@pytest.mark.parametrize("content", [b"", b"XD", b"not an XDF file", b"XDF:", b"XDF:\x01\x02\x01\x00"])
+def test_what_is_no_xdf_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.xdf").write_bytes(content)
+    with pytest.raises(TacpipeError, match=r"a\.xdf"):
+        read(tmp_path / "a.xdf")
+
+
+def test_a_description_that_cannot_be_read_costs_its_stream_alone(tmp_path: Path) -> None:
+    writer = Writer()
+    writer.stream(1, "odd", "uint128")
+    writer.numbers(1, "int32", [1.0], np.ones((1, 1)))
+    writer.stream(2, "a", "int32")
+    writer.numbers(2, "int32", [1.0], np.ones((1, 1)))
+    found = read(writer.write(tmp_path / "a.xdf"))
+    assert list(found.streams) == ["a"]
+    assert "uint128" in str(found.attributes["skipped"])
+
+
+def test_a_layout_replaces_what_the_file_states_wrongly(tmp_path: Path) -> None:
+    force(tmp_path / "run.xdf", rows=100)
+    layout = '[streams.wrist]\nsource = "force"\ncolumns = [{ match = "f{axis}", unit = "mN" }]'
+    (table,) = read(tmp_path / "run.xdf", layout).streams.values()
+    assert table.schema.field("fx").metadata[b"unit"] == b"mN"
+
+
+@pytest.mark.data
+@pytest.mark.skipif(SAMPLE_DATA is None, reason="TACPIPE_SAMPLE_DATA is not set")
+def test_a_published_file_reads_as_pyxdf_does() -> None:
+    path = Path(str(SAMPLE_DATA)) / "foreign" / "xdf" / "minimal.xdf"
+    found, other = read(path), theirs(path)
+    synced = theirs(path, synchronize_clocks=True)
+    for name, one in other.items():
+        table = found.streams[name]
+        assert np.array_equal(stamps(table, "t_device_ns"), np.rint(one["time_stamps"] * 1e9))
+        assert np.allclose(stamps(table) / 1e9, synced[name]["time_stamps"], atol=1e-8)
+        channels = [table.column(column).to_pylist() for column in table.column_names[2:]]
+        assert np.column_stack(channels).tolist() == np.asarray(one["time_series"]).tolist()
