@@ -43,7 +43,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     trials, kept = [], {}
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for name, shard in sorted(recordings.recordings.items()):
-        track = tracks.track(shard, forecaster.codec)
+        track = tracks.track(shard, forecaster.codec, forecaster.pose)
         check_rate(track, forecaster)
         trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
         starts = track.starts(forecaster.context, forecaster.horizon)
