@@ -24,7 +24,9 @@ def entry(stream: str) -> str:
     return f"[streams.{plain(stream) if stream else '…'}] columns"
 
 
-def absent(recording: str, quantity: str, fields: Iterable[pa.Field], *, unit: str = "", stream: str = "") -> TacpipeError:
+def absent(
+    recording: str, quantity: str, fields: Iterable[pa.Field], *, unit: str = "", stream: str = ""
+) -> TacpipeError:
     """Return the error of a recording without a channel of ``quantity``; ``fields`` are those of all its columns.
 
     It names the quantities that are there, columns without one first, and the line of a layout file that sets it.

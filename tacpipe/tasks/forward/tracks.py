@@ -67,7 +67,8 @@ class Track:
 def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:
     """Return the codec among a dataset's files, or the one that leaves channels as they are where there is none.
 
-    ``name`` is that of the recording whose ``table`` it is. Raises `TacpipeError` where table and files do not belong together.
+    ``name`` is that of the recording whose ``table`` it is. Raises `TacpipeError` where table and files do not belong
+    together.
     """
     latents = tactile.columns(table.schema, "latent")
     if codecs.DESCRIPTION in files:
@@ -109,8 +110,8 @@ def inputs(table: pa.Table, names: Sequence[str]) -> AnyFloats:
 def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
     """Return the columns of the arm whose motion a model reads; of no arm where it needs none and there is none.
 
-    ``actions`` and ``arm`` are the params of these names. Raises `TacpipeError`, naming the recording, where there is no
-    arm to plan with, and what `tacpipe.channels.pose.pose` raises.
+    ``actions`` and ``arm`` are the params of these names. Raises `TacpipeError`, naming the recording, where there is
+    no arm to plan with, and what `tacpipe.channels.pose.pose` raises.
     """
     schema = shard.table().schema
     try:
@@ -127,7 +128,8 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
 def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Track:
     """Return the track of a recording; its latents are those stored, or its channels where ``codec`` is raw.
 
-    ``pose`` names the columns of its arm; without them it rests where it is, and without a quaternion it never turns. Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the
+    ``pose`` names the columns of its arm; without them it rests where it is, and without a quaternion it never turns.
+    Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the
     recording where a column is absent or its channels are not the codec's.
     """
     table = shard.table()
@@ -209,7 +211,11 @@ def _joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, 
         return (), ()
     stream = tactile.metadata(schema.field(pose.position[0])).get("stream")
     angles, speeds = (
-        tuple(name for name in tactile.columns(schema, quantity) if tactile.metadata(schema.field(name)).get("stream") == stream)
+        tuple(
+            name
+            for name in tactile.columns(schema, quantity)
+            if tactile.metadata(schema.field(name)).get("stream") == stream
+        )
         for quantity in ("joint_position", "joint_velocity")
     )
     return angles, speeds
@@ -254,4 +260,3 @@ def rate_hz(tracks: Sequence[Track]) -> float:
             "Synchronize all recordings with one --rate-hz."
         )
     return round(float(np.median(list(rates.values()))), 3)
-
