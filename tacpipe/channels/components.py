@@ -30,7 +30,5 @@ def of_name(name: str) -> tuple[str, str]:
 
 def shared_name(field: pa.Field) -> str:
     """Return what the names of the components of one vector have in common."""
-    said = (field.metadata or {}).get(b"component", b"").decode()
-    if said and field.name.endswith(said):
-        return field.name.removesuffix(said)
-    return of_name(field.name)[1]
+    said, name = (field.metadata or {}).get(b"component", b"").decode(), str(field.name)
+    return name.removesuffix(said) if said and name.endswith(said) else of_name(name)[1]

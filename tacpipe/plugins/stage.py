@@ -34,6 +34,8 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.plugins.requirements import Requirements
+
 ROLES = ("train", "val", "test")
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
@@ -99,6 +101,7 @@ class Stage(Generic[P, R]):
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
     preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
     guess: Callable[[Path], str] | None = None  # of a source: a first layout file (--guess)
+    requirements: Requirements | None = None  # of recordings to train a task on (--requirements)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Return what the function returns: no store is involved."""
@@ -174,10 +177,12 @@ def stage(
     headline: str | None = None,
     preview: Callable[[Any, Path], str] | None = None,
     guess: Callable[[Path], str] | None = None,
+    requirements: Requirements | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
     """Declare the decorated function a stage, whose signature it keeps. Raise ``version`` whenever its result changes.
 
     ``headline`` names the file of its result (`tacpipe.metrics.headline`) that the command prints as a table.
     ``preview`` returns what ``discover`` and the stage would read of a source, in words; ``guess`` a first layout of one.
+    ``requirements`` describe what recordings must hold.
     """
-    return lambda function: Stage(function, version, reads, fit, discover, headline, preview, guess)
+    return lambda function: Stage(function, version, reads, fit, discover, headline, preview, guess, requirements)

@@ -26,7 +26,7 @@ LINES = 200  # of a text file that are looked at
 _TIME = re.compile(
     r"(t|time|timestamp|time_?stamp|stamp|clock|unix_?time|datetime|date)(_?(s|sec|ms|us|ns))?", re.IGNORECASE
 )
-_RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
+RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 _MEANINGS = (  # how a name ends, and the quantity; the first that matches
     (r"(txl|tax|taxel|skin|tactile|cell|electrode|pad|sensel|touch)\w*", "tactile"),
@@ -196,7 +196,7 @@ def _labels_of(group: _Group) -> str:
     if len(group.paths) == 1:
         found = group.first
         keys = [name for name, values in found.values.items() if len(set(values)) == len(values)]
-        named = next((name for name in keys if _RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
+        named = next((name for name in keys if RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
         lines.append(f"key = {_quoted(named)}  # the column that names recordings")
     return "\n".join(lines)
 
@@ -211,7 +211,7 @@ def _stream(group: _Group) -> str:
     ]
     if found.text is not None:
         lines += _written(found.text, group.paths[0])
-    several = next((name for name in found.names if _RECORDING.fullmatch(name)), None)
+    several = next((name for name in found.names if RECORDING.fullmatch(name)), None)
     if several is not None and len(group.paths) == 1:
         lines.append(f"recording = {_quoted(several)}  # the column that names the recording of a row")
         apart.add(several)
@@ -241,7 +241,7 @@ def _written(found: Dialect, path: Path) -> list[str]:
 def _time_column(found: Looked) -> str | None:
     """Return the column that holds stamps: one so named, else the first whose numbers always rise."""
     named = [name for name in found.names if _TIME.fullmatch(name)]
-    rising = [name for name in found.names if _rises(found.values[name]) and not _RECORDING.fullmatch(name)]
+    rising = [name for name in found.names if _rises(found.values[name]) and not RECORDING.fullmatch(name)]
     both = [name for name in named if name in rising or any(isinstance(value, str) for value in found.values[name])]
     return next(iter(both), None) or (rising[0] if rising and rising[0] == found.names[0] else None)
 

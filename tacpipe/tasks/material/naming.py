@@ -13,12 +13,12 @@ from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
+from tacpipe.tasks.material.params import KEY
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 UNKNOWN = -1  # stands where a slide has no label
-KEY = "material"  # the label that names classes, unless params name another
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from tacpipe.plugins.constraints import (
     StoredAs,
 )
 from tacpipe.plugins.params import added
-from tacpipe.tasks.material.naming import KEY
 
+KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
