@@ -29,7 +29,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{name}.md"
-        for name in ("tutorials/simulated", "howto/stage", "tutorials/own-data", "tutorials/ci-and-dvc", "howto/python")
+        for name in ("tutorials/simulated", "howto/stage", "tutorials/own-data", "howto/format", "tutorials/ci-and-dvc", "howto/python")
     ),
     *sorted((ROOT / "docs" / "tasks").glob("*.md")),
     ROOT / "docs" / "rig.md",
@@ -80,7 +80,7 @@ MORE = "…"  # in a page, for lines that a command prints besides
 
 
 def printed(block: str) -> list[tuple[str, list[str]]]:
-    """Return the commands of a console block, each with the lines that are printed below it."""
+    """Return the commands of a console block, each with the lines that are printed below it, but for empty ones."""
     found: list[tuple[str, list[str]]] = []
     for line in block.splitlines():
         if line.startswith("$ "):

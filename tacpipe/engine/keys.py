@@ -73,13 +73,15 @@ def source_tasks(
     digests: Mapping[str, Mapping[str, str]],
 ) -> list[Task]:
     """Return one task a recording of a published source."""
-    argument, values = stage.argument("Files"), stage.argument("Values")
+    argument, values, called = (stage.argument(kind) for kind in ("Files", "Values", "RecordingName"))
     assert argument is not None
 
     def task(recording: str, source: Source) -> Task:
         inputs: dict[str, Any] = {argument: {file: digests[recording][file] for file in source.files}}
         if values is not None:
             inputs[values] = dict(source.values)
+        if called is not None:
+            inputs[called] = recording
         named = identity(name, stage.version, params, inputs)
         return Task(
             str(store.root), name, named, recording, files={file: str(path) for file, path in source.files.items()}

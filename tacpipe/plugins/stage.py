@@ -3,19 +3,20 @@
 The first parameter is ``params``, a frozen dataclass or a union of several (`tacpipe.plugins.params`). Each further one says
 by its annotation what the stage reads:
 
-==============  ==========================================================================================
-``Recording``   one recording at a time; the stage is run, keyed and stored for each recording alone
-``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
-                may be empty where it is annotated ``Dataset | None``
-``Datasets``    several datasets side by side, as a tuple
-``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
-``Fitted``      the files that the stage's ``fit`` made of the training recordings
-``Files``       the files of one recording of a source; the stage's ``discover`` finds them
-``Values``      what ``discover`` gave for one recording beside its files, as labels; part of its key
-``Trial``       the number of one recording to simulate, from 0 to ``params.trials``
-``Roles``       the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
-``Workspace``   a folder that survives an interruption, for checkpoints
-==============  ==========================================================================================
+=================  ==================================================================================================
+``Recording``      one recording at a time; the stage is run, keyed and stored for each recording alone
+``Dataset``        all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
+                   may be empty where it is annotated ``Dataset | None``
+``Datasets``       several datasets side by side, as a tuple
+``Model``          a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
+``Fitted``         the files that the stage's ``fit`` made of the training recordings
+``Files``          the files of one recording of a source; the stage's ``discover`` finds them
+``Values``         what ``discover`` gave for one recording beside its files, as labels; part of its key
+``RecordingName``  the name that ``discover`` gave a recording; part of its key, so only stages that need it take it
+``Trial``          the number of one recording to simulate, from 0 to ``params.trials``
+``Roles``          the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
+``Workspace``      a folder that survives an interruption, for checkpoints
+=================  ==================================================================================================
 
 Annotations are read as text, so a stage module needs to import nothing for them but under ``TYPE_CHECKING``.
 """
@@ -40,13 +41,17 @@ ROLES = ("train", "val", "test")
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
 Values = Mapping[str, Any]  # of JSON, by name
+RecordingName = str
 Fitted = Mapping[str, bytes]  # file name, content
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
-_KINDS = ("Recording", "Dataset", "Datasets", "Model", "Fitted", "Files", "Values", "Trial", "Roles", "Workspace")
+_KINDS = (
+    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Files", "Values", "RecordingName", "Trial", "Roles"),
+    "Workspace",
+)
 
 
 @dataclass(frozen=True)

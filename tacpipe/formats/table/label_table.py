@@ -58,7 +58,7 @@ class LabelTable:
                 found[name] = dict(row.labels)
         if unknown:
             raise UsageError(
-                f"{self.path} has {len(unknown)} rows of recordings that are not there: {listed(unknown, 10)} (column "
+                f"{self.path} names recordings that are not there: {listed(unknown, 10)} (column "
                 f"{plain(self.key)}); there are {listed(known, 6)}. Correct these names, or choose the column with --key."
             )
         return found
