@@ -29,7 +29,14 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{name}.md"
-        for name in ("tutorials/simulated", "howto/stage", "tutorials/own-data", "howto/format", "tutorials/ci-and-dvc", "howto/python")
+        for name in (
+            "tutorials/simulated",
+            "howto/stage",
+            "tutorials/own-data",
+            "howto/format",
+            "tutorials/ci-and-dvc",
+            "howto/python",
+        )
     ),
     *sorted((ROOT / "docs" / "tasks").glob("*.md")),
     ROOT / "docs" / "rig.md",
@@ -85,7 +92,7 @@ def printed(block: str) -> list[tuple[str, list[str]]]:
     for line in block.splitlines():
         if line.startswith("$ "):
             found.append((line.removeprefix("$ "), []))
-        else:
+        elif line:
             found[-1][1].append(line)
     return found
 
