@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.conftest import tacpipe
+from tests import commands
 
 TRAIN = "train forward data/latents --split data/split --architecture gru --hidden 16"
 CHAIN = (
@@ -22,6 +22,4 @@ CHAIN = (
 def run(folder: Path) -> None:
     """Run the chain in ``folder``."""
     (folder / ".tacpipe").mkdir(exist_ok=True)
-    for command in CHAIN:
-        done = tacpipe(folder, command)
-        assert done.returncode == 0, f"{command}: {done.stderr}"
+    commands.run(folder, CHAIN)

@@ -168,12 +168,12 @@ def lab(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, call: Cal
     forget()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project in which the forward chain has run; tests may add to it, but change nothing that is there."""
     from tests import chain
 
-    folder = tmp_path_factory.mktemp("chained") / "project"  # a worker's own: nobody else's commands run there
+    folder = tmp_path_factory.mktemp("chained") / "project"  # a module's own: no other's results lie in its store
     return shutil.copytree(made_once(tmp_path_factory, "chain", chain.run), folder, symlinks=True)
 
 

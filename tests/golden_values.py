@@ -51,15 +51,13 @@ def values_digest(path: Path) -> str:
 def current() -> dict[str, dict[str, Any]]:
     """Return version and digest of each stage as the code stands."""
     from tacpipe.plugins import registry
-    from tests.conftest import tacpipe
+    from tests import commands
 
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / ".tacpipe").mkdir()
-        assert tacpipe(Path(folder), RAW).returncode == 0
+        commands.run(Path(folder), [RAW, *(command.format(name) for name, command in COMMANDS.items())])
         found = {}
-        for name, command in COMMANDS.items():
-            done = tacpipe(Path(folder), command.format(name))
-            assert done.returncode == 0, done.stderr
+        for name in COMMANDS:
             stage = registry.load(name)
             version = [stage.version] + ([stage.fit.version] if stage.fit else [])
             found[name] = {"version": version, "digest": values_digest(Path(folder) / name)}

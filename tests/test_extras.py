@@ -22,7 +22,8 @@ from tacpipe.errors import MissingModuleError
 from tacpipe.plugins import extras, registry
 from tests import without_extras
 from tests.clouds import shapes
-from tests.conftest import Lab, forget, tacpipe
+from tests.commands import run as run_all
+from tests.conftest import Lab, forget
 from tests.formats import grasp_files, slide_files, xela_files
 from tests.promises.warm import Warm, serving
 from tests.recording.live import stream
@@ -112,9 +113,7 @@ INPUTS = (
 
 def prepare(folder: Path) -> None:
     """Fill a project with what all commands read, made where every extra is installed."""
-    for command in INPUTS:
-        done = tacpipe(folder, command)
-        assert done.returncode == 0, f"{command}: {done.stderr}"
+    run_all(folder, INPUTS)
     xela_files.write_flat(folder / "flat" / "trial_1")
     xela_files.write_psc(folder / "psc" / "trial_1")
     slide_files.write_biotac(folder / "biotac")

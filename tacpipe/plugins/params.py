@@ -276,14 +276,23 @@ def _current(several: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind |
     """
     name = _tag_name(several) if len(several) > 1 else None
     chosen = next((one for one in several if name is None or _tagged(one, name, values)), None)
-    order = [one for one in (chosen, *several) if one is not None]
+    today = _today(tuple(one for one in (chosen, *several) if one is not None))
     found = {}
     for stored, value in values.items():
-        marks = [(field, _stored_as(kind, field)) for kind in order for field in fields_of.hints(kind)]
-        field, mark = next((one for one in marks if one[1].name == stored), (stored, StoredAs(stored)))
-        choices = {old: new for new, old in mark.choices.items()}
+        field, choices = today.get(stored, (stored, {}))
         found[field] = choices.get(value, value) if isinstance(value, str) else value
     return chosen, found
+
+
+@functools.cache
+def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]]]:
+    """Return today's name and choices of each stored name; of two kinds that have it, those of the first."""
+    found: dict[str, tuple[str, Mapping[str, str]]] = {}
+    for kind in order:
+        for field in fields_of.hints(kind):
+            mark = _stored_as(kind, field)
+            found.setdefault(mark.name, (field, {old: new for new, old in mark.choices.items()}))
+    return found
 
 
 def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:

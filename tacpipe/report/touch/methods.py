@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels import biotac_sp
@@ -43,7 +44,7 @@ class Run:
         found = predictions.read(dataset.recordings[PREDICTIONS])
         return cls(dataset, contents.tree(dataset, "config.json"), contents.history(dataset), found)
 
-    @property
+    @cached_property
     def params(self) -> Tree:
         """What the model was trained with, as far as it counts for its architecture."""
         found: Tree = self.config.get("params", {})
