@@ -75,10 +75,16 @@ def fit(params: Params, train: Dataset) -> Result:
     from tacpipe.plugins.stage import Result
 
     rows = training_rows.read(train.recordings, params.representation)
+    channels = len(rows.channels)
     codec = pca.fit_and_measure(
-        rows, components=params.components, variance=params.variance, representation=params.representation
+        rows,
+        components=min(params.components, channels),
+        variance=params.variance,
+        representation=params.representation,
     )
-    return Result(files=codec.to_files())
+    few = not params.variance and params.components > channels
+    note = f"components is {params.components} and there are {channels} tactile channels, so as many latents are kept."
+    return Result(files=codec.to_files(), notes=[note] if few else [])
 
 
 @stage(version=1)
