@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.channels.absent import absent
+from tacpipe.channels.absent import absent, entry
+from tacpipe.channels.pose import METRES
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.params import added
@@ -137,7 +138,8 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 class SlipParams:
     """What counts as slip and as drop, in the readings of a proximity sensor that looks at the held object.
 
-    Thresholds are in multiples of the noise of the readings' rate after the grasp. One millimetre is 8 counts on the
+    Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are
+    taken as so many counts as ``count_per_mm`` makes of them, and never saturate. One millimetre is 8 counts on the
     published rig, its fingers' patch 25 mm, its noise 0.8 counts and its smallest reading 544.
     """
 
@@ -168,7 +170,7 @@ class SlipParams:
             )
 
 
-@stage(version=1)
+@stage(version=2)
 def slips(params: SlipParams, recording: Recording) -> pa.Table:
     """Mark slips and drops of a held object.
 
@@ -187,7 +189,13 @@ def slips(params: SlipParams, recording: Recording) -> pa.Table:
     table = recording.table()
     if "slip" in table.column_names:
         raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
-    readings = table.column(_proximity(recording.name, params.channel, table)).to_numpy().astype(np.float64)
+    channel = _proximity(recording.name, params.channel, table)
+    readings, saturated = table.column(channel).to_numpy().astype(np.float64), params.saturated_count
+    unit = (table.field(channel).metadata or {}).get(b"unit", b"").decode()
+    if unit in METRES:
+        readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
+    elif unit not in (COUNT, ""):
+        raise _no_distance(recording.name, channel, unit, table)
     t_ns = table.column("t_ns").to_numpy()
     rate_hz = _rate_hz(recording.name, t_ns)
     contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
@@ -205,8 +213,8 @@ def slips(params: SlipParams, recording: Recording) -> pa.Table:
     grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
     for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise
         since, held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
-        lost = slip.dropped(since, still, patch_count, params.saturated_count)
-        known_lost = slip.dropped_online(since, still, patch_count, params.saturated_count)
+        lost = slip.dropped(since, still, patch_count, saturated)
+        known_lost = slip.dropped_online(since, still, patch_count, saturated)
         labels["dropped"][rows] = lost
         labels["slip"][rows] = held & ~lost & slip.slip_offline(since, rate_hz, params.cutoff_hz, still, limits)
         known = slip.slip_online(since, rate_hz, params.cutoff_hz, still, limits)
@@ -501,12 +509,23 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
                 f"Recording {name} has no column {channel}; proximity is in {', '.join(found) or 'none'}."
             )
         return channel
+    if not found:
+        raise absent(name, "proximity", table.schema, unit="mm")
     if len(found) != 1:
         raise TacpipeError(
             f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected in one. "
             f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
     return found[0]
+
+
+def _no_distance(name: str, channel: str, unit: str, table: pa.Table) -> TacpipeError:
+    """Return the error of a proximity in another unit than counts or a length."""
+    stream = (table.field(channel).metadata or {}).get(b"stream", b"").decode()
+    return TacpipeError(
+        f"Recording {name}: {channel} is in {unit}, and slip is detected in counts or in {', '.join(METRES)}. Set unit in "
+        f"{entry(stream)} of the layout file, with scale where the file has another unit, and ingest again."
+    )
 
 
 def _rate_hz(name: str, t_ns: Times) -> float:

@@ -36,7 +36,8 @@ def forward(
     from tacpipe.plugins.stage import Result
     from tacpipe.tasks.forward import task
 
-    return Result(files=task.train(params, train, val, workspace, init.files if init else None))
+    files = task.train(params, train, val, workspace, init.files if init else None)
+    return Result(files=files, notes=task.notes(params, files))
 
 
 @stage(version=1, requirements=MATERIAL_NEEDS)

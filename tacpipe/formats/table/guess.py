@@ -26,6 +26,12 @@ LINES = 200  # of a text file that are looked at
 _TIME = re.compile(
     r"(t|time|timestamp|time_?stamp|stamp|clock|unix_?time|datetime|date)(_?(s|sec|ms|us|ns))?", re.IGNORECASE
 )
+VOCABULARY = (  # for who replaces a "?"
+    "quantity: what a column measures, as tactile, position, orientation (a quaternion), joint_position, force, torque,",
+    "  static_pressure, vibration, temperature, proximity; `tacpipe train TASK --requirements` lists what a task reads",
+    "unit: as count, m, mm, 1 (of a quaternion), rad, N, kPa, V; of time s, ms, us, ns",
+    '{taxel} and {axis} in match state where a tactile column lies; component = "x" which part of a vector it is',
+)
 RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 _MEANINGS = (  # how a name ends, and the quantity; the first that matches
@@ -82,6 +88,7 @@ def layout(folder: Path) -> str:
     parts = [
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
+        *(f"# {line}" for line in VOCABULARY),
     ]
     parts += [_stream(group) for group in groups]
     described = [path for path in every if path.suffix.lower() in (".yaml", ".yml", ".json")]
@@ -89,7 +96,8 @@ def layout(folder: Path) -> str:
     if described:
         parts.append(f"[[labels]]\nfile = {_quoted(_pattern(described))}")
     parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
-    return "\n\n".join(parts) + "\n"
+    head = "\n".join(parts[: 2 + len(VOCABULARY)])
+    return "\n\n".join([head, *parts[2 + len(VOCABULARY) :]]) + "\n"
 
 
 def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group]]:
@@ -280,8 +288,11 @@ def _rules(found: Looked, names: Sequence[str]) -> list[str]:
         kind = _kind(values)
         by_rule.setdefault((_match(name), *_meaning(name, kind), kind), []).append(name)
     rules = []
+    whole = {part for name in names for part in [_part(name)] if part}
     for (match, quantity, unit, kind), members in by_rule.items():
-        one = members[0] if len(members) == 1 else match
+        one = members[0] if len(members) == 1 else _of_taxels(match, quantity, kind)
+        if quantity == UNKNOWN and kind.startswith("float") and {_place(name) for name in members} <= {"x", "y", "z"}:
+            quantity = "position" if whole >= set("xyzw") else quantity
         if kind == "text":
             rules.append(f"{{ match = {_quoted(one)}, skip = true }}")
             continue
@@ -289,6 +300,27 @@ def _rules(found: Looked, names: Sequence[str]) -> list[str]:
             f"{{ match = {_quoted(one)}, quantity = {_quoted(quantity)}, unit = {_quoted(unit)}, type = {_quoted(kind)} }}"
         )
     return sorted(rules, key=lambda rule: rule.count("{"))  # exact names before patterns
+
+
+def _place(name: str) -> str:
+    """Return the letter of a column that is called x, y or z alone, else its name."""
+    return name.strip().lower()
+
+
+def _part(name: str) -> str:
+    """Return the component that a column of a quaternion or a place has by its name, as x of qx."""
+    found = re.fullmatch(r"(?:(?:quat|quaternion|orientation|ori|rot|q)_?)?([xyzw])", _place(name))
+    return found[1] if found else ""
+
+
+def _of_taxels(match: str, quantity: str, kind: str) -> str:
+    """Return the pattern of numbered columns with {taxel} for their number, where they are or can be taxels.
+
+    >>> _of_taxels("pad{pad}", "tactile", "float64"), _of_taxels("q{number}", "joint_position", "float64")
+    ('pad{taxel}', 'q{number}')
+    """
+    taxels = quantity == "tactile" or (quantity == UNKNOWN and "int" in kind)
+    return re.sub(r"\{\w+\}", "{taxel}", match) if taxels and match.count("{") == 1 else match
 
 
 def _match(name: str) -> str:

@@ -12,7 +12,7 @@ from tacpipe.arrays import Float32s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import tracks, units
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
@@ -77,9 +77,10 @@ def _table(forecaster: Forecaster, t_ns: Times, counts: Float32s, steps: Sequenc
     """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]
+    unit = str(forecaster.config["inputs"].get("unit", units.COUNT))
     for channel, name in enumerate(forecaster.codec.channels):
         for index, step in enumerate(steps):
-            about = {"quantity": "prediction", "unit": "count", "step": str(step), **forecaster.codec.layout[channel]}
+            about = {"quantity": "prediction", "unit": unit, "step": str(step), **forecaster.codec.layout[channel]}
             fields.append(pa.field(f"{name}_t{step}", pa.float32(), metadata=about))
             columns.append(pa.array(counts[index, channel]))
     return pa.Table.from_arrays(columns, schema=pa.schema(fields))

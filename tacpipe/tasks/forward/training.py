@@ -23,7 +23,7 @@ from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
@@ -71,6 +71,7 @@ def train(
     first = next(iter(training.recordings.values()))
     codec = tracks.codec_of(first.table(), training.files, first.name)
     pose = tracks.pose_of(first, params.actions, params.arm)
+    unit = units.of_channels(first.table().schema, codec.channels)
     start = Forecaster.load(init) if init else None
     params = _resolved(params, codec, start)
     if init and start:
@@ -121,6 +122,7 @@ def train(
             "tactile": list(codec.channels),
             "layout": [dict(one) for one in codec.layout],
             "orientation_reference": reference.tolist(),
+            **({} if unit == units.COUNT else {"unit": unit}),
             **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
         },
         "scaling": _scaling(parts[0]),
@@ -264,6 +266,24 @@ def _check_start(
         )
     check_codec(init, recordings)
     codecs.check_channels(start.codec.channels, codec.channels)
+
+
+def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
+    """Return what a user should know of a trained model, its ``files`` given: an architecture that is not the best known."""
+    config = json.loads(files[CONFIG])
+    raw, channels = config["codec"]["kind"] == "raw", config["inputs"]["layout"]
+    if params.architecture == forecasts.AUTO and raw and config["architecture"] != forecasts.TAXELWISE:
+        named = sum("taxel" in one for one in channels)
+        why = (
+            f"{named} of {len(channels)} channels state their taxel"
+            if named < len(channels)
+            else "sensors differ in size"
+        )
+        return [
+            f"{why}, so the architecture is {config['architecture']} and not {forecasts.TAXELWISE}. Write {{taxel}} in "
+            f"match of [streams.…] columns of the layout file where channels are taxels."
+        ]
+    return []
 
 
 def _check_pose(start: Forecaster, pose: Pose) -> None:

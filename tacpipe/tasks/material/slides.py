@@ -115,6 +115,16 @@ def read(
     return {sensor: _bundle(several, naming, labelled) for sensor, several in sorted(found.items())}
 
 
+def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[str]:
+    """Return those of the quantities that no sensor has, by the first recording of each."""
+    first = {shard.attributes.get("sensor"): shard for _, shard in sorted(recordings.recordings.items(), reverse=True)}
+    there: set[str] = set()
+    for shard in first.values():
+        schema = shard.table(STREAM if STREAM in shard.streams else "").schema
+        there |= {(field.metadata or {}).get(b"quantity", b"").decode() for field in schema}
+    return [quantity for quantity in quantities if quantity not in there]
+
+
 def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
     """Return the layout of a slide and its frames (time, channel)."""
     if STREAM not in shard.streams and "" not in shard.streams:

@@ -84,6 +84,7 @@ def train(
         raise TacpipeError(
             f"All training slides are of {naming.key} {naming.name(classes[0])}; there is nothing to classify."
         )
+    absent = slides_of.absent_quantities(training, kinds)
     config: Config = {
         "task": TASK,
         "architecture": params.architecture,
@@ -93,6 +94,7 @@ def train(
         "sensors": {name: some.layout.to_json() for name, some in known.items()},
         "classes": classes,
         **naming.to_json(),
+        **({"absent": absent} if absent else {}),
         "counts": {
             role: {name: len(some) for name, some in part.items()}
             for role, part in (("train", known), ("val", watched))
