@@ -15,7 +15,7 @@ SIDE = 4  # taxels
 PITCH_M = 4e-3
 SKIN_HZ, ARM_HZ = 100, 500
 PERIODS_M = {"cork": 2.2e-3, "foam": 9e-3, "felt": 1.2e-3, "rubber": 4.5e-3}
-STIFFNESS = 8e5  # counts a metre
+STIFFNESS = 2.4e7  # counts of a depth in metres to the power of Hertz
 LAG_S = 0.03  # of the skin behind the load
 
 
@@ -77,7 +77,7 @@ def pressed(
         for order in (1, 2, 3)
     )
     depth_m = np.clip(tilt[:, None] * (place - place.mean()) / 2 - height[:, None], 0, None)
-    load = STIFFNESS * depth_m * (1 + 0.12 * texture)
+    load = STIFFNESS * depth_m**1.5 * (1 + 0.12 * texture)
     kept = np.exp(-1 / SKIN_HZ / LAG_S)
     found = np.zeros_like(load)
     for row in range(1, len(load)):

@@ -29,6 +29,9 @@ def of_name(name: str) -> tuple[str, str]:
 
 
 def shared_name(field: pa.Field) -> str:
-    """Return what the names of the components of one vector have in common."""
+    """Return what the names of the components of one vector have in common; '' of a column that shows no component."""
     said, name = (field.metadata or {}).get(b"component", b"").decode(), str(field.name)
-    return name.removesuffix(said) if said and name.endswith(said) else of_name(name)[1]
+    if said and name.endswith(said):
+        return name.removesuffix(said)
+    part, shared = of_name(name)
+    return shared if part or said else ""
