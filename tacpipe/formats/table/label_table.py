@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.formats.table import labels
 from tacpipe.formats.table.guess import RECORDING
 from tacpipe.io import yaml_text
@@ -111,7 +111,9 @@ def _row(path: Path, place: str, key: str, row: Mapping[str, Any], texts: bool) 
     name = written(row.get(key))
     if not name:
         raise TacpipeError(f"{path}, {place} has no {plain(key)}. Write the name of its recording, or remove the row.")
-    values = {label: labels.plain_value(value) if texts else value for label, value in row.items() if label != key}
+    values = {label: value for label, value in row.items() if label != key}
+    if texts:
+        values = {label: labels.plain_value(value) for label, value in values.items() if value}
     return Row(place, name, {label: _value(path, place, label, value) for label, value in values.items()})
 
 
@@ -127,11 +129,11 @@ def _value(path: Path, place: str, label: str, value: Any) -> Attribute:
 
 
 def _cells(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the cells with text of each row of a text table by the names of its header."""
+    """Yield the cells of each row of a text table by the names of its header."""
     numbered = labels.read_rows(path)
     header = next(numbered, (0, []))[1]
     for line, cells in numbered:
-        yield f"line {line}", {name: cell for name, cell in zip(header, cells, strict=True) if cell}
+        yield f"line {line}", dict(zip(header, cells, strict=True))
 
 
 def _parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -139,7 +141,11 @@ def _parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
     with regular.failing(path):
         content = regular.content(path, labels.MOST_BYTES)
-    for number, row in enumerate(parquet.from_parquet(content).to_pylist()):
+    try:
+        table = parquet.from_parquet(content)
+    except DamagedError as error:
+        raise TacpipeError(f"{path} cannot be read: {error}") from error
+    for number, row in enumerate(table.to_pylist()):
         yield f"row {number}", {name: value for name, value in row.items() if value is not None}
 
 
