@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from tacpipe.arrays import AnyFloats
+
 SIDE = 4  # taxels
 PITCH_M = 4e-3
 SKIN_HZ, ARM_HZ = 100, 500
@@ -45,7 +47,7 @@ def write(folder: Path, count: int = 20, seconds: float = 8.0, seed: int = 0) ->
         (place / "labels.yaml").write_text(f"material: {material}\nobject: plate_{trial % 5 + 1}\n")
 
 
-def moved(rng: np.random.Generator, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def moved(rng: np.random.Generator, seconds: float) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     """Return times (time,), the arm's positions (time, 3) in m and its tilt (time,) in rad: down, along, up."""
     time_s = np.arange(int(seconds * ARM_HZ)) / ARM_HZ
     down, up, press_m = 0.7 + rng.uniform(0, 0.2), seconds - 0.8, rng.uniform(0.6, 1.8) * 1e-3
@@ -64,11 +66,11 @@ def moved(rng: np.random.Generator, seconds: float) -> tuple[np.ndarray, np.ndar
 def pressed(
     rng: np.random.Generator,
     period_m: float,
-    skin_s: np.ndarray,
-    time_s: np.ndarray,
-    position_m: np.ndarray,
-    tilt_rad: np.ndarray,
-) -> np.ndarray:
+    skin_s: AnyFloats,
+    time_s: AnyFloats,
+    position_m: AnyFloats,
+    tilt_rad: AnyFloats,
+) -> AnyFloats:
     """Return the load of each taxel (time, taxel) in counts."""
     along, height, tilt = (np.interp(skin_s, time_s, one) for one in (position_m[:, 0], position_m[:, 2], tilt_rad))
     place = np.tile(np.arange(SIDE) * PITCH_M, SIDE)  # (taxel,), along the slide
@@ -77,9 +79,9 @@ def pressed(
         for order in (1, 2, 3)
     )
     depth_m = np.clip(tilt[:, None] * (place - place.mean()) / 2 - height[:, None], 0, None)
-    load = STIFFNESS * depth_m**1.5 * (1 + 0.12 * texture)
+    load: AnyFloats = STIFFNESS * depth_m**1.5 * (1 + 0.12 * texture)
     kept = np.exp(-1 / SKIN_HZ / LAG_S)
-    found = np.zeros_like(load)
+    found: AnyFloats = np.zeros_like(load)
     for row in range(1, len(load)):
         found[row] = kept * found[row - 1] + (1 - kept) * load[row]
     return found

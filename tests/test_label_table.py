@@ -25,7 +25,7 @@ TABLES = {  # the same labels in each format
         ]
     ),
 }
-WANTED = {
+WANTED: dict[str, dict[str, Any]] = {
     "trial-000": {"material": "foam", "grit": 3, "good": True},
     "trial-001": {"material": "cork"},
     "trial-002": {"material": "007", "grit": 4.5, "good": False},

@@ -53,9 +53,9 @@ def recording(
 
 
 def trained(folder: Path, architecture: str = "auto", actions: str = "planned", arm: str = "", **made: Any) -> Any:
-    parts = [dataset(*(recording(seed, **made) for seed in seeds)) for seeds in (range(3), [10])]
+    training, validation = (dataset(*(recording(seed, **made) for seed in seeds)) for seeds in (range(3), [10]))
     asked = params(architecture=architecture, actions=actions, arm=arm)
-    return forward.train(asked, *parts, folder)
+    return forward.train(asked, training, validation, folder)
 
 
 @pytest.mark.long
