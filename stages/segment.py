@@ -294,7 +294,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
     ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
     then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
-    positions if nothing else tells its speed. Of such a slide no protocol is known, and none is checked.
+    positions if nothing else gives its speed. Of such a slide no protocol is known, and none is checked.
 
     Example: tacpipe segment slides data/touched -o data/slides
     """

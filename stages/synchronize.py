@@ -385,7 +385,7 @@ def _order(stream: _Stream, members: list[str]) -> list[int]:
         raise TacpipeError(
             f"Stream {stream.name!r}: the orientation in {_list(members)} has the components "
             f"{_list(part or 'unknown' for part in found)}; a quaternion needs x, y, z and w once each. Set component = "
-            f'"x" and so on in {entry(stream.name)} of the layout file, or another quantity for what is no quaternion.'
+            f'"x" and so on in {entry(stream.name)} of the layout file, or another quantity for what is not a quaternion.'
         )
     return [found.index(part) for part in "xyzw"]
 

@@ -59,7 +59,7 @@ def pose(schema: pa.Schema, arm: str = "") -> Pose:
         several = listed(field.name for fields in found.values() for field in fields)
         raise TacpipeError(
             f"There are {len(found)} positions ({several}), and the motion of one arm is read. Name its stream with "
-            f"--arm, or give what is no arm another quantity in {entry(stream if here else '')} of the layout file."
+            f"--arm, or give what is not an arm another quantity in {entry(stream if here else '')} of the layout file."
         )
     position = _ordered(here[0], "xyz", POSITION, stream)
     turned = [fields for (owner, _), fields in _vectors(schema, ORIENTATION).items() if owner == stream]

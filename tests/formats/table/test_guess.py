@@ -118,7 +118,7 @@ def test_numbered_columns_that_are_or_may_be_taxels_state_which(tmp_path: Path) 
 
 
 def test_a_place_beside_a_quaternion_is_a_position_and_one_alone_is_asked_for(tmp_path: Path) -> None:
-    place, turned = dict.fromkeys("xyz", [0.5, 0.25]), dict.fromkeys(("qx", "qy", "qz", "qw"), [0.5, 0.25])
+    place, turned = (dict.fromkeys(names, (0.5, 0.25)) for names in ("xyz", ("qx", "qy", "qz", "qw")))
     time = {"time": [1.7e9, 1.7e9 + 1]}
     alone = columns_of(tmp_path, pd.DataFrame({**time, **place}))
     beside = columns_of(tmp_path, pd.DataFrame({**time, **place, **turned}))
