@@ -17,6 +17,7 @@ COUNTS := .cache/counts.jsonl
 SECONDS := 60
 DATA := $(TACPIPE_SAMPLE_DATA)
 EVERY := 1
+SLOW := 1/1
 TARGETS :=
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto
 FAULTS := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST) --every $(EVERY)
@@ -68,8 +69,8 @@ test-long: $(VENV)/.dev ## run the tests that take long: training, kills and cro
 test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
 	@$(PYTEST) -m "rig and not faults"
 
-test-ci: $(VENV)/.dev ## run the tests of all three in one go, which is faster
-	@$(PYTEST) -m "not faults"
+test-ci: $(VENV)/.dev ## run the tests of all three in one go, which is faster; SLOW=2/3 runs every third of the slow ones, from the second
+	@$(PYTEST) -m "not faults" --slow $(SLOW)
 
 test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight other processes keep the computer busy
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi

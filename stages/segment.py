@@ -300,7 +300,8 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     """
     from tacpipe.channels import arm
     from tacpipe.channels.finger import finger, mended
-    from tacpipe.channels.streams import of_quantity, streams_of
+    from tacpipe.channels.streams import of_quantity
+    from tacpipe.datasets.streams import streams_of
     from tacpipe.signals import slides as found
 
     streams = streams_of(recording)

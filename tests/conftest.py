@@ -77,13 +77,18 @@ def name_signals() -> None:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--every", type=int, default=1, help="Run one of so many of the tests that were chosen.")
+    parser.addoption("--slow", default="1/1", help="K/N: of those marked long or rig, run each Nth from the Kth.")
 
 
 @pytest.hookimpl(trylast=True)  # after markers chose what runs
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     every: int = config.getoption("--every")
-    config.hook.pytest_deselected(items=[item for number, item in enumerate(items) if number % every])
-    items[:] = items[::every]
+    first, _, share = config.getoption("--slow").partition("/")
+    slow = [item for item in items if item.get_closest_marker("long") or item.get_closest_marker("rig")]
+    left = {id(item) for number, item in enumerate(slow, 1) if (number - int(first)) % int(share)}
+    left |= {id(item) for number, item in enumerate(items) if number % every}
+    config.hook.pytest_deselected(items=[item for item in items if id(item) in left])
+    items[:] = [item for item in items if id(item) not in left]
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -40,7 +40,7 @@ def completed(folder: Path, shell: str, line: str) -> set[str]:
     return {word.partition("\t")[0].strip('(")*:') for word in done.stdout.replace('":"', "\t").split("\n")}
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("shell", ["bash", *(pytest.param(name, marks=pytest.mark.long) for name in ("zsh", "fish"))])
 def test_commands_methods_and_options_are_completed_in_every_shell(tmp_path: Path, shell: str) -> None:
     named = {name.partition(".")[0] for name in registry.stages()} | set(commands.NAMES)
     every = completed(tmp_path, shell, "tacpipe ")

@@ -56,8 +56,9 @@ def sentences(tree: ast.AST) -> Iterator[str]:
     for raised in ast.walk(tree):
         if not isinstance(raised, ast.Raise):
             continue
-        inner = {id(part) for node in ast.walk(raised) if isinstance(node, ast.JoinedStr) for part in node.values}
-        for node in ast.walk(raised):
+        nodes = list(ast.walk(raised))
+        inner = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}
+        for node in nodes:
             if isinstance(node, ast.JoinedStr):
                 yield "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:

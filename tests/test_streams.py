@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.channels.streams import of_quantity, signal, streams_of
+from tacpipe.channels.streams import of_quantity, signal
+from tacpipe.datasets.streams import streams_of
 
 
 @dataclass

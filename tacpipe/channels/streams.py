@@ -1,4 +1,4 @@
-"""The streams of a recording, whether they lie apart, as recorded, or side by side in one synchronized table."""
+"""What the table of a stream holds: its rate, its columns of a quantity, and which are ground truth."""
 
 from __future__ import annotations
 
@@ -9,30 +9,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import AnyArray, Int64s
-    from tacpipe.datasets.dataset import Recording
 
-NO_SIGNALS = ("events", "truth")  # streams of what went wrong, and of what a simulation knows
 TRUTH = "gt_"  # how columns with ground truth begin
-
-
-def streams_of(recording: Recording) -> dict[str, pa.Table]:
-    """Return the table of each stream, under the names that its columns had when they were recorded.
-
-    Ground truth and the masks of a synchronized table are left out.
-    """
-    if set(recording.streams) != {""}:
-        return {name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS}
-    table = recording.table()
-    columns: dict[str, list[str]] = {}
-    for field in table.schema:
-        metadata = field.metadata or {}
-        signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
-        if signal:
-            columns.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
-    return {
-        stream: table.select(["t_ns", *names]).rename_columns(["t_ns", *(_recorded(name, stream) for name in names)])
-        for stream, names in columns.items()
-    }
 
 
 def rate_hz(table: pa.Table) -> float | None:
@@ -66,7 +44,3 @@ def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyA
             values = np.column_stack([table.column(name).to_numpy() for name in names])
             return table.column("t_ns").to_numpy(), values
     return None
-
-
-def _recorded(name: str, stream: str) -> str:
-    return name.removeprefix(f"{stream}_") if stream else name

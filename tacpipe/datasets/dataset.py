@@ -90,7 +90,7 @@ class Recording:
 
         if stream in self._shards:
             return from_parquet(self._content(stream), columns)
-        from tacpipe.channels.streams import streams_of
+        from tacpipe.datasets.streams import streams_of
 
         within = streams_of(self) if self.streams == ("",) else {}
         if stream not in within:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe import printable
 from tacpipe.channels import streams
+from tacpipe.datasets.streams import streams_of
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed
 
@@ -61,7 +62,7 @@ def _streams(recording: Recording) -> str:
     try:
         if recording.streams == ("",):
             table = recording.table()
-            within = [name for name in streams.streams_of(recording) if name]
+            within = [name for name in streams_of(recording) if name]
             return f"one table ({_size(table)}){' of ' if within else ''}{', '.join(within)}"
         return ", ".join(f"{name} ({_size(recording.table(name))})" for name in recording.streams)
     except TacpipeError as error:

@@ -133,7 +133,7 @@ class Stage(Generic[P, R]):
         """Return whether the argument ``name`` may be left out."""
         return _text(inspect.signature(self.function).parameters[name].annotation).endswith(" | None")
 
-    @property
+    @functools.cached_property
     def params(self) -> Any:
         """The dataclass of the first argument, or a union of dataclasses; `params.kinds` gives each."""
         function: Any = self.function

@@ -32,12 +32,13 @@ CORE = (
     "simulate touch --trials 1 -o data/grasps",
 )
 LEARN = (
-    "train forward data/segments --split data/split -o model --architecture linear",
+    "train forward data/segments --split data/split -o model --epochs 1",
     "evaluate model data/segments --split data/split -o results",
     "report results -o report.html",
 )
 CLOUDS = ("candidates box.pcd",)
 DEVICES = ("sensors probe",)
+SILENT = 5  # where the computer has a serial port, and nothing answers there
 EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not without
     "learn": LEARN,
     "clouds": CLOUDS,
@@ -103,7 +104,8 @@ def tried(folder: Path, package: Path, extra: str) -> float:
     write_box(project / "box.pcd")
     print(run([str(python), "-c", IMPORT_ALL, extra], project), end="")
     for command in (*CORE, *EXTRAS.get(extra, ())):
-        run([str(environment / "bin" / "tacpipe"), *shlex.split(command)], project)
+        allowed = (0, SILENT) if command in DEVICES else (0,)
+        run([str(environment / "bin" / "tacpipe"), *shlex.split(command)], project, allowed)
     return installed_mb
 
 
@@ -122,10 +124,10 @@ def size_mb(folder: Path) -> float:
     return sum(path.lstat().st_size for path in folder.rglob("*") if not path.is_dir()) / 1e6
 
 
-def run(words: list[str], folder: Path) -> str:
-    """Return what a command prints; raises `FailedError` where it does not end with 0."""
+def run(words: list[str], folder: Path, allowed: tuple[int, ...] = (0,)) -> str:
+    """Return what a command prints; raises `FailedError` where it ends with a code that is not allowed."""
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode:
+    if done.returncode not in allowed:
         raise FailedError(f"{shlex.join(words)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
     return done.stdout
 

@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.report import drawing, page
+from tests.fake_recordings import FakeRecording
 from tests.promises.counts import count
 from tests.promises.limits import some
 from tests.report import elements
 from tests.report.forward import result_fakes
 from tests.report.material import material_fakes
-from tests.report.stream_shard import StreamShard
 from tests.report.test_page import other
 from tests.report.touch import touch_fakes
 from tests.stages.learning_fakes import FakeDataset, FakeShard
@@ -81,8 +81,8 @@ def shard(one: Any, words: Words) -> Any:
         renamed(one.name, words),
         {**renamed(one.attributes, words), "note": words[NOTE], "object": words[NOTE]},
     )
-    if isinstance(one, StreamShard):
-        return StreamShard(name, {stream: table(one.table(stream), words) for stream in one.streams}, attributes)
+    if isinstance(one, FakeRecording):
+        return FakeRecording({stream: table(one.table(stream), words) for stream in one.streams}, name, attributes)
     return FakeShard(name, one.content, attributes)
 
 

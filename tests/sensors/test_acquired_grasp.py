@@ -21,7 +21,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.sensors.tap import Tap
 from tests.clouds.scene_fakes import scene
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 
 
 def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
@@ -47,6 +47,6 @@ def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     }
 
     held = {"scene": whole.cloud.table(), "grasp": grasp.table(5)}
-    found, expected = (stage(stage.params(), FakeShard(streams)).streams for streams in (came, held))
+    found, expected = (stage(stage.params(), FakeRecording(streams)).streams for streams in (came, held))
     np.testing.assert_array_equal(Cloud.of(found["cloud"]).points_m, Cloud.of(expected["cloud"]).points_m)
     assert found["grasp"].equals(expected["grasp"])

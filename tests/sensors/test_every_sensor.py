@@ -169,7 +169,7 @@ def test_frames_are_found_again_within_two(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_chunks_give_the_same_samples_however_they_are_batched(case: str) -> None:
-    one = sent(case, 300)
+    one = sent(case, 100)
     rng = np.random.default_rng(3)
     chunks = harm.sent(one.sensor, one.pieces, list(harm.harms(one.sensor, one.pieces, rng)), rng)
 

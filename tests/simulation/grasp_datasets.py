@@ -12,13 +12,13 @@ from tacpipe.channels import biotac_sp
 from tacpipe.io.hashing import digest
 from tacpipe.simulation.grasp import simulate_trial
 from tacpipe.simulation.grasp_scene import Rig
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import FakeDataset
 
 SEED = 5
 
 
-class GraspShard(FakeShard):
+class GraspShard(FakeRecording):
     """A recording of one grasp."""
 
     @property

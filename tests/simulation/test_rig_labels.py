@@ -13,7 +13,7 @@ from tacpipe.channels import schema
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import faults, pick_and_move, taxels
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 
 TRIALS = 20
 simulate, synchronize = load("simulate.forward"), load("synchronize")
@@ -26,14 +26,14 @@ def recorded(trial: int, **rig: Any) -> RecordingOutput:
 
 
 def synced(recording: RecordingOutput, **params: Any) -> RecordingOutput:
-    found: RecordingOutput = synchronize(synchronize.params(**params), FakeShard(recording.streams))
+    found: RecordingOutput = synchronize(synchronize.params(**params), FakeRecording(recording.streams))
     return found
 
 
 @cache
 def labelled(trial: int, **rig: Any) -> pa.Table:
     table = synced(recorded(trial, **rig)).streams[""]
-    return slips(slips.params(), FakeShard(contacts(contacts.params(), FakeShard({"": table})).streams))
+    return slips(slips.params(), FakeRecording(contacts(contacts.params(), FakeRecording({"": table})).streams))
 
 
 def column(table: pa.Table, name: str) -> np.ndarray:
@@ -56,6 +56,7 @@ def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], least: f
     assert 2 * (found & truth).sum() / (found.sum() + truth.sum()) >= least
 
 
+@pytest.mark.long
 def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
     for trial in range(TRIALS):
         table = labelled(trial, effort=1.15)
@@ -64,6 +65,7 @@ def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
         assert abs(int(found.argmax()) - int(truth.argmax())) <= 2
 
 
+@pytest.mark.long
 def test_where_nothing_slips_there_is_at_most_one_false_frame_a_minute() -> None:
     tables = [labelled(trial, friction_scale=4.0) for trial in range(TRIALS)]
     assert not any(column(table, "gt_slip").any() for table in tables)

@@ -24,7 +24,7 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, predicted
 from tests.asked import fitting
-from tests.stages.conftest import FakeShard as Recording
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import FakeShard, dataset
 
 HORIZON = 10
@@ -54,8 +54,8 @@ simulate, synchronize, contacts = load("simulate.forward"), load("synchronize"),
 def recorded(index: int, grid: str = "uniform", **rig: Any) -> FakeShard:
     """A segmented trial of the rig."""
     recording = simulate(simulate.params(**rig), index)
-    synced = synchronize(synchronize.params(grid=grid), Recording(recording.streams))
-    table = contacts(contacts.params(), Recording({"": synced.streams[""]})).streams[""]
+    synced = synchronize(synchronize.params(grid=grid), FakeRecording(recording.streams))
+    table = contacts(contacts.params(), FakeRecording({"": synced.streams[""]})).streams[""]
     return FakeShard(f"trial-{index}", table, dict(recording.attributes) | {"grid": grid})
 
 

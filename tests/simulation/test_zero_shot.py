@@ -19,7 +19,7 @@ from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
 from tacpipe.tasks.material import task as material
 from tests.asked import fitting
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 from tests.tasks.material.textures import Slide, dataset
 
 SEEDS, MATERIALS = (0, 1, 2), 12
@@ -34,7 +34,7 @@ def slide(seed: int, index: int, spectra: str) -> Slide:
     """Slide ``index`` of the rig, cut as any other."""
     asked = simulate.params(seed=seed, materials=MATERIALS, spectra=spectra, pac=False, arm_every=0)
     recording = simulate(asked, index)
-    cut = segment(segment.params(), FakeShard(recording.streams, f"slide-{index}", recording.attributes))
+    cut = segment(segment.params(), FakeRecording(recording.streams, f"slide-{index}", recording.attributes))
     return Slide(cut.streams, f"slide-{index}", {**recording.attributes, **cut.attributes})
 
 

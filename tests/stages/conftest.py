@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
-import pyarrow as pa
 import pytest
 
-from tacpipe.io.columns import Columns
-from tacpipe.io.parquet import to_parquet
-from tacpipe.plugins.stage import Attribute
-
-
-@dataclass(frozen=True)
-class FakeShard:
-    """What a stage sees of one recording."""
-
-    tables: Mapping[str, pa.Table]
-    name: str = "trial"
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)
-
-    @property
-    def streams(self) -> tuple[str, ...]:
-        return tuple(sorted(self.tables))
-
-    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
-
-    def columns(self, stream: str = "") -> Columns:
-        return Columns(to_parquet(self.tables[stream]))
+from tests.fake_recordings import FakeRecording
 
 
 @pytest.fixture
-def shard() -> Callable[..., FakeShard]:
+def shard() -> Callable[..., FakeRecording]:
     """Make a recording of tables by stream name."""
-    return FakeShard
+    return FakeRecording

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tests.report.stream_shard import StreamShard
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import FakeDataset, FakeShard
 
 MATERIALS, TRIALS = 4, 5  # of the test slides of a sensor
@@ -153,16 +153,16 @@ def recorded(count: int = 3, outside: int = 1) -> Any:
             }
         )
         why = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
-        attributes = {
+        attributes: dict[str, Any] = {
             "published": "biotac-slide",
             "sensor": "biotac",
             "force_n": 1.0 + index,
             "outside_protocol": index < outside,
             **why,
         }
-        shards[f"biotac-m01-t{index:03d}"] = StreamShard(
-            f"biotac-m01-t{index:03d}", {"slide": profile, "profile": profile}, attributes
+        shards[f"biotac-m01-t{index:03d}"] = FakeRecording(
+            {"slide": profile, "profile": profile}, f"biotac-m01-t{index:03d}", attributes
         )
     attributes = {"published": "roboskin", "sensor": "roboskin", "outside_protocol": False}
-    shards["roboskin-test-000"] = StreamShard("roboskin-test-000", {"slide": pa.table({"t_ns": [0]})}, attributes)
+    shards["roboskin-test-000"] = FakeRecording({"slide": pa.table({"t_ns": [0]})}, "roboskin-test-000", attributes)
     return FakeDataset(shards)

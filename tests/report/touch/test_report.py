@@ -27,6 +27,7 @@ def everything(simulated: bool = False) -> list[Any]:
     ]
 
 
+@pytest.mark.long
 def test_all_parts_are_told_on_one_page_that_is_the_same_each_time() -> None:
     given = [*everything(), recorded()]
     told = page.render(given, title="t")

@@ -13,7 +13,7 @@ from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tests.report.stream_shard import StreamShard
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import FakeDataset
 
 KNOWN, NOVEL = ("bleach", "coffee", "spam"), ("drill", "shoe")
@@ -95,7 +95,7 @@ def result(
     tables = {name: _table(touch) for name, touch in shares.items()}
     marked = {"published": "vision2tactile"} if published else {}
     attributes = {"simulated": True} if simulated else marked
-    shard: Any = StreamShard("predictions", {"grasps": pa.table(grasps), **tables}, attributes)
+    shard: Any = FakeRecording({"grasps": pa.table(grasps), **tables}, "predictions", attributes)
     config = {
         "task": "touch",
         "architecture": architecture,
@@ -137,7 +137,7 @@ def recorded(names: Sequence[str] = ("bleach-001", "drill-002")) -> Any:
         cloud = Cloud(points, np.full(points.shape, 128, np.uint8))
         grasp = Grasp(np.array([-0.035, 0.02, 0.8]), np.array([0.035, 0.02, 0.8]))
         tables = {"cloud": cloud.table(), "grasp": grasp.table(0), "reading": pa.table({"t_ns": [0]})}
-        shards[name] = StreamShard(name, tables, {"object": name.partition("-")[0]})
+        shards[name] = FakeRecording(tables, name, {"object": name.partition("-")[0]})
     return FakeDataset(shards)
 
 

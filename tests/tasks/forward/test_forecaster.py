@@ -19,7 +19,7 @@ from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel, load
 from tests.conftest import sample_data
-from tests.report.stream_shard import StreamShard
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
@@ -232,8 +232,8 @@ def published(files: Mapping[str, Path]) -> FakeShard:
         load_stage(name) for name in ("ingest.xela-flat", "synchronize", "segment.contacts")
     )
     recording = ingest(ingest.params(), files)
-    synced = synchronize(synchronize.params(grid="logged"), StreamShard("trial", recording.streams))
-    made = contacts(contacts.params(), StreamShard("trial", synced.streams))
+    synced = synchronize(synchronize.params(grid="logged"), FakeRecording(recording.streams))
+    made = contacts(contacts.params(), FakeRecording(synced.streams))
     return FakeShard("-".join(sorted(map(str, files.values())))[-60:], made.streams[""], dict(synced.attributes))
 
 

@@ -14,7 +14,7 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.material import task as material
 from tests.asked import fitting
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import FakeDataset
 
 MATERIALS = (1, 2, 3, 4)
@@ -23,7 +23,7 @@ CHANNELS = {"biotac": 5, "roboskin": 60}
 SMALL = {"features": 200, "epochs": 3, "hidden": 8, "latents": 6, "batch": 8, "align_from": 1}
 
 
-class Slide(FakeShard):
+class Slide(FakeRecording):
     """A recording with one slide."""
 
     @property

@@ -20,7 +20,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch.grasps import Grasps
 from tests.asked import fitting
-from tests.stages.conftest import FakeShard
+from tests.fake_recordings import FakeRecording
 from tests.stages.learning_fakes import FakeDataset
 
 OBJECTS = {"ball": 0.03, "melon": 0.05}  # metres, half the size
@@ -32,7 +32,7 @@ POINTNET = {
 }
 
 
-class GraspShard(FakeShard):
+class GraspShard(FakeRecording):
     """A recording of one grasp."""
 
     @property

@@ -60,7 +60,7 @@ def test_strong_trees_are_a_forest_a_target_and_one_of_all(tmp_path: Path) -> No
     assert config(trained(tmp_path, targets="e_th"))["members"][0]["groups"] == [["e_th"]]
 
 
-@pytest.mark.parametrize("changed", [{}, TREES, PATCHES, POINTNET])
+@pytest.mark.parametrize("changed", [{}, TREES, PATCHES, pytest.param(POINTNET, marks=pytest.mark.long)])
 def test_training_again_gives_the_same_bytes_and_another_seed_does_not(changed: dict[str, Any], tmp_path: Path) -> None:
     one, same, other = (
         trained(tmp_path / name, **{**changed, "seed": seed}) for name, seed in (("a", 0), ("b", 0), ("c", 1))
@@ -155,6 +155,7 @@ def test_patience_ends_a_training_whose_validation_loss_no_longer_falls(tmp_path
     assert [line["best"] for line in lines[-3:]] == [True, False, False]
 
 
+@pytest.mark.long
 def test_one_network_a_target_makes_four_members_each_with_its_history(tmp_path: Path) -> None:
     files = trained(tmp_path, **{**POINTNET, "targets": "e_mf, pdc_th,e_th,pdc_mf", "multi_target": False})
     told = config(files)
@@ -176,7 +177,9 @@ def test_several_networks_have_other_first_weights(tmp_path: Path) -> None:
     assert not (weights["0.network.head.0.weight"] == weights["1.network.head.0.weight"]).all()
 
 
-@pytest.mark.parametrize("changed", [{}, TREES, PATCHES, {**POINTNET, "multi_target": True}])
+@pytest.mark.parametrize(
+    "changed", [{}, TREES, PATCHES, pytest.param({**POINTNET, "multi_target": True}, marks=pytest.mark.long)]
+)
 def test_some_targets_alone_are_told_where_only_they_are_asked_for(changed: dict[str, Any], tmp_path: Path) -> None:
     files = trained(tmp_path, **{**changed, "targets": "e_th,pdc_mf"})
     assert config(files)["targets"] == ["pdc_mf", "e_th"]

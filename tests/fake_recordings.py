@@ -1,24 +1,24 @@
-"""A recording with several streams, made by hand."""
+"""A recording without a store, for functions that read recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import pyarrow as pa
 
 from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
+from tacpipe.plugins.stage import Attribute
 
 
 @dataclass
-class StreamShard:
-    """A recording with several streams."""
+class FakeRecording:
+    """What a stage sees of one recording: tables by stream name."""
 
-    name: str
     tables: Mapping[str, pa.Table]
-    attributes: dict[str, Any] = field(default_factory=dict)
+    name: str = "trial"
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     @property
     def streams(self) -> tuple[str, ...]:
