@@ -60,7 +60,8 @@ def worst(counts: Ints, materials: Sequence[int | str]) -> str:
 def _figure(method: Method, sensor: str) -> str:
     counts, materials = counted(method, sensor)
     runs = len(method.of(sensor))
-    svg = figures.confusion(counts, materials, f"Materials and what they were taken for, {shown(sensor)}")
+    label = method.of(sensor)[0].predictions.naming.key
+    svg = figures.confusion(counts, materials, f"Materials and what they were taken for, {shown(sensor)}", label)
     caption = (
         f"{shown(sensor)}, {method.name}: {counts.trace()} of {counts.sum()} right on unseen slides"
         f"{f', {runs} runs pooled' if runs > 1 else ''}. {worst(counts, materials)}"

@@ -70,7 +70,7 @@ def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Seque
     return svg(draw, title, size=(5.4, 3.4 + 0.2 * len(bands)))
 
 
-def confusion(counts: Ints, materials: Sequence[int | str], title: str) -> str:
+def confusion(counts: Ints, materials: Sequence[int | str], title: str, label: str = "material") -> str:
     """Return how often each material (row) was taken for each (column), in squares; mistakes stand as numbers."""
 
     def draw(axes: list[Axes]) -> None:
@@ -89,7 +89,7 @@ def confusion(counts: Ints, materials: Sequence[int | str], title: str) -> str:
             if not right:
                 axes[0].text(column, row, str(count), fontsize=7, ha="center", va="center")
         ends = (-0.5, len(materials) - 0.5)
-        axes[0].set(xlim=ends, ylim=ends[::-1], aspect="equal", xlabel="named", ylabel="material")
+        axes[0].set(xlim=ends, ylim=ends[::-1], aspect="equal", xlabel="named", ylabel=label)
         axes[0].spines[["top", "right"]].set_visible(True)
         for axis in (axes[0].xaxis, axes[0].yaxis):
             axis.set_ticks(range(len(materials)), labels=[_short(str(one)) for one in materials], fontsize=7)

@@ -70,7 +70,7 @@ def _figure(method: Method) -> str:
     sensors, parts = rows
     points = projected([_latents(part) for part in parts])
     clouds = [
-        Cloud(shown(sensor), at, part.materials, part.names)
+        Cloud(shown(sensor), at, part.materials, part.naming.names)
         for sensor, at, part in zip(sensors, points, parts, strict=True)
     ]
     partners = {int(one): int(other) for one, other in method.runs[0].config.get("partners", {}).items()}

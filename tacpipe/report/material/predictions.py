@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.tasks.material.naming import Naming
+from tacpipe.tasks.material.naming import NUMBERS, Naming
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,7 +33,7 @@ class Predictions:
     materials: Int64s  # (slide,), the truth
     predicted: Mapping[str, Int64s]  # by predictor, (slide,)
     latents: AnyFloats | None  # (slide, latent); None where the model has none
-    names: tuple[str, ...] = ()  # of materials, where they are not their numbers
+    naming: Naming = NUMBERS  # of materials
     sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
 
     def of(self, sensor: str) -> Predictions:
@@ -43,12 +43,12 @@ class Predictions:
         latents = None if self.latents is None else self.latents[rows]
         sessions = None if self.sessions is None else self.sessions[rows]
         return Predictions(
-            self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, self.names, sessions
+            self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, self.naming, sessions
         )
 
     def named(self, materials: Int64s) -> NDArray[Any]:
         """Return the names of materials (slide,): text, or the numbers where these are the names."""
-        return Naming(names=self.names).named(materials)
+        return self.naming.named(materials)
 
     @property
     def one_session_each(self) -> bool:
@@ -78,7 +78,7 @@ def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
         _numbers(table, "material", naming),
         {name: _numbers(table, name, naming) for name in PREDICTORS if name in table.column_names},
         latents if latents is not None and np.isfinite(latents).all() else None,
-        naming.names,
+        naming,
         np.array([one or "" for one in table["session"].to_pylist()], dtype=np.str_)
         if "session" in table.column_names
         else None,
