@@ -207,7 +207,7 @@ def _master(recording: str, wanted: str, streams: Mapping[str, Columns]) -> str:
     for name, columns in streams.items():
         if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in columns.schema):
             return name
-    found = absent(recording, "tactile", (field for columns in streams.values() for field in columns.schema))
+    found = absent(recording, "tactile", {name: columns.schema for name, columns in streams.items()})
     raise TacpipeError(f"{found} Without a tactile stream, name the master among {_list(streams)} with --master.")
 
 

@@ -95,3 +95,8 @@ def test_what_is_absent_is_named_with_what_is_there_and_where_to_declare_it() ->
     said = str(absent.absent("trial-3", "tactile", [pa.field("t_ns", pa.int64()), bare, *arm("ee")]))
     for part in ("trial-3", "tactile", "3 of position", "skin_t1", "[streams.skin] columns", 'quantity = "tactile"'):
         assert part in said
+
+
+def test_columns_of_streams_name_the_stream_in_which_to_declare_them() -> None:
+    streams = {"skin": [pa.field("t1", pa.uint16())], "ee": arm("ee")}
+    assert "[streams.skin] columns" in str(absent.absent("trial-3", "tactile", streams))

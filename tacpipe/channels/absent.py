@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _NO_CHANNELS = ("time", "mask", "label", "latent", "prediction")  # quantities of columns that no sensor gave
-_SHOWN = 6
+_SHOWN = 6  # quantities
 
 
 def entry(stream: str) -> str:
@@ -25,16 +25,22 @@ def entry(stream: str) -> str:
 
 
 def absent(
-    recording: str, quantity: str, fields: Iterable[pa.Field], *, unit: str = "", stream: str = ""
+    recording: str, quantity: str, fields: Iterable[pa.Field] | Mapping[str, Iterable[pa.Field]], *, unit: str = ""
 ) -> TacpipeError:
-    """Return the error of a recording without a channel of ``quantity``; ``fields`` are those of all its columns.
+    """Return the error of a recording without a channel of ``quantity``; ``fields`` are those of all its columns, or of each
+    stream.
 
-    It names the quantities that are there, columns without one first, and the line of a layout file that sets it.
+    It names the quantities that are there, the columns without one, and the line of a layout file that sets it.
     """
     undeclared: list[str] = []
     known: dict[str, int] = {}
-    streams = {stream} if stream else set()
-    for field in fields:
+    streams: set[str] = set()
+    owned: list[tuple[str, pa.Field]]
+    if isinstance(fields, Mapping):
+        owned = [(stream, field) for stream, some in fields.items() for field in some]
+    else:
+        owned = [("", field) for field in fields]
+    for stream, field in owned:
         metadata = field.metadata or {}
         found = metadata.get(b"quantity", b"").decode()
         if found in _NO_CHANNELS or field.name in ("t_ns", "seq", "t_device_ns"):
@@ -43,12 +49,13 @@ def absent(
             known[found] = known.get(found, 0) + 1
         else:
             undeclared.append(field.name)
-            streams.add(metadata.get(b"stream", b"").decode())
+            streams.add(stream or metadata.get(b"stream", b"").decode())
     there = [f"{count} of {plain(name)}" for name, count in known.items()]
     there += [f"{len(undeclared)} without a quantity ({listed(undeclared, 3)})"] if undeclared else []
     where = entry(streams.pop() if len(streams) == 1 else "")
     wanted = f'quantity = "{quantity}"' + (f' and unit = "{unit}"' if unit else "")
+    shown = ", ".join(there[-_SHOWN:]) or "none"
     return TacpipeError(
-        f"Recording {recording} has no channel of the quantity {quantity}; its columns are {listed(there, _SHOWN)}. Set "
+        f"Recording {recording} has no channel of the quantity {quantity}; its columns are {shown}. Set "
         f"{wanted} in {where} of the layout file, and ingest again."
     )
