@@ -75,10 +75,9 @@ def fit(params: Params, train: Dataset) -> Result:
     from tacpipe.plugins.stage import Result
 
     rows = training_rows.read(train.recordings, params.representation)
-    codec = pca.fit_and_measure(
-        rows, components=params.components, variance=params.variance, representation=params.representation
-    )
-    return Result(files=codec.to_files())
+    kept, notes = _kept(params.components, len(rows.channels))
+    codec = pca.fit_and_measure(rows, components=kept, variance=params.variance, representation=params.representation)
+    return Result(files=codec.to_files(), notes=[] if params.variance else notes)
 
 
 @stage(version=1)
@@ -100,10 +99,9 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
         seed=params.seed,
     )
     rows = training_rows.read(train.recordings, params.representation, params.frames)
-    codec = autoencoder_fit.fit(
-        rows, tried, schedule, workspace, components=params.components, representation=params.representation
-    )
-    return Result(files=codec.to_files())
+    kept, notes = _kept(params.components, len(rows.channels))
+    codec = autoencoder_fit.fit(rows, tried, schedule, workspace, components=kept, representation=params.representation)
+    return Result(files=codec.to_files(), notes=notes)
 
 
 @stage(version=2, fit=fit)
@@ -129,6 +127,15 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
     Example: tacpipe compress autoencoder data/segments --split data/split -o data/latents
     """
     return _encoded(recording, codec)
+
+
+def _kept(components: int, channels: int) -> tuple[int, list[str]]:
+    """Return how many latents are kept, and a note where there are fewer channels than were asked for."""
+    if components <= channels:
+        return components, []
+    return channels, [
+        f"components is {components} and there are {channels} tactile channels, so as many latents are kept."
+    ]
 
 
 def _encoded(recording: Recording, codec: Fitted) -> pa.Table:

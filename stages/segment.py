@@ -7,11 +7,13 @@ remain that are alike in all recordings.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from tacpipe.channels.absent import absent, entry
+from tacpipe.channels.pose import METRES
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.params import added
@@ -20,11 +22,16 @@ from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Floats, Times
+    from tacpipe.arrays import AnyArray, Bools, Floats, Times
     from tacpipe.datasets.dataset import Recording
     from tacpipe.signals.contact import Thresholds
 
 COUNT = "count"
+USUAL_SPEED = 0.75  # quantile of the speed in contact: that of the slide, which is most of it
+_KEPT_WHOLE = (
+    "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
+    "sensor is touched and the arm moves."
+)
 EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
 
 
@@ -53,9 +60,18 @@ class Params:
     off_level: NonNegativeFloat | None = added(None)
     # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
     tare: Literal["median", "first", "axis_mean"] = "median"
+    # of streams in counts: unit, on_count and off_count; noise, from their noise at rest as those in other units
+    thresholds: Literal["unit", "noise"] = added("unit")
+    # which rest_s: start of the recording; lowest: those in which the channels are lowest together
+    rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
-        """Refuse contacts that end above where they begin."""
+        """Refuse contacts that end above where they begin, and thresholds in counts that would do nothing."""
+        if self.thresholds == "noise" and (self.on_count, self.off_count) != (Params.on_count, Params.off_count):
+            raise UsageError(
+                f"thresholds is noise, and on_count {self.on_count:g} and off_count {self.off_count:g} would do nothing; "
+                f"give --on-level and --off-level, or leave --thresholds out."
+            )
         if self.off_count > self.on_count:
             raise UsageError(
                 f"off_count is {self.off_count:g}, above on_count, {self.on_count:g}; a contact must end at or below the "
@@ -69,10 +85,11 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
     Rows in which either finger is in contact are numbered from 0 in the column ``contact``; all others have -1. Each
     tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
-    median of the first seconds, whatever ``tare`` is. A stream in counts has the thresholds of ``on_count`` and
-    ``off_count``. One in any other unit has those of ``on_level`` and ``off_level`` or of its noise at rest (see
-    `tacpipe.signals.contact.noise_thresholds`), and the attributes ``<stream>_contact_on``, ``<stream>_contact_off``
-    and ``<stream>_contact_unit`` record them. A recording without a contact has a note.
+    median of the first seconds (``rest``), whatever ``tare`` is. A stream in counts has the thresholds of ``on_count``
+    and ``off_count``, unless ``thresholds`` is noise. One in any other unit has those of ``on_level`` and ``off_level``
+    or of its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
+    ``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without a
+    contact has a note.
 
     Example: tacpipe segment contacts data/synced -o data/segments
     """
@@ -80,7 +97,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     import pyarrow as pa
 
     from tacpipe.io.parquet import with_metadata
-    from tacpipe.signals.contact import Thresholds, contact_intervals, load, noise_thresholds, rest_level
+    from tacpipe.signals.contact import Thresholds, contact_intervals, load, noise_thresholds
 
     table = recording.table()
     t_ns = table.column("t_ns").to_numpy()  # (time,)
@@ -89,16 +106,17 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     rest: dict[str, dict[str, str]] = {}
     sensors = _sensors(recording.name, table)
     units = {stream: _unit(table, names) for stream, names in sensors.items()}
-    _check_levels(params, recording.name, units)
+    fixed = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
+    _check_levels(params, recording.name, units, fixed)
     for stream, names in sensors.items():
         values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
         axes = len({(table.field(name).metadata or {}).get(b"axis") for name in names})
-        level = rest_level(values, t_ns, params.rest_s)
+        level, rows = _rest(params.rest, values, t_ns, params.rest_s)
         loads.append(load(values, level, axes))
-        if units[stream] == COUNT:
+        if stream in fixed:
             limits.append(Thresholds(params.on_count, params.off_count))
         else:
-            limits.append(_given(params, noise_thresholds(values, loads[-1], t_ns, params.rest_s)))
+            limits.append(_given(params, noise_thresholds(values, loads[-1], t_ns, params.rest_s, rows)))
         written = _tared(params.tare, values, level, axes)
         rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, written, strict=True)}
     if params.begins == "grasped":
@@ -111,16 +129,17 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
         numbers[start:stop] = number
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
     largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
-    notes = [] if len(intervals) else [_no_contact(params, units, limits, largest)]
+    notes = [] if len(intervals) else [_no_contact(params, units, limits, largest, fixed)]
     marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
-    return RecordingOutput(marked, _threshold_attributes(units, limits), notes)
+    return RecordingOutput(marked, _threshold_attributes(units, limits, fixed), notes)
 
 
 @dataclass(frozen=True)
 class SlipParams:
     """What counts as slip and as drop, in the readings of a proximity sensor that looks at the held object.
 
-    Thresholds are in multiples of the noise of the readings' rate after the grasp. One millimetre is 8 counts on the
+    Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are
+    taken as so many counts as ``count_per_mm`` makes of them, and never saturate. One millimetre is 8 counts on the
     published rig, its fingers' patch 25 mm, its noise 0.8 counts and its smallest reading 544.
     """
 
@@ -151,7 +170,7 @@ class SlipParams:
             )
 
 
-@stage(version=1)
+@stage(version=2)
 def slips(params: SlipParams, recording: Recording) -> pa.Table:
     """Mark slips and drops of a held object.
 
@@ -170,7 +189,13 @@ def slips(params: SlipParams, recording: Recording) -> pa.Table:
     table = recording.table()
     if "slip" in table.column_names:
         raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
-    readings = table.column(_proximity(recording.name, params.channel, table)).to_numpy().astype(np.float64)
+    channel = _proximity(recording.name, params.channel, table)
+    readings, saturated = table.column(channel).to_numpy().astype(np.float64), params.saturated_count
+    unit = (table.field(channel).metadata or {}).get(b"unit", b"").decode()
+    if unit in METRES:
+        readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
+    elif unit not in (COUNT, ""):
+        raise _no_distance(recording.name, channel, unit, table)
     t_ns = table.column("t_ns").to_numpy()
     rate_hz = _rate_hz(recording.name, t_ns)
     contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
@@ -188,8 +213,8 @@ def slips(params: SlipParams, recording: Recording) -> pa.Table:
     grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
     for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise
         since, held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
-        lost = slip.dropped(since, still, patch_count, params.saturated_count)
-        known_lost = slip.dropped_online(since, still, patch_count, params.saturated_count)
+        lost = slip.dropped(since, still, patch_count, saturated)
+        known_lost = slip.dropped_online(since, still, patch_count, saturated)
         labels["dropped"][rows] = lost
         labels["slip"][rows] = held & ~lost & slip.slip_offline(since, rate_hz, params.cutoff_hz, still, limits)
         known = slip.slip_online(since, rate_hz, params.cutoff_hz, still, limits)
@@ -204,9 +229,9 @@ def slips(params: SlipParams, recording: Recording) -> pa.Table:
 class SlideParams:
     """Where a slide begins and ends, which of its frames are kept, and what the protocol of the recordings was.
 
-    The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the finger's
-    pressure reached 40 counts. Half the speed lies in the middle between rest and slide, whose ramp takes 0.1 s. Over 800
-    slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
+    The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the
+    finger's pressure reached 40 counts. Half the speed lies in the middle between rest and slide, whose ramp takes 0.1
+    s. Over 800 slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
     """
 
     # static pressure whose first crossing starts the slide
@@ -232,9 +257,21 @@ class SlideParams:
     pressure_low: Annotated[NonNegativeFloat, Unit("count")] = 2.0
     # largest mean pressure within the protocol; above, the finger was pressed too hard
     pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0
+    # what the slide begins and ends by: pressure, the static one; load, the taxels' mean change from rest, of any sensor
+    trigger: Literal["pressure", "load"] = added("pressure")
+    # load at which the slide begins, in the unit of the taxels; None: from their noise at rest
+    load_trigger: PositiveFloat | None = added(None)
+    # time whose median is each channel's level without load
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = added(0.2)
+    # which rest_s: start of the recording; lowest: those in which the channels are lowest together
+    rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
-        """Refuse a median of an even number of rows, and bounds of the pressure that leave nothing between them."""
+        """Refuse an even median, bounds of the pressure with nothing between them, and a load that would do nothing."""
+        if self.load_trigger is not None and self.trigger != "load":
+            raise UsageError(
+                f"load_trigger is {self.load_trigger:g} and trigger is {self.trigger}; give --trigger load with it."
+            )
         if self.spike_frames % 2 == 0:
             raise UsageError(
                 f"spike_frames is {self.spike_frames}; it must be odd, for a reading has as many rows on both sides."
@@ -255,7 +292,9 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure
     changes; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
     ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
-    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole.
+    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
+    then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
+    positions if nothing else gives its speed. Of such a slide no protocol is known, and none is checked.
 
     Example: tacpipe segment slides data/touched -o data/slides
     """
@@ -268,12 +307,15 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     streams = streams_of(recording)
     table = finger(recording.name, streams)
     t_ns = table.column("t_ns").to_numpy()  # (time,)
+    if params.trigger == "load":
+        return _slide_by_load(params, recording.name, streams, table)
+    attributes: dict[str, Attribute]
     table, spikes = mended(table, params.spike_frames, params.spike_deviations, params.spike_count)
     pressures = of_quantity(table, "static_pressure")
     if not pressures:
-        return RecordingOutput(
-            {"slide": table}, {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
-        )
+        notes = [_KEPT_WHOLE.format(len(t_ns))] if len(t_ns) > params.frames else []
+        attributes = {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
+        return RecordingOutput({"slide": table}, attributes, notes)
     pressure = table.column(pressures[0]).to_numpy()
     profile = arm.profile(streams, t_ns)
     try:
@@ -291,12 +333,60 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     rows = slice(first, stop)
     told = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
     why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, told)
-    attributes: dict[str, Attribute] = {**told, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
+    attributes = {**told, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
     attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})
     tables = {"slide": table.slice(first, stop - first).combine_chunks()}
     if profile:
         tables["profile"] = arm.profile_table(t_ns, pressure, profile, found.phases(len(t_ns), slide))
     return RecordingOutput(tables, attributes)
+
+
+def _slide_by_load(params: SlideParams, name: str, streams: Mapping[str, pa.Table], table: pa.Table) -> RecordingOutput:
+    """Return the slide of a sensor of any unit: the rows in contact, and of these those in which the arm moves."""
+    import numpy as np
+
+    from tacpipe.channels import arm
+    from tacpipe.channels.finger import mended
+    from tacpipe.channels.streams import of_quantity
+    from tacpipe.signals import slides as found
+    from tacpipe.signals.contact import ENDS, Thresholds, load, noise_thresholds
+
+    t_ns, names = table.column("t_ns").to_numpy(), of_quantity(table, "tactile")
+    values = np.column_stack([table.column(one).to_numpy() for one in names])  # (time, channel)
+    axes = len({(table.field(one).metadata or {}).get(b"axis") for one in names})
+    level, rows = _rest(params.rest, values, t_ns, params.rest_s)
+    loaded = load(values, level, axes)
+    if params.load_trigger is None:
+        limits = noise_thresholds(values, loaded, t_ns, params.rest_s, rows)
+    else:
+        limits = Thresholds(params.load_trigger, ENDS * params.load_trigger)
+    unit = _unit(table, names)
+    profile = arm.profile(streams, t_ns, by_place=True)
+    try:
+        touched = found.touched_rows(loaded, limits.on, limits.off, unit)
+        slide = touched
+        if profile:
+            usual_m_s = float(np.nanquantile(profile["speed_m_s"][slice(*touched)], USUAL_SPEED))
+            moving = found.sliding_rows(
+                profile["speed_m_s"][: touched[1]], touched[0], params.moving_share * usual_m_s, params.steady_frames
+            )
+            slide = moving or touched
+        first, stop = found.kept_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {name}: {error}") from error
+    kept = slice(first, stop)
+    height = params.spike_count if unit == COUNT else limits.on
+    table, spikes = mended(table, params.spike_frames, params.spike_deviations, height)
+    attributes: dict[str, Attribute] = {
+        "load_mean": float(f"{loaded[kept].mean():.4g}"),
+        "load_trigger": float(f"{limits.on:.4g}"),
+        "slide_frames": stop - first,
+        "spikes": int(spikes[kept].sum()),
+        "outside_protocol": False,
+    }
+    if profile and np.isfinite(profile["speed_m_s"][kept]).all():
+        attributes["speed_m_s"] = round(float(np.median(profile["speed_m_s"][kept])), 5)
+    return RecordingOutput({"slide": table.slice(first, stop - first).combine_chunks()}, attributes)
 
 
 def _tared(tare: str, values: AnyArray, level: Floats, axes: int) -> Floats:
@@ -315,21 +405,34 @@ def _tared(tare: str, values: AnyArray, level: Floats, axes: int) -> Floats:
     raise TacpipeError(f"tare is {tare!r}; it must be median, first or axis_mean.")
 
 
+def _rest(which: str, values: AnyArray, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
+    """Return each channel's level without load (channel,), and the rows (time,) it is of; None: those of the start."""
+    import numpy as np
+
+    from tacpipe.signals.contact import lowest_part, rest_level
+
+    if which == "start" or not len(t_ns):
+        return rest_level(values, t_ns, rest_s), None
+    rows = lowest_part(values, t_ns, rest_s)
+    level: Floats = np.median(values[rows], axis=0).astype(np.float64)
+    return level, rows
+
+
 def _unit(table: pa.Table, names: Sequence[str]) -> str:
     """Return the unit of a stream's channels; the empty text where they have none, or not all the same."""
     units = {(table.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
     return next(iter(units)) if len(units) == 1 else ""
 
 
-def _check_levels(params: Params, name: str, units: Mapping[str, str]) -> None:
+def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:
     """Refuse thresholds in a unit that no stream has: they would do nothing."""
     if params.on_level is not None and params.on_level <= 0:
         raise UsageError(f"on_level is {params.on_level:g}; it must be above 0, or every row would be in contact.")
     told = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
-    if set(units.values()) == {COUNT} and (params.on_level, params.off_level) != (None, None):
+    if set(fixed) == set(units) and (params.on_level, params.off_level) != (None, None):
         raise UsageError(
             f"on_level and off_level are of streams in other units than counts, and recording {name} has {told}; give "
-            f"on_count and off_count."
+            f"on_count and off_count, or --thresholds noise."
         )
     if COUNT not in units.values() and (params.on_count, params.off_count) != (Params.on_count, Params.off_count):
         raise UsageError(
@@ -346,18 +449,24 @@ def _given(params: Params, found: Thresholds) -> Thresholds:
     return found._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
 
 
-def _threshold_attributes(units: Mapping[str, str], limits: Sequence[Thresholds]) -> dict[str, Attribute]:
-    """Return the attributes that record by which thresholds a stream in another unit than counts was segmented."""
+def _threshold_attributes(
+    units: Mapping[str, str], limits: Sequence[Thresholds], fixed: Collection[str]
+) -> dict[str, Attribute]:
+    """Return the attributes that record by which thresholds streams other than the ``fixed`` were segmented."""
     told: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
-        if unit != COUNT and math.isfinite(on):
+        if stream not in fixed and math.isfinite(on):
             begins = f"{stream}_contact" if stream else "contact"
             told |= {f"{begins}_on": on, f"{begins}_off": off, f"{begins}_unit": unit}
     return told
 
 
 def _no_contact(
-    params: Params, units: Mapping[str, str], limits: Sequence[Thresholds], largest: Sequence[float]
+    params: Params,
+    units: Mapping[str, str],
+    limits: Sequence[Thresholds],
+    largest: Sequence[float],
+    fixed: Collection[str],
 ) -> str:
     """Return the note on a recording without a contact: thresholds, largest load, and what to do."""
     found = [
@@ -367,10 +476,11 @@ def _no_contact(
         else f"{stream or 'the sensor'} never leaves its level at rest"
         for (stream, unit), (on, _), most in zip(units.items(), limits, largest, strict=True)
     ]
-    names = ["--on-count"] * (COUNT in units.values()) + ["--on-level"] * bool(set(units.values()) - {COUNT})
+    names = ["--on-count"] * bool(fixed) + ["--on-level"] * (set(fixed) != set(units))
+    other = ", or give --thresholds noise" if fixed else ""
     return (
         f"no contact of {params.min_s:g} s or more was found in this recording: {'; '.join(found)}. If something was "
-        f"touched, lower {' and '.join(names)}."
+        f"touched, lower {' and '.join(names)}{other}."
     )
 
 
@@ -387,10 +497,7 @@ def _sensors(name: str, table: pa.Table) -> dict[str, list[str]]:
         if metadata.get(b"quantity") == b"tactile":
             found.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
     if not found:
-        raise TacpipeError(
-            f"Recording {name} has no tactile channel: no column's quantity is tactile. Give a synchronized dataset "
-            f"with a tactile stream."
-        )
+        raise absent(name, "tactile", table.schema)
     return found
 
 
@@ -403,12 +510,23 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
                 f"Recording {name} has no column {channel}; proximity is in {', '.join(found) or 'none'}."
             )
         return channel
+    if not found:
+        raise absent(name, "proximity", table.schema, unit="mm")
     if len(found) != 1:
         raise TacpipeError(
             f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected in one. "
             f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
         )
     return found[0]
+
+
+def _no_distance(name: str, channel: str, unit: str, table: pa.Table) -> TacpipeError:
+    """Return the error of a proximity in another unit than counts or a length."""
+    stream = (table.field(channel).metadata or {}).get(b"stream", b"").decode()
+    return TacpipeError(
+        f"Recording {name}: {channel} is in {unit}, and slip is detected in counts or in {', '.join(METRES)}. Set unit in "
+        f"{entry(stream)} of the layout file, with scale where the file has another unit, and ingest again."
+    )
 
 
 def _rate_hz(name: str, t_ns: Times) -> float:

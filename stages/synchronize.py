@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from tacpipe.channels import components
+from tacpipe.channels.absent import absent, entry
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
@@ -220,7 +222,8 @@ def _master(recording: str, wanted: str, streams: Mapping[str, Columns]) -> str:
     for name, columns in streams.items():
         if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in columns.schema):
             return name
-    raise TacpipeError(f"Recording {recording} has no tactile stream; name the master among {_list(streams)}.")
+    found = absent(recording, "tactile", {name: columns.schema for name, columns in streams.items()})
+    raise TacpipeError(f"{found} Without a tactile stream, name the master among {_list(streams)} with --master.")
 
 
 def _grid(recording: str, params: Params, streams: Mapping[str, _Stream], master: _Stream) -> tuple[Int64s, Int64s]:
@@ -385,20 +388,21 @@ def _method(schema: pa.Schema, name: str) -> str:
     if quantity == "proximity":
         return "median"
     if quantity == "orientation":
-        return "slerp " + name.removesuffix(metadata.get(b"component", b"").decode())
+        return f"slerp {components.shared_name(field)}"
     return "linear"
 
 
 def _order(stream: _Stream, members: list[str]) -> list[int]:
     """Return the positions of x, y, z and w among the four components of a quaternion."""
     fields = [stream.columns.schema.field(name) for name in members]
-    components = [(field.metadata or {}).get(b"component", b"").decode() for field in fields]
-    if sorted(components) != ["w", "x", "y", "z"]:
+    found = [components.component(field) for field in fields]
+    if sorted(found) != ["w", "x", "y", "z"]:
         raise TacpipeError(
-            f"Stream {stream.name!r}: the orientation in {_list(members)} has the components {_list(components)}; a "
-            f"quaternion needs x, y, z and w once each. Check the field metadata `component`."
+            f"Stream {stream.name!r}: the orientation in {_list(members)} has the components "
+            f"{_list(part or 'unknown' for part in found)}; a quaternion needs x, y, z and w once each. Set component = "
+            f'"x" and so on in {entry(stream.name)} of the layout file, or another quantity for what is not a quaternion.'
         )
-    return [components.index(part) for part in "xyzw"]
+    return [found.index(part) for part in "xyzw"]
 
 
 def _between(kind: pa.DataType) -> pa.DataType:

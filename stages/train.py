@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING
 
 from tacpipe.plugins.stage import stage
 from tacpipe.tasks.forward.params import Params as ForwardParams
+from tacpipe.tasks.forward.requirements import REQUIREMENTS as FORWARD_NEEDS
 from tacpipe.tasks.material.params import Params as MaterialParams
+from tacpipe.tasks.material.requirements import REQUIREMENTS as MATERIAL_NEEDS
 from tacpipe.tasks.touch.params import Params as TouchParams
+from tacpipe.tasks.touch.requirements import REQUIREMENTS as TOUCH_NEEDS
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.plugins.stage import Result, Workspace
 
 
-@stage(version=3)
+@stage(version=3, requirements=FORWARD_NEEDS)
 def forward(
     params: ForwardParams, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None
 ) -> Result:
@@ -33,10 +36,11 @@ def forward(
     from tacpipe.plugins.stage import Result
     from tacpipe.tasks.forward import task
 
-    return Result(files=task.train(params, train, val, workspace, init.files if init else None))
+    files = task.train(params, train, val, workspace, init.files if init else None)
+    return Result(files=files, notes=task.notes(params, files))
 
 
-@stage(version=1)
+@stage(version=1, requirements=MATERIAL_NEEDS)
 def material(
     params: MaterialParams, train: Dataset, val: Dataset | None, workspace: Workspace, init: Model | None = None
 ) -> Result:
@@ -53,7 +57,7 @@ def material(
     return Result(files=task.train(params, train, val, workspace, init.files if init else None))
 
 
-@stage(version=1)
+@stage(version=1, requirements=TOUCH_NEEDS)
 def touch(params: TouchParams, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
     """Train a model that predicts the tactile reading of a grasp.
 

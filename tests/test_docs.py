@@ -35,6 +35,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
             "tutorials/own-data",
             "howto/hdf5",
             "howto/export",
+            "howto/format",
             "tutorials/ci-and-dvc",
             "howto/python",
         )
@@ -88,12 +89,12 @@ MORE = "…"  # in a page, for lines that a command prints besides
 
 
 def printed(block: str) -> list[tuple[str, list[str]]]:
-    """Return the commands of a console block, each with the lines that are printed below it."""
+    """Return the commands of a console block, each with the lines that are printed below it, but for empty ones."""
     found: list[tuple[str, list[str]]] = []
     for line in block.splitlines():
         if line.startswith("$ "):
             found.append((line.removeprefix("$ "), []))
-        else:
+        elif line:
             found[-1][1].append(line)
     return found
 

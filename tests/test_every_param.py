@@ -44,6 +44,8 @@ FREE = {  # params that are any text, and why
     "split.few_of": "an attribute and its value; `check` looks at the form",
     "split.apart": "an attribute of recordings",
     "split.by": "an attribute of recordings",
+    "train.forward.arm": "a stream of recordings",
+    "train.material.label": "a label of recordings, which are the lab's own",
     "train.material.sensors": "sensors of recordings, which plug-ins may add",
     "train.material.quantities": "quantities of columns, which plug-ins may add",
     "train.material.subsample_sensor": "a sensor of recordings",

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
-from tacpipe.channels.streams import signal
+from tacpipe.channels.pose import metres
+from tacpipe.channels.streams import of_quantity, signal
 from tacpipe.signals import kinematics
 from tacpipe.signals.filters import median
 from tacpipe.signals.resampling import linear
@@ -22,13 +23,14 @@ if TYPE_CHECKING:
 MEDIAN_ROWS = 3  # a controller that lost cycles takes several for one and gives a single speed that is times too high
 
 
-def profile(streams: Mapping[str, pa.Table], t_ns: Times) -> dict[str, Floats]:
+def profile(streams: Mapping[str, pa.Table], t_ns: Times, *, by_place: bool = False) -> dict[str, Floats]:
     """Return what the arm did at ``t_ns``, each (time,); empty without an arm.
 
     ``speed_raw_m_s`` and ``speed_m_s`` are the speed of the hand as recorded and after a median of three readings,
-    ``force_n`` the force along z, on which the finger presses, NaN where none was recorded.
+    ``force_n`` the force along z, on which the finger presses, NaN where none was recorded. ``by_place`` derives the speed
+    from positions where nothing else gives it.
     """
-    found = speed(streams)
+    found = speed(streams) or (path_speed(streams) if by_place else None)
     if found is None:
         return {}
     at_ns, raw_m_s = found
@@ -45,6 +47,21 @@ def profile_table(t_ns: Times, pressure: AnyArray, moved: Mapping[str, Floats], 
     """Return what `profile` gave, with pressure and phase, as the table of a stream; all are (time,)."""
     columns = [pressure, *(moved[name] for name in ("speed_raw_m_s", "speed_m_s", "force_n")), phase]
     return schema.stream(t_ns, columns, schema.profile_fields())
+
+
+def path_speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:
+    """Return stamps and speed in m/s along the path of the first stream with a position, each (time,); None without one.
+
+    Raises `TacpipeError` for a position in another unit than metres, cm or mm.
+    """
+    for table in streams.values():
+        names = of_quantity(table, "position")
+        if names and table.num_rows > 1:
+            scale = np.array([metres(table.schema.field(name)) for name in names])
+            place_m = np.column_stack([table.column(name).to_numpy() for name in names]) * scale
+            t_ns = table.column("t_ns").to_numpy()
+            return t_ns, kinematics.path_speed(t_ns, place_m)
+    return None
 
 
 def speed(streams: Mapping[str, pa.Table]) -> tuple[Times, Floats] | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Int64s
+from tacpipe.channels.absent import absent
 from tacpipe.channels.streams import of_quantity
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.spikes import hampel
@@ -19,9 +20,11 @@ if TYPE_CHECKING:
 def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
     """Return the only stream with tactile channels. Raises `TacpipeError`, naming the recording, for none or several."""
     found = [stream for stream, table in streams.items() if of_quantity(table, "tactile")]
+    if not found:
+        raise absent(name, "tactile", {stream: table.schema for stream, table in streams.items()})
     if len(found) != 1:
         raise TacpipeError(
-            f"Recording {name} has {len(found)} streams with tactile channels{': ' if found else ''}{', '.join(found)}; a "
+            f"Recording {name} has {len(found)} streams with tactile channels: {', '.join(found)}; a "
             f"slide is cut from one. Give recordings of one finger, or of one patch of skin."
         )
     return streams[found[0]]

@@ -28,20 +28,42 @@ SUMMARIES = {
 
 def _label(program: typer.Typer) -> None:
     @program.command(
-        "label", help=SUMMARIES["label"] + "\n\nExample: tacpipe label data/recordings trial-003 --set material=foam"
+        "label",
+        help=SUMMARIES["label"]
+        + "\n\nLabels are set on the recordings that are named, or on each by a table with --from: "
+        "CSV, TSV, Parquet, JSON or YAML with a row a recording. An empty cell changes nothing.\n\n"
+        "Example: tacpipe label data/recordings trial-003 --set material=foam",
     )
     def label(
         dataset: Annotated[Path, typer.Argument(help="The recordings.")],
-        names: Annotated[list[str], typer.Argument(help="Names of recordings; * and ? match any letters.")],
+        names: Annotated[
+            list[str] | None, typer.Argument(help="Names of recordings; * and ? match any letters.")
+        ] = None,
         set_: Annotated[list[str] | None, typer.Option("--set", help="Label as name=value; null removes it.")] = None,
         exclude: Annotated[
             str | None, typer.Option("--exclude", help="Leave out of all stages, for this reason.")
         ] = None,
         include: Annotated[bool, typer.Option("--include", help="Undo --exclude.")] = False,
+        from_: Annotated[
+            Path | None, typer.Option("--from", help="Table with a row a recording and a column a label.")
+        ] = None,
+        key: Annotated[
+            str, typer.Option("--key", help="Column of --from that names recordings; found where it is left out.")
+        ] = "",
+        dry_run: Annotated[
+            bool, typer.Option("--dry-run", help="Print which labels --from would change, and stop.")
+        ] = False,
         as_json: AsJson = False,
     ) -> None:
+        from tacpipe.cli import labels_from
         from tacpipe.datasets import labels
 
+        if from_ is not None:
+            labels_from.refuse_others(names, set_, exclude, include)
+            labels_from.run(dataset, from_, key, dry_run=dry_run, as_json=as_json)
+            return
+        labels_from.refuse_alone(names, key, dry_run)
+        assert names is not None
         wanted = labels.parse(set_ or [], exclude, include=include)
         changed = labels.change(dataset, names, wanted)
         value = {

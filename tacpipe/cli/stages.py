@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -19,6 +19,7 @@ from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.plugins.requirements import Requirements
 from tacpipe.plugins.stage import AnyStage
 
 EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
@@ -217,7 +218,22 @@ def _looks(stage: AnyStage) -> list[inspect.Parameter]:
     if stage.preview is not None:
         text = "Describe what would be read, and stop."
         found.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
+    if stage.requirements is not None:
+        text = "Print what recordings must hold, and stop."
+        show = typer.Option(False, "--requirements", help=text, is_eager=True, callback=_shows(stage.requirements))
+        found.append(_parameter("requirements", bool, show))
     return found
+
+
+def _shows(requirements: Requirements) -> Callable[[bool], None]:
+    """Return what prints the requirements of a task, before the arguments of its command are missed."""
+
+    def show(given: bool) -> None:
+        if given:
+            terminal.result(requirements.to_text())
+            raise typer.Exit
+
+    return show
 
 
 def _parsed(given: Any, wanted: Any) -> Any:

@@ -114,6 +114,11 @@ class Recording:
 
     def _without(self, stream: str, within: Sequence[str]) -> UsageError:
         there = ", ".join(map(repr, within or self.streams))
+        if not stream and not within:
+            return UsageError(
+                f"Recording {self.name} has the streams {there} and is not one table yet. Run `tacpipe synchronize` on it "
+                f"first, or name a stream."
+            )
         return UsageError(f"Recording {self.name} has no stream {stream!r}; it has {there}.")
 
 

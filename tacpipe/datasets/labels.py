@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from math import isfinite
@@ -56,11 +56,56 @@ class Changed:
     recordings: list[str]
 
 
+ByRecording = Mapping[str, Mapping[str, Attribute]]
+
+
 def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute]) -> Changed:
     """Set ``labels`` on the recordings whose names match and return the dataset's directory and their names.
 
     Raises `UsageError` if a pattern matches no recording.
     """
+    return _change(path, lambda found: dict.fromkeys(_matching(found, patterns), labels))
+
+
+def change_each(path: Path, wanted: Callable[[ByRecording], ByRecording]) -> Changed:
+    """Set other labels on each recording: ``wanted`` returns them by name, given the attributes of all.
+
+    Recordings whose labels are so already stay untouched, and nothing is computed again for them.
+    """
+    return _change(path, lambda found: differing(attributes(found.manifest), wanted(attributes(found.manifest))))
+
+
+def planned(path: Path, wanted: Callable[[ByRecording], ByRecording]) -> tuple[ByRecording, ByRecording]:
+    """Return the attributes of all recordings and the labels that `change_each` would set, by name; nothing is changed."""
+    found = manifest_of.find(path)
+    _refuse_made(found.manifest, found.directory)
+    now = attributes(found.manifest)
+    return now, differing(now, wanted(now))
+
+
+def attributes(manifest: Manifest) -> ByRecording:
+    """Return the attributes of each recording by name."""
+    return {name: entry["attributes"] for name, entry in manifest.recordings.items()}
+
+
+def differing(now: ByRecording, wanted: ByRecording) -> dict[str, dict[str, Attribute]]:
+    """Return the labels in ``wanted`` that are others than ``now``, of the recordings that have some; 1 is not true.
+
+    >>> differing({"a": {"n": 1}, "b": {"n": 1}}, {"a": {"n": 1}, "b": {"n": True, "m": None}})
+    {'b': {'n': True}}
+    """
+    found = {
+        name: {key: value for key, value in labels.items() if _apart(now[name].get(key), value)}
+        for name, labels in wanted.items()
+    }
+    return {name: labels for name, labels in found.items() if labels}
+
+
+def _apart(one: Attribute, other: Attribute) -> bool:
+    return one != other or type(one) is not type(other)
+
+
+def _change(path: Path, wanted: Callable[[Found], ByRecording]) -> Changed:
     found = manifest_of.find(path)
     store, directory = locate(found.directory), found.directory
     _refuse_made(found.manifest, directory)
@@ -68,9 +113,10 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
 
     def labelled() -> directory_of.Change:
         here = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
-        names.extend(_matching(here, patterns))
+        labels = {name: dict(values) for name, values in wanted(here).items()}
+        names.extend(labels)
         store.put(here.content)
-        return directory_of.Change(here.manifest.labelled({name: dict(labels) for name in names}), relabelled=True)
+        return directory_of.Change(here.manifest.labelled(labels), relabelled=True)
 
     with store.at_work([found.digest]):
         directory_of.change(store, directory, labelled)

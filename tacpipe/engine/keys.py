@@ -55,7 +55,7 @@ def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: 
     stage = execution.stage_of(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
-    named = stage.argument("Name")
+    named = stage.argument("RecordingName")
 
     def task(name: str, entry: Entry) -> Task:
         inputs = {recording: of_recording(entry, stage.reads or ()), **fitted, **({named: name} if named else {})}
@@ -74,13 +74,15 @@ def source_tasks(
     digests: Mapping[str, Mapping[str, str]],
 ) -> list[Task]:
     """Return one task a recording of a published source."""
-    argument, values = stage.argument("Files"), stage.argument("Values")
+    argument, values, called = (stage.argument(kind) for kind in ("Files", "Values", "RecordingName"))
     assert argument is not None
 
     def task(recording: str, source: Source) -> Task:
         inputs: dict[str, Any] = {argument: {file: digests[recording][file] for file in source.files}}
         if values is not None:
             inputs[values] = dict(source.values)
+        if called is not None:
+            inputs[called] = recording
         named = identity(name, stage.version, params, inputs)
         return Task(
             str(store.root), name, named, recording, files={file: str(path) for file, path in source.files.items()}

@@ -129,8 +129,12 @@ def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
     wanted = [(stream, taxel, axis) for stream in streams for taxel in names for axis in axes]
     if None in names or places != wanted or taxels < 2:
         held = f"these {len(layout)} do not" if layout else "the recordings hold latents"
+        declared = (
+            "Write {taxel}, and {axis} where there are several, in match of [streams.…] columns of the layout file. "
+        )
         raise TacpipeError(
-            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel; {held}. "
+            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel, as many of each; {held}. "
+            f"{declared if layout and None in names else ''}"
             f"Train it on segments without a codec, or choose --architecture gru, lstm, tcn or recurrent."
         )
     return len(streams), taxels, len(axes)

@@ -3,22 +3,22 @@
 The first parameter is ``params``, a frozen dataclass or a union of several (`tacpipe.plugins.params`). Each further one says
 by its annotation what the stage reads:
 
-==============  ==========================================================================================
-``Recording``   one recording at a time; the stage is run, keyed and stored for each recording alone
-``Dataset``     all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
-                may be empty where it is annotated ``Dataset | None``; ``originals`` are the recordings as they were
-                given, before they went through the stages that ``first`` names
-``Datasets``    several datasets side by side, as a tuple
-``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
-``Fitted``      the files that the stage's ``fit`` made of the training recordings
-``Parts``       what the stage's ``part`` gave for each recording, as a `Dataset`
-``Name``        the name of the one recording; part of its key
-``Files``       the files of one recording of a source; the stage's ``discover`` finds them
-``Values``      what ``discover`` gave for one recording beside its files, as labels; part of its key
-``Trial``       the number of one recording to simulate, from 0 to ``params.trials``
-``Roles``       the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
-``Workspace``   a folder that survives an interruption, for checkpoints
-==============  ==========================================================================================
+=================  ==================================================================================================
+``Recording``      one recording at a time; the stage is run, keyed and stored for each recording alone
+``Dataset``        all recordings at once; an argument named ``train``, ``val`` or ``test`` holds that role alone, and
+                   may be empty where it is annotated ``Dataset | None``; ``originals`` are the recordings as they were
+                   given, before they went through the stages that ``first`` names
+``Datasets``       several datasets side by side, as a tuple
+``Model``          a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
+``Fitted``         the files that the stage's ``fit`` made of the training recordings
+``Parts``          what the stage's ``part`` gave for each recording, as a `Dataset`
+``RecordingName``  the name of the one recording; part of its key, so only stages that need it take it
+``Files``          the files of one recording of a source; the stage's ``discover`` finds them
+``Values``         what ``discover`` gave for one recording beside its files, as labels; part of its key
+``Trial``          the number of one recording to simulate, from 0 to ``params.trials``
+``Roles``          the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
+``Workspace``      a folder that survives an interruption, for checkpoints
+=================  ==================================================================================================
 
 Annotations are read as text, so a stage module needs to import nothing for them but under ``TYPE_CHECKING``.
 """
@@ -37,13 +37,15 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.plugins.requirements import Requirements
+
 ROLES = ("train", "val", "test")
 ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
 Values = Mapping[str, Any]  # of JSON, by name
+RecordingName = str
 Fitted = Mapping[str, bytes]  # file name, content
-Name = str
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
@@ -51,7 +53,7 @@ P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
 ALL = ("*",)  # as ``reads``: every attribute
 _KINDS = (
-    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "Name"),
+    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "RecordingName"),
     *("Files", "Values", "Trial", "Roles", "Workspace"),
 )
 
@@ -115,6 +117,7 @@ class Stage(Generic[P, R]):
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
     preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
     guess: Callable[[Path], str] | None = None  # of a source: a first layout file (--guess)
+    requirements: Requirements | None = None  # of recordings to train a task on (--requirements)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Return what the function returns: no store is involved."""
@@ -193,6 +196,7 @@ def stage(
     headline: str | None = None,
     preview: Callable[[Any, Path], str] | None = None,
     guess: Callable[[Path], str] | None = None,
+    requirements: Requirements | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
     """Declare the decorated function a stage, whose signature it keeps. Raise ``version`` whenever its result changes.
 
@@ -200,7 +204,8 @@ def stage(
     ``part`` is keyed recording by recording, with the same params; its files become files of the result, and an argument
     ``Parts`` holds its tables. ``first`` names stages that the recordings go through before, with params of their own.
     ``preview`` returns what ``discover`` and the stage would read of a source, in words; ``guess`` a first layout of one.
+    ``requirements`` describe what recordings must hold.
     """
     return lambda function: Stage(
-        function, version, reads, fit, part, first, originals, discover, headline, preview, guess
+        function, version, reads, fit, part, first, originals, discover, headline, preview, guess, requirements
     )

@@ -37,6 +37,26 @@ def rest_level(values: AnyArray, t_ns: Times, rest_s: float) -> Floats:
     return level
 
 
+def lowest_part(values: AnyArray, t_ns: Times, rest_s: float) -> Bools:
+    """Return the rows (time,) of the ``rest_s`` seconds in which the channels (time, channel) are lowest together.
+
+    For recordings that begin in contact, of sensors that rise under load. Rows that are not finite never count.
+
+    >>> lowest_part(np.array([[9], [9], [1], [2], [9]]), np.arange(5) * 10**9, rest_s=1.0).tolist()
+    [False, False, True, True, False]
+    """
+    total = np.where(np.isfinite(values).all(axis=1), values.sum(axis=1), np.inf)  # (time,)
+    stop = np.searchsorted(t_ns, t_ns + round(rest_s * 1e9), side="right")
+    whole = np.flatnonzero(t_ns + round(rest_s * 1e9) <= t_ns[-1]) if len(t_ns) else np.zeros(0, int)
+    if not len(whole):
+        return np.ones(len(t_ns), bool)
+    means = [float(np.mean(total[first : stop[first]])) for first in whole]
+    first = int(whole[int(np.argmin(means))])
+    found = np.zeros(len(t_ns), bool)
+    found[first : stop[first]] = True
+    return found
+
+
 def axis_mean_level(values: AnyArray, axes: int = 3) -> Floats:
     """Return what to take off each channel of ``values`` (time, channel) so that all taxels of an axis begin alike.
 
@@ -70,20 +90,22 @@ def load(values: AnyArray, rest: Floats, axes: int = 3) -> Floats:
     return distance
 
 
-def noise_thresholds(values: AnyArray, load: Floats, t_ns: Times, rest_s: float) -> Thresholds:
+def noise_thresholds(
+    values: AnyArray, load: Floats, t_ns: Times, rest_s: float, rest: Bools | None = None
+) -> Thresholds:
     """Return thresholds for a sensor of any unit, from its noise at rest.
 
-    The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds; samples that repeat the one
-    before in all channels of ``values`` (time, channel) are left out. Contact starts at 40 times the noise, but at no
-    more than a quarter of the recording's largest load, at least at a twentieth of that, and at least at 10 times the
-    noise; it ends at two thirds of that. On 52 published trials of a XELA uSkin this is 70 to 230 counts, next to the 120
-    that were set by hand. Without any load the thresholds are infinite.
+    The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds, or the rows ``rest`` (time,);
+    samples that repeat the one before in all channels of ``values`` (time, channel) are left out. Contact starts at 40
+    times the noise, but at no more than a quarter of the recording's largest load, at least at a twentieth of that, and
+    at least at 10 times the noise; it ends at two thirds of that. On 52 published trials of a XELA uSkin this is 70 to
+    230 counts, next to the 120 that were set by hand. Without any load the thresholds are infinite.
     """
     finite = np.isfinite(load)
     largest = float(np.quantile(load[finite], LARGEST)) if finite.any() else 0.0
     if largest <= 0:
         return Thresholds(np.inf, np.inf)
-    at_rest = finite & ~held(values) & (t_ns <= t_ns[0] + round(rest_s * 1e9))
+    at_rest = finite & ~held(values) & (t_ns <= t_ns[0] + round(rest_s * 1e9) if rest is None else rest)
     noise = float(np.quantile(load[at_rest], 0.75)) if at_rest.any() else 0.0
     usual = min(NOISE_USUAL * noise, PEAK_MOST * largest)
     on = max(NOISE_FEWEST * noise, PEAK_LEAST * largest, usual)
@@ -101,11 +123,11 @@ def contact_intervals(
 ) -> Int64s:
     """Return the row ranges (contact, 2) in which there is contact, stop exclusive, sorted and without overlap.
 
-    Contact starts where ``load`` (time,) reaches ``on`` and ends where it falls below ``off``. Of several sensors ``load``
-    is (sensor, time) and the thresholds may be (sensor,): it starts where any load reaches its own and ends where all are
-    below. Where a load is NaN it does neither. Contacts that are at most ``merge_s`` apart are one; then those shorter than
-    ``min_s`` go; the rest grow by ``pad_s`` on both sides, and where they would meet, the rows between them are shared out
-    at the middle. Raises `TacpipeError` unless 0 <= off <= on.
+    Contact starts where ``load`` (time,) reaches ``on`` and ends where it falls below ``off``. Of several sensors
+    ``load`` is (sensor, time) and the thresholds may be (sensor,): it starts where any load reaches its own and ends
+    where all are below. Where a load is NaN it does neither. Contacts that are at most ``merge_s`` apart are one; then
+    those shorter than ``min_s`` go; the rest grow by ``pad_s`` on both sides, and where they would meet, the rows
+    between them are shared out at the middle. Raises `TacpipeError` unless 0 <= off <= on.
     """
     loads, ons, offs = np.atleast_2d(load), np.reshape(on, (-1, 1)), np.reshape(off, (-1, 1))  # (sensor, time or 1)
     if not ((offs >= 0) & (offs <= ons)).all():

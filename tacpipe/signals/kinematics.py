@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Times
+from tacpipe.arrays import AnyFloats, Floats, Times
 
 TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
 
@@ -104,3 +104,21 @@ def differences(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloats) -> A
     )  # (time - 1, 3), the vector part of after times the inverse of before
     velocity[1:, 3:] = 2 * turned / step_s
     return velocity
+
+
+def path_speed(t_ns: Times, position_m: AnyFloats, span_s: float = 0.02) -> Floats:
+    """Return the speed along a path in m/s, (time,), of ``position_m`` (time, axis): over ``span_s`` around each row.
+
+    A span, because the difference of two readings in a row is mostly their noise.
+
+    >>> path_speed(np.arange(5) * 10_000_000, np.arange(5)[:, None] * 0.01).round(6).tolist()
+    [1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    half_ns = round(span_s * 5e8)
+    rows = np.arange(len(t_ns))
+    first = np.minimum(np.searchsorted(t_ns, t_ns - half_ns), np.maximum(rows - 1, 0))
+    last = np.maximum(np.searchsorted(t_ns, t_ns + half_ns, side="right") - 1, np.minimum(rows + 1, len(rows) - 1))
+    moved = np.linalg.norm(position_m[last] - position_m[first], axis=1)
+    took_s = (t_ns[last] - t_ns[first]) / 1e9
+    speed: Floats = np.divide(moved, took_s, out=np.zeros(len(t_ns)), where=took_s > 0)
+    return speed

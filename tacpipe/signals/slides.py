@@ -45,6 +45,24 @@ def trigger_row(pressure: AnyArray, threshold: float) -> int:
     return int(reached.argmax())
 
 
+def touched_rows(load: Floats, on: float, off: float, unit: str = "") -> Rows:
+    """Return the rows from the first ``load`` (time,) of ``on`` or more to the last of ``off`` or more.
+
+    Raises `TacpipeError` where there is none.
+
+    >>> touched_rows(np.array([0.0, 1.0, 5.0, 3.0, 6.0, 2.0, 0.0]), on=4.0, off=2.0)
+    (2, 6)
+    """
+    reached = load >= on
+    if not reached.any():
+        most = f"{np.nanmax(load):.3g}" if np.isfinite(load).any() else "no reading"
+        raise TacpipeError(
+            f"The load never reaches {on:.3g} {unit}, its most is {most}; no slide began. Exclude the recording, or lower "
+            f"`--load-trigger`."
+        )
+    return int(reached.argmax()), int(np.flatnonzero(load >= off)[-1]) + 1
+
+
 def sliding_rows(speed_m_s: Floats, first: int, least_m_s: float, steady_rows: int) -> Rows | None:
     """Return the rows from ``first`` on between which ``speed_m_s`` (time,) begins and ceases to be ``least_m_s``.
 

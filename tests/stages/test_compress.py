@@ -157,3 +157,14 @@ def test_another_kind_of_value_is_refused_before_anything_is_fitted(tmp_path: Pa
         fitted(*RECORDINGS, **how)
     with pytest.raises(TacpipeError, match=r"^representation is .*levels.*increments"):
         learned(tmp_path, *RECORDINGS, **how)
+
+
+def test_an_array_with_fewer_channels_than_latents_keeps_as_many_as_it_has_and_a_note_says_so() -> None:
+    stage = registry.load("compress.pca")
+    assert stage.fit is not None
+    shards = dataset(*(motion(seed) for seed in range(3)))
+    made = stage.fit(stage.params(components=len(CHANNELS) + 1), shards)
+    whole = stage.fit(stage.params(components=len(CHANNELS)), shards)
+    assert made.files == whole.files
+    assert len(made.notes) == 1 and str(len(CHANNELS)) in made.notes[0]
+    assert not whole.notes

@@ -300,7 +300,7 @@ def test_streams_without_common_time_rows_or_touch_are_refused(shard: Recording)
         run(shard({"xela1": uskin(np.arange(9)), "robot": robot(np.arange(20, 30))}))
     with pytest.raises(TacpipeError, match="stream 'robot' has no rows"):
         run(shard({"xela1": uskin(np.arange(9)), "robot": robot(np.arange(0))}))
-    with pytest.raises(TacpipeError, match="no tactile stream"):
+    with pytest.raises(TacpipeError, match="quantity tactile"):
         run(shard({"robot": robot(np.arange(9))}))
 
 

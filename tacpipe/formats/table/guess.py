@@ -26,7 +26,13 @@ LINES = 200  # of a text file that are looked at
 _TIME = re.compile(
     r"(t|time|timestamp|time_?stamp|stamp|clock|unix_?time|datetime|date)(_?(s|sec|ms|us|ns))?", re.IGNORECASE
 )
-_RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
+VOCABULARY = (  # for who replaces a "?"
+    "quantity: what a column measures, as tactile, position, orientation (a quaternion), joint_position, force, torque,",
+    "  static_pressure, vibration, temperature, proximity; `tacpipe train TASK --requirements` lists what a task reads",
+    "unit: as count, m, mm, 1 (of a quaternion), rad, N, kPa, V; of time s, ms, us, ns",
+    '{taxel} and {axis} in match state where a tactile column lies; component = "x" which part of a vector it is',
+)
+RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 _MEANINGS = (  # how a name ends, and the quantity; the first that matches
     (r"(txl|tax|taxel|skin|tactile|cell|electrode|pad|sensel|touch)\w*", "tactile"),
@@ -82,6 +88,7 @@ def layout(folder: Path) -> str:
     parts = [
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
+        *(f"# {line}" for line in VOCABULARY),
     ]
     parts += [_stream(group) for group in groups]
     described = [path for path in every if path.suffix.lower() in (".yaml", ".yml", ".json")]
@@ -89,7 +96,8 @@ def layout(folder: Path) -> str:
     if described:
         parts.append(f"[[labels]]\nfile = {_quoted(_pattern(described))}")
     parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
-    return "\n\n".join(parts) + "\n"
+    head = "\n".join(parts[: 2 + len(VOCABULARY)])
+    return "\n\n".join([head, *parts[2 + len(VOCABULARY) :]]) + "\n"
 
 
 def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group]]:
@@ -196,7 +204,7 @@ def _labels_of(group: _Group) -> str:
     if len(group.paths) == 1:
         found = group.first
         keys = [name for name, values in found.values.items() if len(set(values)) == len(values)]
-        named = next((name for name in keys if _RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
+        named = next((name for name in keys if RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
         lines.append(f"key = {_quoted(named)}  # the column that names recordings")
     return "\n".join(lines)
 
@@ -211,7 +219,7 @@ def _stream(group: _Group) -> str:
     ]
     if found.text is not None:
         lines += _written(found.text, group.paths[0])
-    several = next((name for name in found.names if _RECORDING.fullmatch(name)), None)
+    several = next((name for name in found.names if RECORDING.fullmatch(name)), None)
     if several is not None and len(group.paths) == 1:
         lines.append(f"recording = {_quoted(several)}  # the column that names the recording of a row")
         apart.add(several)
@@ -241,7 +249,7 @@ def _written(found: Dialect, path: Path) -> list[str]:
 def _time_column(found: Looked) -> str | None:
     """Return the column that holds stamps: one so named, else the first whose numbers always rise."""
     named = [name for name in found.names if _TIME.fullmatch(name)]
-    rising = [name for name in found.names if _rises(found.values[name]) and not _RECORDING.fullmatch(name)]
+    rising = [name for name in found.names if _rises(found.values[name]) and not RECORDING.fullmatch(name)]
     both = [name for name in named if name in rising or any(isinstance(value, str) for value in found.values[name])]
     return next(iter(both), None) or (rising[0] if rising and rising[0] == found.names[0] else None)
 
@@ -280,8 +288,11 @@ def _rules(found: Looked, names: Sequence[str]) -> list[str]:
         kind = _kind(values)
         by_rule.setdefault((_match(name), *meaning(name, kind), kind), []).append(name)
     rules = []
+    whole = {part for name in names for part in [_part(name)] if part}
     for (match, quantity, unit, kind), members in by_rule.items():
-        one = members[0] if len(members) == 1 else match
+        one = members[0] if len(members) == 1 else _of_taxels(match, quantity, kind)
+        if quantity == UNKNOWN and kind.startswith("float") and {_place(name) for name in members} <= {"x", "y", "z"}:
+            quantity = "position" if whole >= set("xyzw") else quantity
         if kind == "text":
             rules.append(f"{{ match = {_quoted(one)}, skip = true }}")
             continue
@@ -289,6 +300,27 @@ def _rules(found: Looked, names: Sequence[str]) -> list[str]:
             f"{{ match = {_quoted(one)}, quantity = {_quoted(quantity)}, unit = {_quoted(unit)}, type = {_quoted(kind)} }}"
         )
     return sorted(rules, key=lambda rule: rule.count("{"))  # exact names before patterns
+
+
+def _place(name: str) -> str:
+    """Return the letter of a column that is called x, y or z alone, else its name."""
+    return name.strip().lower()
+
+
+def _part(name: str) -> str:
+    """Return the component that a column of a quaternion or a place has by its name, as x of qx."""
+    found = re.fullmatch(r"(?:(?:quat|quaternion|orientation|ori|rot|q)_?)?([xyzw])", _place(name))
+    return found[1] if found else ""
+
+
+def _of_taxels(match: str, quantity: str, kind: str) -> str:
+    """Return the pattern of numbered columns with {taxel} for their number, where they are or can be taxels.
+
+    >>> _of_taxels("pad{pad}", "tactile", "float64"), _of_taxels("q{number}", "joint_position", "float64")
+    ('pad{taxel}', 'q{number}')
+    """
+    taxels = quantity == "tactile" or (quantity == UNKNOWN and "int" in kind)
+    return re.sub(r"\{\w+\}", "{taxel}", match) if taxels and match.count("{") == 1 else match
 
 
 def _match(name: str) -> str:

@@ -71,9 +71,9 @@ def plain_value(text: str) -> Attribute:
     return number if finite and not digits.startswith("00") and "_" not in text and not digits.isdigit() else text
 
 
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the number and the cells of each line that holds some, the header first; all are as wide as it."""
-    text = _text(path)
+    text = read_text(path)
     separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     header: list[str] = []
@@ -90,7 +90,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _only_row(path: Path) -> dict[str, Attribute]:
     """Return the one row of a table that describes one recording."""
-    rows = list(_rows(path))
+    rows = list(read_rows(path))
     if len(rows) != 2:
         raise TacpipeError(
             f"{path} has {max(len(rows) - 1, 0)} rows below its header; the labels of one recording are one row."
@@ -100,7 +100,7 @@ def _only_row(path: Path) -> dict[str, Attribute]:
 
 def _table(path: Path, labels: Labels) -> dict[str, dict[str, Attribute]]:
     """Return the rows of a table of labels by the value of its key."""
-    numbered = _rows(path)
+    numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
     if labels.key not in header:
         raise TacpipeError(f"{path} has no column {plain(labels.key)}; it has {listed(header, 6)}.")
@@ -129,7 +129,7 @@ def _file(folder: Path, labels: Labels, source: Source) -> dict[str, Attribute]:
     path = folder / pattern.filled(labels.file, {**source.values, "recording": source.within or source.name})
     if path.suffix.lower() in (".csv", ".tsv"):
         return _only_row(path)
-    text = _text(path)
+    text = read_text(path)
     try:
         values = json.loads(text) if path.suffix.lower() == ".json" else yaml_text.load(text)
     except (ValueError, RecursionError) as error:
@@ -167,7 +167,8 @@ def _picked(values: dict[str, Attribute], labels: Labels, recording: str) -> dic
     return {name: values[name] for name in labels.columns}
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Return the text of a file of labels. Raises `TacpipeError` for one that is too large or not UTF-8."""
     with regular.failing(path):
         content = regular.content(path, MOST_BYTES)
     try:

@@ -7,7 +7,7 @@ is opened.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -50,6 +50,7 @@ EXTENSIONS: Mapping[str, Format] = {
 GZIP = ".gz"
 FILE = "file"  # the placeholder of a container's name, where containers are found by their format
 UNKNOWN = "?"  # what a guessed layout could not know
+OPEN = 4  # of such entries that are named at once
 
 
 DECLARED = Time()  # neither a column nor a rate: as a container declares it
@@ -221,15 +222,22 @@ def of(tables: Mapping[str, Any], where: str = "The layout", container: Format |
 
 
 def _refuse_unknown(value: Any, where: str) -> None:
-    """Raise `UsageError` for the first entry that still holds what a guess could not know."""
+    """Raise `UsageError` where entries still hold what a guess could not know, naming the first few."""
+    found = list(_unknown(value, where))
+    if found:
+        more = f"; and {len(found) - OPEN} more" if len(found) > OPEN else ""
+        raise UsageError(f"{'; '.join(found[:OPEN])}{more}. Write what it is, or skip = true for a column.")
+
+
+def _unknown(value: Any, where: str) -> Iterator[str]:
+    """Yield each entry that still holds what a guess could not know, with what stands beside it."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         for one in inner if isinstance(inner, list) else [inner]:
             if one == UNKNOWN:
                 known = ", ".join(f"{name} = {excerpt(found)}" for name, found in value.items() if found != UNKNOWN)
-                raise UsageError(
-                    f'{where}: {plain(key)} is "?" ({known or "alone"}). Write what it is, or skip = true for a column.'
-                )
-            _refuse_unknown(one, f"{where}, {plain(key)}")
+                yield f'{where}: {plain(key)} is "?"' + (f" ({known})" if known else "")
+            else:
+                yield from _unknown(one, f"{where}, {plain(key)}")
 
 
 def _stream(name: str, value: Any, where: str, container: Format | None) -> Stream:

@@ -22,6 +22,7 @@ from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method, Run
 from tacpipe.report.spread import Spread, spread
 from tacpipe.tasks.forward import headline as headlines
+from tacpipe.tasks.forward import units
 
 _draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
@@ -166,7 +167,13 @@ def headline(method: Method, others: Sequence[Method], steps: Sequence[int], kno
         held = method if name in _predictors(method) else source
         baselines[name] = _sums(held.runs, name, steps, known)
     return headlines.headline(
-        method.name, steps, _sums(method.runs, MODEL, steps, known), baselines, known, len(method.runs)
+        method.name,
+        steps,
+        _sums(method.runs, MODEL, steps, known),
+        baselines,
+        known,
+        len(method.runs),
+        units.of_model(method.config),
     )
 
 

@@ -19,6 +19,7 @@ from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.comparison import Row
 from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method, Run
+from tacpipe.tasks.forward import units
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -132,6 +133,7 @@ def _basis(overview: Overview, simulated: bool) -> str:
         most = max((pool.distinct_windows for pool in pools), default=0)
         of = f" of {tables.OBJECTS[part]}" if part is not None else ""
         windows.append(f"{headline_of.counted(recordings, 'recordings')}{of} ({most:,} windows)")
+    unit = units.common(method.config for method in overview.methods)
     runs = [run for method in overview.methods for run in method.runs]
     known: dict[str, set[bool]] = {}
     for run in runs:
@@ -142,7 +144,7 @@ def _basis(overview: Overview, simulated: bool) -> str:
         f"Evaluated on {' and '.join(windows)}, none of which its model was trained on"
         f"{'; objects of some recordings are known to one run and unseen to another' if both else ''}.",
         f"Settings: {settings}." if settings else "",
-        "Skill over persistence is 1 − squared error / squared error of persistence, both in counts over all channels.",
+        f"Skill over persistence is 1 − squared error / squared error of persistence, both in {unit} over all channels.",
         "Intervals are 95 %, from drawing whole recordings anew.",
         "In tables, the errors of a recording in several runs are kept together; the sd over runs is about other seeds."
         if any(len(method.runs) > 1 for method in overview.methods)
@@ -240,10 +242,11 @@ def _chosen(overview: Overview, part: bool | None, count: int) -> list[Row]:
 def _comparable(overview: Overview) -> str:
     """Return the tables in which all methods and baselines can be compared, and those of the best by channel."""
     source = by_method.reference(overview.main)
+    unit = units.common(method.config for method in overview.methods)
     parts = [
-        "<h3>All in counts</h3>",
+        f"<h3>All in {escape(unit)}</h3>",
         markup.note(
-            f"Every representation is decoded to counts of all channels before it is evaluated, so all rows can be "
+            f"Every representation is decoded to {unit} of all channels before it is evaluated, so all rows can be "
             f"compared. Baselines, in grey, are those of {counted(len(source.runs), 'runs')} of {source.name}; those of a "
             f"codec are given for each, and codec and codec_anchored know the true future. Errors without a step are "
             f"means over all steps."

@@ -14,6 +14,7 @@ from tacpipe.metrics import headline as headline_of
 from tacpipe.metrics.headline import Headline
 from tacpipe.report import contents, headline_box, markup, provenance
 from tacpipe.report.forward import comparison, figures, methods, traces
+from tacpipe.tasks.forward import units
 from tacpipe.tasks.forward.headline import legitimate
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def headlines(result: Dataset) -> list[Headline]:
     return [one for one in found if one is not None]
 
 
-def sentences(found: Sequence[Headline], metrics: Tree) -> list[tuple[str, str]]:
+def sentences(found: Sequence[Headline], metrics: Tree, unit: str = units.COUNTS) -> list[tuple[str, str]]:
     """Return the result in a sentence or two, each with its verdict (`tacpipe.metrics.headline.verdict`)."""
     if found:
         return [(headline_of.sentence(one), one.verdict) for one in found]
@@ -72,7 +73,7 @@ def sentences(found: Sequence[Headline], metrics: Tree) -> list[tuple[str, str]]
         return [("The model was evaluated without a baseline.", "")]
     best = min(others, key=lambda name: others[name])
     described = (
-        f"Mean squared error over all steps: {markup.number(errors['model'])} counts² for the model, "
+        f"Mean squared error over all steps: {markup.number(errors['model'])} {unit}² for the model, "
         f"{markup.number(others[best])} for {best}, the best of {len(others)} baselines. This result holds no sums by "
         f"recording, so there is no interval: evaluate the model again."
     )
@@ -83,7 +84,7 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
     """Return the part of the page that one result has: the ``number``-th ``of`` so many, with ``drawn`` traces."""
     metrics, config = (contents.tree(result, name) for name in ("metrics.json", "config.json"))
     rate_hz = float(config.get("rate_hz", 0.0))
-    found = headlines(result)
+    found, unit = headlines(result), units.of_model(config)
     badge = ' <span class="badge">simulated</span>' if provenance.simulated(result) else ""
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     if isinstance(config.get("codec"), Mapping):
@@ -91,14 +92,14 @@ def render(result: Dataset, number: int, of: int, drawn: int) -> str:
     trials = list(csv.DictReader(io.StringIO(result.files.get("trials.csv", b"").decode())))
     parts = [
         f"<h2>{f'{number}. ' if of > 1 else ''}{escape(name.replace('_', ' '))}{badge}</h2>",
-        headline_box.box(sentences(found, metrics)),
+        headline_box.box(sentences(found, metrics, unit)),
         headline_box.table(found),
-        _floor(metrics),
+        _floor(metrics, unit),
         _counts(metrics, provenance.simulated(result)),
-        _horizon_figures(metrics, rate_hz),
-        _error_tables(metrics),
-        _objects(metrics),
-        _trials(trials),
+        _horizon_figures(metrics, rate_hz, unit),
+        _error_tables(metrics, unit),
+        _objects(metrics, unit),
+        _trials(trials, unit),
         _traces(result, trials, drawn),
         _seen(metrics),
         _training(contents.history(result)),
@@ -122,7 +123,7 @@ def _counts(metrics: Tree, badge: bool) -> str:
     return f'<p class="note">{escape(text)}</p>'
 
 
-def _floor(metrics: Tree) -> str:
+def _floor(metrics: Tree, unit: str) -> str:
     """Return a warning where the codec alone loses more than persistence errs, empty otherwise."""
     if "codec" not in metrics:
         return ""
@@ -134,7 +135,7 @@ def _floor(metrics: Tree) -> str:
     which = "at every step" if lost == steps else f"up to t+{max(lost)}"
     text = (
         f"The codec alone loses more than persistence errs {which} (squared error of the true future through the codec: "
-        f"{markup.number(floor['mean'])} counts² on average), so a model of its latents can hardly win there in counts."
+        f"{markup.number(floor['mean'])} {unit}² on average), so a model of its latents can hardly win there in {unit}."
     )
     return f"<p>{escape(text)}</p>"
 
@@ -160,7 +161,7 @@ def _predictors(metrics: Tree) -> list[str]:
     return sorted(found, key=lambda name: (order.index(name) if name in order else len(order), name))
 
 
-def _horizon_figures(metrics: Tree, rate_hz: float) -> str:
+def _horizon_figures(metrics: Tree, rate_hz: float, unit: str) -> str:
     """Return error and skill over the time ahead, side by side."""
     names = _predictors(metrics)
     if not names:
@@ -174,7 +175,7 @@ def _horizon_figures(metrics: Tree, rate_hz: float) -> str:
     }
     parts = [
         markup.figure(
-            figures.errors_by_horizon(errors, ahead_ms, "root mean squared error (counts)"),
+            figures.errors_by_horizon(errors, ahead_ms, f"root mean squared error ({unit})"),
             "Error over all channels and unseen recordings. Lower is better.",
         )
     ]
@@ -186,7 +187,7 @@ def _horizon_figures(metrics: Tree, rate_hz: float) -> str:
     return f'<div class="pair">{"".join(parts)}</div>'
 
 
-def _error_tables(metrics: Tree) -> str:
+def _error_tables(metrics: Tree, unit: str) -> str:
     """Return errors by predictor, skill with intervals, and errors by sensor and axis."""
     names = _predictors(metrics)
     if not names:
@@ -196,8 +197,8 @@ def _error_tables(metrics: Tree) -> str:
     heads = [name.replace("t", "t+") if name != "mean" else name for name in shown]
     parts = []
     for measure, title in (
-        ("mae_counts", "Mean absolute error (counts)"),
-        ("mse_counts", "Mean squared error (counts²)"),
+        ("mae_counts", f"Mean absolute error ({unit})"),
+        ("mse_counts", f"Mean squared error ({unit}²)"),
     ):
         rows = [[name, *(markup.number(_both(metrics[name][measure])[step]) for step in shown)] for name in names]
         parts.append(markup.table(title, ["", *heads], rows))
@@ -214,12 +215,12 @@ def _error_tables(metrics: Tree) -> str:
         if group not in ("both", "all")
         for name in names[:2]
     ]
-    parts.append(markup.table("Mean absolute error by sensor and axis (counts)", ["", *heads], rows))
+    parts.append(markup.table(f"Mean absolute error by sensor and axis ({unit})", ["", *heads], rows))
     legend = "; ".join(f"{name}: {EXPLAINED[name]}" for name in names if name in EXPLAINED)
     return f'<h3>Errors</h3><p class="note">{escape(legend)}.</p>' + "".join(parts)
 
 
-def _objects(metrics: Tree) -> str:
+def _objects(metrics: Tree, unit: str) -> str:
     """Return errors and skill on objects that the model was trained on next to those on others, where it is given."""
     parts = {name: metrics[name] for name in ("known", "unseen") if "skill" in metrics.get(name, {})}
     if not parts:
@@ -230,14 +231,14 @@ def _objects(metrics: Tree) -> str:
         objects = f"{name} objects ({part['counts']['recordings']} recordings)"
         for predictor in _predictors(part)[:2]:
             errors = _both(part[predictor]["mae_counts"])
-            rows.append([f"{objects}, {predictor} (counts)", *(markup.number(errors[step]) for step in steps)])
+            rows.append([f"{objects}, {predictor} ({unit})", *(markup.number(errors[step]) for step in steps)])
         described = part["skill"]["mse_counts"]
         rows.append([f"{objects}, skill", *(markup.interval(described.get(step, {})) for step in steps)])
     heads = [step.replace("t", "t+") if step != "mean" else step for step in steps]
     return markup.table("Known objects and unseen ones: mean absolute error, and skill", ["", *heads], rows)
 
 
-def _trials(trials: Sequence[Mapping[str, str]]) -> str:
+def _trials(trials: Sequence[Mapping[str, str]], unit: str) -> str:
     """Return the skill on each unseen recording."""
     ranked = [one for one in trials if one["seen"] == "false" and one["skill"]]
     if not ranked:
@@ -257,7 +258,7 @@ def _trials(trials: Sequence[Mapping[str, str]]) -> str:
         ]
         for one in sorted(ranked, key=lambda one: float(one["skill"]))
     ]
-    heads = ["recording", "windows", "model (counts²)", "persistence (counts²)", "skill"]
+    heads = ["recording", "windows", f"model ({unit}²)", f"persistence ({unit}²)", "skill"]
     return (
         "<h3>By recording</h3>"
         + markup.figure(figures.skill_by_trial(skill, windows), caption)

@@ -14,6 +14,7 @@ from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method
 from tacpipe.report.forward.sweep import Loss
 from tacpipe.report.markup import NONE
+from tacpipe.tasks.forward import units
 
 PRINTED = {  # validation and test error in Table 1 of the paper
     "raw": (0.0484, 0.0552),
@@ -78,8 +79,8 @@ def representations(methods: Sequence[Method], published: bool) -> str:
 
 
 def comparable(found: Sequence[Row], steps: Sequence[int], known: bool | None) -> str:
-    """Return every method and baseline with its errors in counts and its skill, as `comparison.rows` sorted them."""
-    first = comparison.best(found)
+    """Return every method and baseline with its errors and its skill, in the order of `comparison.rows`."""
+    first, unit = comparison.best(found), units.common(row.method.config for row in found)
     rows, kinds = [], {}
     for index, row in enumerate(found):
         if row is first:
@@ -107,8 +108,8 @@ def comparable(found: Sequence[Row], steps: Sequence[int], known: bool | None) -
         "mean skill",
         "sd over runs",
         "mean skill (standardised)",
-        *(f"MAE {step} (counts)" for step in ahead),
-        "MSE (counts²)",
+        *(f"MAE {step} ({unit})" for step in ahead),
+        f"MSE ({unit}²)",
         "MSE (standardised)",
         *(f"skill {step}" for step in ahead),
         "runs",
@@ -134,7 +135,8 @@ def channel_groups(chosen: Sequence[Row], steps: Sequence[int], known: bool | No
         if still:
             rows.append([f"{group}, {BASELINE}", NONE, *_mae(still, steps), *[NONE] * len(steps)])
     ahead = [f"t+{step}" for step in steps]
-    heads = ["", "mean skill", *(f"MAE {step} (counts)" for step in ahead), *(f"skill {step}" for step in ahead)]
+    unit = units.common(row.method.config for row in chosen)
+    heads = ["", "mean skill", *(f"MAE {step} ({unit})" for step in ahead), *(f"skill {step}" for step in ahead)]
     return markup.table(f"By sensor and axis, {OBJECTS[known]}", heads, rows) if rows else ""
 
 
@@ -172,9 +174,9 @@ def timelines(methods: Sequence[Method], steps: Sequence[int], parts: Sequence[b
             rows.append([*row, str(len(method.runs))])
     if not rows:
         return ""
-    heads = ["", "a step (ms)"]
+    heads, unit = ["", "a step (ms)"], units.common(one.config for one in methods)
     for known in parts:
-        heads += [f"{OBJECTS[known]}: mean skill", f"{OBJECTS[known]}: MAE t+{steps[-1]} (counts)"]
+        heads += [f"{OBJECTS[known]}: mean skill", f"{OBJECTS[known]}: MAE t+{steps[-1]} ({unit})"]
     return markup.table("Timelines: a step lasts differently, so rows cannot be compared", [*heads, "runs"], rows)
 
 
@@ -209,7 +211,7 @@ def losses(found: Sequence[Loss]) -> str:
         ]
         for one in found
     ]
-    heads = ["", "latents", "MSE (standardised)", "MAE (counts)", "training recordings", "codecs"]
+    heads = ["", "latents", "MSE (standardised)", "MAE (channels' unit)", "training recordings", "codecs"]
     return markup.table("What representations lose on the way to latents and back", heads, rows)
 
 

@@ -30,22 +30,22 @@ def section(methods: Sequence[Method]) -> str:
     return f'<h3>Which materials are confused</h3><div class="pair">{"".join(drawn)}</div>{markup.note(NOTE)}'
 
 
-def counted(method: Method, sensor: str) -> tuple[Ints, list[int]]:
+def counted(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
     """Return how often each material was taken for each, pooled over runs, (material, named), and the materials."""
     truth, predicted = [], []
     for run in method.of(sensor):
         rows = run.predictions.of(sensor)
         described = rows.predicted[MODEL] != NOTHING
-        truth.append(rows.materials[described])
-        predicted.append(rows.predicted[MODEL][described])
+        truth.append(rows.named(rows.materials[described]))
+        predicted.append(rows.named(rows.predicted[MODEL][described]))
     materials, codes = np.unique(np.concatenate([*truth, *predicted]), return_inverse=True)
     pairs = codes.reshape(2, -1)
     counts = np.zeros((len(materials), len(materials)), dtype=np.int64)
     np.add.at(counts, (pairs[0], pairs[1]), 1)
-    return counts, [int(one) for one in materials]
+    return counts, materials.tolist()
 
 
-def worst(counts: Ints, materials: Sequence[int]) -> str:
+def worst(counts: Ints, materials: Sequence[int | str]) -> str:
     """Return the materials most often taken for another, in words."""
     wrong = counts - np.diag(np.diag(counts))
     order = np.argsort(-wrong, axis=None, kind="stable")[:MOST_PAIRS]
@@ -60,7 +60,8 @@ def worst(counts: Ints, materials: Sequence[int]) -> str:
 def _figure(method: Method, sensor: str) -> str:
     counts, materials = counted(method, sensor)
     runs = len(method.of(sensor))
-    svg = figures.confusion(counts, materials, f"Materials and what they were taken for, {shown(sensor)}")
+    label = method.of(sensor)[0].predictions.naming.key
+    svg = figures.confusion(counts, materials, f"Materials and what they were taken for, {shown(sensor)}", label)
     caption = (
         f"{shown(sensor)}, {method.name}: {counts.trace()} of {counts.sum()} right on unseen slides"
         f"{f', {runs} runs pooled' if runs > 1 else ''}. {worst(counts, materials)}"

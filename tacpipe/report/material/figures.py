@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 MARKERS = ("o", "^", "s", "D")
+LONGEST, LEVEL = 14, 3  # letters of a name next to an axis, and of one that lies level below it
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,11 @@ class Cloud:
     sensor: str
     points: AnyFloats  # (slide, 2)
     materials: Ints  # (slide,)
+    names: Sequence[str] = ()  # of materials, where they are not their numbers
+
+    def name(self, material: int) -> str:
+        """Return what the figure calls a material."""
+        return _short(self.names[material]) if self.names else str(material)
 
 
 def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Sequence[str] = ()) -> str:
@@ -64,7 +70,7 @@ def by_slides(bands: Mapping[str, Band], chance: float, title: str, order: Seque
     return svg(draw, title, size=(5.4, 3.4 + 0.2 * len(bands)))
 
 
-def confusion(counts: Ints, materials: Sequence[int], title: str) -> str:
+def confusion(counts: Ints, materials: Sequence[int | str], title: str, label: str = "material") -> str:
     """Return how often each material (row) was taken for each (column), in squares; mistakes stand as numbers."""
 
     def draw(axes: list[Axes]) -> None:
@@ -83,10 +89,12 @@ def confusion(counts: Ints, materials: Sequence[int], title: str) -> str:
             if not right:
                 axes[0].text(column, row, str(count), fontsize=7, ha="center", va="center")
         ends = (-0.5, len(materials) - 0.5)
-        axes[0].set(xlim=ends, ylim=ends[::-1], aspect="equal", xlabel="named", ylabel="material")
+        axes[0].set(xlim=ends, ylim=ends[::-1], aspect="equal", xlabel="named", ylabel=label)
         axes[0].spines[["top", "right"]].set_visible(True)
         for axis in (axes[0].xaxis, axes[0].yaxis):
-            axis.set_ticks(range(len(materials)), labels=[str(one) for one in materials], fontsize=7)
+            axis.set_ticks(range(len(materials)), labels=[_short(str(one)) for one in materials], fontsize=7)
+        if max(len(_short(str(one))) for one in materials) > LEVEL:
+            axes[0].tick_params(axis="x", labelrotation=90)
 
     return svg(draw, title, size=(4.8, 4.6))
 
@@ -119,7 +127,9 @@ def latents(clouds: Sequence[Cloud], partners: Mapping[int, int], title: str) ->
             other = means[1].get(partners.get(one, one))
             if other is not None:
                 axes[0].plot(*np.array([middle, other]).T, color=INK, linewidth=0.8, alpha=0.7)
-            axes[0].text(middle[0], middle[1], str(one), fontsize=8, fontweight="bold", ha="center", va="center")
+            axes[0].text(
+                middle[0], middle[1], clouds[0].name(one), fontsize=8, fontweight="bold", ha="center", va="center"
+            )
         axes[0].set_xticks([])
         axes[0].set_yticks([])
         axes[0].set_xlabel("first principal component")
@@ -150,6 +160,11 @@ def profile(time_s: AnyFloats, lines: Mapping[str, AnyFloats], during: Bools, qu
             axes[0].legend()
 
     return svg(draw, title, size=(5.4, 3.0))
+
+
+def _short(name: str) -> str:
+    """Return a name that fits next to an axis."""
+    return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
 
 
 def _apart(counts: Sequence[int]) -> list[int]:

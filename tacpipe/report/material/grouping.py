@@ -69,7 +69,8 @@ def _settings(run: Run) -> dict[str, Any]:
         "subsample_sensor": str(params.get("subsample_sensor", "")) if ratio < 100 else "",
         "subsample_percent": ratio if params.get("subsample_sensor") else 100,
         "hold_out": "" if architecture == "minirocket" else str(params.get("hold_out", "")),
-        "vibration": "vibration" in config.get("quantities", str(params.get("quantities", "")).split(",")),
+        "vibration": "vibration" in config.get("quantities", str(params.get("quantities", "")).split(","))
+        and "vibration" not in config.get("absent", ()),
         "layout": layout,
         "split": split,
         "simulated": run.simulated,

@@ -69,7 +69,10 @@ def _figure(method: Method) -> str:
         return ""
     sensors, parts = rows
     points = projected([_latents(part) for part in parts])
-    clouds = [Cloud(shown(sensor), at, part.materials) for sensor, at, part in zip(sensors, points, parts, strict=True)]
+    clouds = [
+        Cloud(shown(sensor), at, part.materials, part.naming.names)
+        for sensor, at, part in zip(sensors, points, parts, strict=True)
+    ]
     partners = {int(one): int(other) for one, other in method.runs[0].config.get("partners", {}).items()}
     same, of = together(parts[0], parts[1], partners)
     svg = figures.latents(clouds, partners, "Latents of both sensors")

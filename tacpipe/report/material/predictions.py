@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.tasks.material.naming import NUMBERS, Naming
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -32,6 +33,7 @@ class Predictions:
     materials: Int64s  # (slide,), the truth
     predicted: Mapping[str, Int64s]  # by predictor, (slide,)
     latents: AnyFloats | None  # (slide, latent); None where the model has none
+    naming: Naming = NUMBERS  # of materials
     sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
 
     def of(self, sensor: str) -> Predictions:
@@ -41,8 +43,12 @@ class Predictions:
         latents = None if self.latents is None else self.latents[rows]
         sessions = None if self.sessions is None else self.sessions[rows]
         return Predictions(
-            self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, sessions
+            self.recordings[rows], self.sensors[rows], self.materials[rows], predicted, latents, self.naming, sessions
         )
+
+    def named(self, materials: Int64s) -> NDArray[Any]:
+        """Return the names of materials (slide,): text, or the numbers where these are the names."""
+        return self.naming.named(materials)
 
     @property
     def one_session_each(self) -> bool:
@@ -62,29 +68,35 @@ def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
     As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
     of the last batch where the model's ``config`` leaves it out, nor those of a sensor whose network was only taken over.
     """
-    table = table.filter(_counted(table, config))
+    naming = Naming.from_json(config)
+    table = table.filter(_counted(table, config, naming))
     names = [name for name in table.column_names if name.startswith("z") and name[1:].isdigit()]
     latents = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64) if names else None
     return Predictions(
         np.array(table["recording"].to_pylist(), dtype=np.str_),
         np.array(table["sensor"].to_pylist(), dtype=np.str_),
-        table["material"].to_numpy().astype(np.int64),
-        {
-            name: table[name].fill_null(NOTHING).to_numpy().astype(np.int64)
-            for name in PREDICTORS
-            if name in table.column_names
-        },
+        _numbers(table, "material", naming),
+        {name: _numbers(table, name, naming) for name in PREDICTORS if name in table.column_names},
         latents if latents is not None and np.isfinite(latents).all() else None,
+        naming,
         np.array([one or "" for one in table["session"].to_pylist()], dtype=np.str_)
         if "session" in table.column_names
         else None,
     )
 
 
-def _counted(table: pa.Table, config: Mapping[str, Any]) -> Bools:
+def _numbers(table: pa.Table, name: str, naming: Naming) -> Int64s:
+    """Return a column of materials as numbers (slide,), `NOTHING` where it is empty."""
+    if not naming.names:
+        return table[name].fill_null(NOTHING).to_numpy().astype(np.int64)  # type: ignore[no-any-return]
+    numbers = {material: number for number, material in enumerate(naming.names)}
+    return np.array([numbers.get(one, NOTHING) for one in table[name].to_pylist()], np.int64)
+
+
+def _counted(table: pa.Table, config: Mapping[str, Any], naming: Naming) -> Bools:
     """Return which rows count (slide,)."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
-    materials = table["material"].to_numpy()
+    materials = _numbers(table, "material", naming)
     params = params_of.counting(registry.load("train.material"), config.get("params", {}))
     counted: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
     counted &= sensors != str(params.get("frozen_sensor", ""))

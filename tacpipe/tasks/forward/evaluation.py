@@ -14,7 +14,7 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.forward import metrics, tracks
+from tacpipe.tasks.forward import metrics, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
@@ -43,7 +43,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     trials, kept = [], {}
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for name, shard in sorted(recordings.recordings.items()):
-        track = tracks.track(shard, forecaster.codec)
+        track = tracks.track(shard, forecaster.codec, forecaster.pose)
         check_rate(track, forecaster)
         trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
         starts = track.starts(forecaster.context, forecaster.horizon)
@@ -68,7 +68,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         tree["anticipation"] = warned
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
-        headline.FILE: headline.write(metrics.headline(method, trials, forecaster.horizon)),
+        headline.FILE: headline.write(
+            metrics.headline(method, trials, forecaster.horizon, units.of_model(forecaster.config))
+        ),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
         "horizons.csv": metrics.horizons_csv(tree, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Bools, Times
+from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored
 from tacpipe.codecs.frame_stacking import INCREMENTS
@@ -87,27 +88,35 @@ class Forecaster:
         return np.array(self.config["inputs"]["orientation_reference"])
 
     @property
+    def pose(self) -> Pose:
+        """The columns of the arm that it was trained on; none where it was trained without one."""
+        found = self.config["inputs"].get("pose")
+        return NAMED if found is None else Pose(tuple(found["position"]), tuple(found["orientation"]))
+
+    @property
     def window_columns(self) -> tuple[str, ...]:
         """The first columns of a window for `predict`, each a column of the recordings: tactile channels, then the pose.
 
         Of a tactile channel a window holds what the recording has less the channel's level at rest, which stands in its
-        field metadata ``rest``; the pose is as recorded.
+        field metadata ``rest``; the pose is as recorded, in m. A model that was trained without an arm has no pose, one that
+        was trained on positions alone no quaternion.
         """
-        return (*self.codec.channels, *tracks.POSE)
+        return (*self.codec.channels, *self.pose.columns)
 
     @property
     def plan_columns(self) -> tuple[str, ...]:
-        """The first columns of a plan for `predict`, each a column of the recordings: position and quaternion."""
-        return tracks.POSE
+        """The first columns of a plan for `predict`, each a column of the recordings: position and quaternion, if any."""
+        return self.pose.columns
 
     @property
     def derived_columns(self) -> tuple[str, ...]:
         """The columns that `windows` adds behind those of window and plan, and that recordings need not hold.
 
         Velocity and angular velocity, from the joints of a known arm, else as differences of the pose. A window then ends
-        with the width of the gripper's opening, ``robot_finger_m`` of the recordings, 0 where they have none.
+        with the width of the gripper's opening, ``robot_finger_m`` of the recordings, 0 where they have none. A model
+        without an arm has no velocities.
         """
-        return (*tracks.VELOCITY, *tracks.TURNING)
+        return (*tracks.VELOCITY, *tracks.TURNING) if self.pose.position else ()
 
     @property
     def predicts_change(self) -> bool:
@@ -172,8 +181,8 @@ class Forecaster:
         }
         if not all(fits.values()):
             raise ValueError(f"{next(name for name, fine in fits.items() if not fine)} is another elsewhere")
-        arm = np.zeros((1, self.context + self.horizon, POSE))
-        arm[..., -1] = 1
+        arm = np.zeros((1, self.context + self.horizon, len(self.pose.columns)))
+        arm[..., 6:] = 1
         touch = np.zeros((1, self.context, len(self.codec.channels)))
         self._of_arrays(*self._parts(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :]))
         if self.baselines is not None:
@@ -242,10 +251,10 @@ class Forecaster:
 
     def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32."""
-        channels = len(self.codec.channels)
+        channels, posed, derived = len(self.codec.channels), len(self.pose.columns), len(self.derived_columns)
         for name, given, rows, before, widths in (
-            ("window", window, self.context, channels, (channels + ARM + 1, channels + POSE)),
-            ("plan", plan, self.horizon, 0, (ARM, POSE)),
+            ("window", window, self.context, channels, (channels + posed + derived + 1, channels + posed)),
+            ("plan", plan, self.horizon, 0, (posed + derived, posed)),
         ):
             if given.ndim != 3 or given.shape[1] != rows or given.shape[2] not in widths:
                 raise TacpipeError(
@@ -258,18 +267,18 @@ class Forecaster:
                     f"The {name} holds {given[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
                     "all values must be finite. Leave the window out, or repair the recording."
                 )
-            if not given[..., before + 3 : before + POSE].any(axis=-1).all():
+            if self.pose.orientation and not given[..., before + 3 : before + POSE].any(axis=-1).all():
                 raise TacpipeError(f"The {name} holds a quaternion of length 0, which is not an orientation.")
         if len(window) != len(plan):
             raise TacpipeError(
                 f"There are {len(window)} windows and {len(plan)} plans; each window needs its own plan."
             )
-        whole = window.shape[2] == channels + ARM + 1
-        if whole != (plan.shape[2] == ARM):
+        whole = window.shape[2] == channels + posed + derived + 1
+        if derived and whole != (plan.shape[2] == posed + derived):
             raise TacpipeError("Window and plan must both hold velocities, or neither.")
         finger = window[..., -1] if whole else np.zeros(window.shape[:2])
         arm = np.concatenate([window[..., channels : channels + plan.shape[2]], plan], axis=1)
-        arm = np.stack([self._arm(one, whole) for one in arm])
+        arm = np.stack([self._arm(_posed(one, posed), whole and derived > 0) for one in arm])
         touch = np.ascontiguousarray(window[..., :channels], dtype=np.float32)
         return touch, arm.astype(np.float32), finger.astype(np.float32)
 
@@ -280,6 +289,15 @@ class Forecaster:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
             rows = np.hstack([rows, kinematics.differences(t_ns, rows[:, :3], rows[:, 3:])])
         return tracks.aligned(rows, self.orientation)
+
+
+def _posed(rows: AnyFloats, columns: int) -> AnyFloats:
+    """Return the rows of an arm with the 7 columns of a pose, where the first ``columns`` are those that are there."""
+    if columns == POSE:
+        return rows
+    rest = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
+    rest[:, :columns] = rows[:, :columns]
+    return np.hstack([rest, rows[:, columns:]])
 
 
 def network(params: Params, codec: codecs.Codec) -> nn.Module:

@@ -10,6 +10,7 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.tasks.forward.units import COUNTS
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them
@@ -49,13 +50,17 @@ def headline(
     baselines: Mapping[str, Sums],
     part: bool | None,
     runs: int = 1,
+    unit: str = COUNTS,
 ) -> Headline | None:
-    """Return how a method compares with its baselines on known objects, unseen ones or all; `sums` by seed and recording."""
+    """Return how a method compares with its baselines on known objects, unseen ones or all; `sums` by seed and recording.
+
+    ``unit`` is that of the mean absolute errors.
+    """
     compared = {name: one for name, one in baselines.items() if legitimate(name)}
-    return pairing.headline(TASK, method, _measure(steps), model, compared, part=PARTS[part], runs=runs)
+    return pairing.headline(TASK, method, _measure(steps, unit), model, compared, part=PARTS[part], runs=runs)
 
 
-def _measure(steps: Sequence[int]) -> Measure:
+def _measure(steps: Sequence[int], unit: str = COUNTS) -> Measure:
     count, ahead = len(steps), [f"t+{step}" for step in steps]
 
     def error(found: AnyFloats) -> AnyFloats:
@@ -75,7 +80,7 @@ def _measure(steps: Sequence[int]) -> Measure:
     over = " and ".join(filter(None, (", ".join(ahead[:-1]), ahead[-1])))
     return Measure(
         (*(f"MAE {step}" for step in ahead), "vs persistence"),
-        "counts",
+        unit,
         f"the squared error as a fraction of persistence's, averaged over {over} (1 less that: vs persistence)",
         "skill",
         "recordings",

@@ -18,6 +18,7 @@ from tacpipe.metrics import forecast
 from tacpipe.metrics.headline import Headline
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
+from tacpipe.tasks.forward.units import COUNTS
 
 Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)
 Tree = dict[str, Any]  # names down to numbers
@@ -117,7 +118,7 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     return tree | {name: _summary(part, groups, horizon, channel_scale, seed) for name, part in parts.items() if part}
 
 
-def headline(method: str, trials: Sequence[Trial], horizon: int) -> list[Headline]:
+def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> list[Headline]:
     """Return how the model compares with its baselines on recordings that it has not seen, of known objects and unseen ones.
 
     Where nobody named an object, all are taken together.
@@ -142,7 +143,7 @@ def headline(method: str, trials: Sequence[Trial], horizon: int) -> list[Headlin
         chosen = [one for one in fresh if part is None or one.known == part]
         names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
         others = {name: sums(name, chosen) for name in names}
-        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part)
+        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part, unit=unit)
         found += [one] if one else []
     return found
 

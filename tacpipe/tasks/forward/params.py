@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
+from tacpipe.plugins.params import added
 
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -33,13 +34,14 @@ class Forward:
     context: PositiveInt = 10  # past rows that the model reads
     horizon: PositiveInt = 10  # future rows that it predicts
     baselines: bool = True  # fit the linear baselines too, for evaluate to compare with
+    arm: str = added("")  # stream whose position and orientation are the motion; empty: the only one with a position
     PANELS: ClassVar[Panels] = {
         "Model": ("architecture", "actions", "hidden", "dropout", "context", "horizon"),
         "Training": (
             *("loss", "epochs", "batch", "learning_rate", "cycle", "patience", "gradient_clip"),
             *("seed", "baselines"),
         ),
-        "Data": ("windows", "stride"),
+        "Data": ("windows", "stride", "arm"),
     }
 
 

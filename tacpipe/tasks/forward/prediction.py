@@ -10,8 +10,9 @@ import pyarrow as pa
 
 from tacpipe.arrays import Float32s, Times
 from tacpipe.errors import TacpipeError
+from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import tracks, units
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
@@ -41,7 +42,7 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
     check_codec(forecaster.codec_files, recordings.files)
     found = {}
     for name, shard in sorted(recordings.recordings.items()):
-        track = tracks.track(shard, forecaster.codec)
+        track = tracks.track(shard, forecaster.codec, forecaster.pose)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
         counts = np.empty((len(steps), len(forecaster.codec.channels), len(starts)), np.float32)
@@ -59,14 +60,15 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     """Return the windows of a dataset's only recording, as `Forecaster.predict` reads them."""
     check_codec(forecaster.codec_files, recordings.files)
     (shard,) = recordings.recordings.values()
-    track = tracks.track(shard, forecaster.codec)
+    track = tracks.track(shard, forecaster.codec, forecaster.pose)
     check_rate(track, forecaster)
     starts = track.starts(forecaster.context, forecaster.horizon)
     past, ahead = (
         starts[:, None] + np.arange(*ends)
         for ends in ((0, forecaster.context), (forecaster.context, forecaster.context + forecaster.horizon))
     )
-    arm = track.arm.astype(np.float64)
+    read = [*range(len(forecaster.pose.columns)), *(range(POSE, ARM) if forecaster.derived_columns else ())]
+    arm = track.arm[:, read].astype(np.float64)
     window = np.concatenate([track.tactile[past], arm[past], track.finger[past][..., None]], axis=-1)
     return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
 
@@ -75,9 +77,10 @@ def _table(forecaster: Forecaster, t_ns: Times, counts: Float32s, steps: Sequenc
     """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]
+    unit = str(forecaster.config["inputs"].get("unit", units.COUNT))
     for channel, name in enumerate(forecaster.codec.channels):
         for index, step in enumerate(steps):
-            about = {"quantity": "prediction", "unit": "count", "step": str(step), **forecaster.codec.layout[channel]}
+            about = {"quantity": "prediction", "unit": unit, "step": str(step), **forecaster.codec.layout[channel]}
             fields.append(pa.field(f"{name}_t{step}", pa.float32(), metadata=about))
             columns.append(pa.array(counts[index, channel]))
     return pa.Table.from_arrays(columns, schema=pa.schema(fields))

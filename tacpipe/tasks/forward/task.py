@@ -8,7 +8,7 @@ from tacpipe.tasks.forward.evaluation import evaluate
 from tacpipe.tasks.forward.forecaster import TASK
 from tacpipe.tasks.forward.model import ForwardModel
 from tacpipe.tasks.forward.prediction import predict
-from tacpipe.tasks.forward.training import train
+from tacpipe.tasks.forward.training import notes, train
 from tacpipe.tasks.opened import Chain
 
 
@@ -17,4 +17,4 @@ def load(files: Mapping[str, bytes], chain: Chain | None = None) -> ForwardModel
     return ForwardModel.load(files, chain)
 
 
-__all__ = ["TASK", "ForwardModel", "evaluate", "load", "predict", "train"]
+__all__ = ["TASK", "ForwardModel", "evaluate", "load", "notes", "predict", "train"]

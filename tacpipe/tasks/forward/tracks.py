@@ -10,10 +10,13 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
 from tacpipe.channels import masks
+from tacpipe.channels import pose as poses
+from tacpipe.channels.absent import absent
+from tacpipe.channels.pose import Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored, tactile
 from tacpipe.codecs.frame_stacking import breaks
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.signals.windows import window_starts
@@ -24,12 +27,11 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
 
-POSITION = tuple(f"robot_position_{axis}_m" for axis in "xyz")
-ORIENTATION = tuple(f"robot_orientation_{axis}" for axis in "xyzw")
-POSE = POSITION + ORIENTATION
+POSE = poses.NAMED.columns
 VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
 TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
 ARM = POSE + VELOCITY + TURNING
+TURNED = slice(3, 7)  # of ``ARM``: the quaternion
 FINGER = "robot_finger_m"
 JOINTS = 7
 TRUTH = "gt_"  # how the simulator's ground truth begins, which no model may see
@@ -62,10 +64,11 @@ class Track:
         return window_starts(groups, self.usable & (self.contact >= 0), context, horizon, stride)
 
 
-def codec_of(table: pa.Table, files: Mapping[str, bytes]) -> codecs.Codec:
+def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:
     """Return the codec among a dataset's files, or the one that leaves channels as they are where there is none.
 
-    Raises `TacpipeError` where table and files do not belong together.
+    ``name`` is that of the recording whose ``table`` it is. Raises `TacpipeError` where table and files do not belong
+    together.
     """
     latents = tactile.columns(table.schema, "latent")
     if codecs.DESCRIPTION in files:
@@ -83,7 +86,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes]) -> codecs.Codec:
         )
     channels = tactile.columns(table.schema, "tactile")
     if not channels:
-        raise TacpipeError("The table has no tactile channel (field metadata quantity=tactile) to forecast.")
+        raise absent(name, "tactile", table.schema)
     return codecs.Raw(channels, tuple(tactile.layout(table.schema, channels)))
 
 
@@ -97,16 +100,35 @@ def inputs(table: pa.Table, names: Sequence[str]) -> AnyFloats:
             raise TacpipeError(f"{name} is the simulator's ground truth; a model that reads it has learned nothing.")
         if name not in table.column_names:
             raise TacpipeError(
-                f"There is no column {name}. Give recordings that went through `tacpipe synchronize` and "
-                "`tacpipe segment contacts`, with the arm's state in a stream named robot, and for a model of latents "
-                "through `tacpipe compress`."
+                f"There is no column {name}. Give recordings of the same streams and columns as the model's, that went "
+                "through `tacpipe synchronize` and `tacpipe segment contacts`, and for a model of latents through "
+                "`tacpipe compress`."
             )
     return tactile.matrix(table, names)
 
 
-def track(shard: Recording, codec: codecs.Codec) -> Track:
+def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
+    """Return the columns of the arm whose motion a model reads; of no arm where it needs none and there is none.
+
+    ``actions`` and ``arm`` are the params of these names. Raises `TacpipeError`, naming the recording, where there is
+    no arm to plan with, and what `tacpipe.channels.pose.pose` raises.
+    """
+    schema = shard.table().schema
+    try:
+        found = poses.pose(schema, arm)
+    except UsageError as error:
+        raise UsageError(f"{shard.name}: {error}") from error
+    except TacpipeError as error:
+        raise TacpipeError(f"{shard.name}: {error}") from error
+    if not found.position and actions != "none":
+        raise poses.no_arm(shard.name, schema)
+    return found
+
+
+def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Track:
     """Return the track of a recording; its latents are those stored, or its channels where ``codec`` is raw.
 
+    ``pose`` names the columns of its arm; without them it rests where it is, and without a quaternion it never turns.
     Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the
     recording where a column is absent or its channels are not the codec's.
     """
@@ -115,13 +137,13 @@ def track(shard: Recording, codec: codecs.Codec) -> Track:
         codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"))
         above_rest = tactile.above_rest(table, codec.channels)
         latent = above_rest if codec.kind == "raw" else inputs(table, codec.latents)
-        pose = np.hstack([inputs(table, POSITION), _orientation(inputs(table, ORIENTATION))])
+        placed = np.hstack([_position(table, pose), _orientation(table, pose)])
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
+        finger = _opening(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
-    arm = np.hstack([pose, _velocity(table, t_ns, pose)]).astype(np.float32)
+    arm = np.hstack([placed, _velocity(table, pose, t_ns, placed)]).astype(np.float32)
     finite = np.isfinite(latent).all(axis=1) & np.isfinite(arm).all(axis=1) & np.isfinite(above_rest).all(axis=1)
-    finger = inputs(table, [FINGER])[:, 0] if FINGER in table.column_names else np.zeros(len(t_ns))
     timeline = str(shard.attributes.get("grid", "uniform"))
     held = shard.attributes.get("object")
     return Track(
@@ -139,15 +161,64 @@ def track(shard: Recording, codec: codecs.Codec) -> Track:
     )
 
 
-def _velocity(table: pa.Table, t_ns: Times, pose: AnyFloats) -> AnyFloats:
+def _position(table: pa.Table, pose: Pose) -> AnyFloats:
+    """Return where the arm is (time, 3), m; the origin without an arm."""
+    if not pose.position:
+        return np.zeros((table.num_rows, 3))
+    found = inputs(table, pose.position)
+    scale = np.array([poses.metres(table.schema.field(name)) for name in pose.position])
+    return found if (scale == 1.0).all() else found * scale
+
+
+def _orientation(table: pa.Table, pose: Pose) -> AnyFloats:
+    """Return unit quaternions (time, 4) of continuous sign; those that cannot be normalised become NaN.
+
+    Without a quaternion the arm is not turned.
+    """
+    if not pose.orientation:
+        return np.tile([0.0, 0.0, 0.0, 1.0], (table.num_rows, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return continuous(inputs(table, pose.orientation).astype(np.float64))
+
+
+def _opening(table: pa.Table) -> AnyFloats:
+    """Return the width between the fingers (time,), m; 0 where none is recorded, or several."""
+    found = (FINGER,) if FINGER in table.column_names else tactile.columns(table.schema, poses.WIDTH)
+    if len(found) != 1:
+        return np.zeros(table.num_rows)
+    scale = poses.metres(table.schema.field(found[0]))
+    width = inputs(table, found)[:, 0]
+    return width if scale == 1.0 else width * scale
+
+
+def _velocity(table: pa.Table, pose: Pose, t_ns: Times, placed: AnyFloats) -> AnyFloats:
     """Return the hand's linear and angular velocity (time, 6): from the joints where they are those of a known arm."""
-    names = [f"robot_joint{joint}_rad" for joint in range(1, JOINTS + 1)]
-    speeds = [f"robot_joint{joint}_velocity_rad_s" for joint in range(1, JOINTS + 1)]
-    if set(names + speeds) <= set(table.column_names):
+    names, speeds = _joints(table.schema, pose)
+    if len(names) == len(speeds) == JOINTS:
         angles = inputs(table, names)
-        if kinematics.carries(kinematics.PANDA, angles, pose[:, :3]):
-            return kinematics.hand_velocity(kinematics.PANDA, angles, inputs(table, speeds), pose[:, :3])
-    return kinematics.differences(t_ns, pose[:, :3], pose[:, 3:])
+        if kinematics.carries(kinematics.PANDA, angles, placed[:, :3]):
+            return kinematics.hand_velocity(kinematics.PANDA, angles, inputs(table, speeds), placed[:, :3])
+    return kinematics.differences(t_ns, placed[:, :3], placed[:, 3:])
+
+
+def _joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the columns of the angles and speeds of the arm's joints, empty where it has none."""
+    if pose == poses.NAMED:
+        each = range(1, JOINTS + 1)
+        found = tuple(f"robot_joint{n}_rad" for n in each), tuple(f"robot_joint{n}_velocity_rad_s" for n in each)
+        return found if set(found[0] + found[1]) <= set(schema.names) else ((), ())
+    if not pose.position:
+        return (), ()
+    stream = tactile.metadata(schema.field(pose.position[0])).get("stream")
+    angles, speeds = (
+        tuple(
+            name
+            for name in tactile.columns(schema, quantity)
+            if tactile.metadata(schema.field(name)).get("stream") == stream
+        )
+        for quantity in ("joint_position", "joint_velocity")
+    )
+    return angles, speeds
 
 
 def whole_numbers(table: pa.Table, name: str) -> Int64s:
@@ -163,10 +234,9 @@ def aligned(arm: AnyFloats, reference: AnyFloats) -> AnyFloats:
     A quaternion and its negative are the same rotation. Within a recording the sign is continuous already; between
     recordings it is a matter of chance, and a model would take it for another pose.
     """
-    turned = slice(len(POSITION), len(POSE))
-    finite = arm[np.isfinite(arm).all(axis=1), turned]
+    finite = arm[np.isfinite(arm).all(axis=1), TURNED]
     if len(finite) and finite[0] @ reference < 0:
-        return np.hstack([arm[:, : turned.start], -arm[:, turned], arm[:, turned.stop :]])
+        return np.hstack([arm[:, : TURNED.start], -arm[:, TURNED], arm[:, TURNED.stop :]])
     return arm
 
 
@@ -190,9 +260,3 @@ def rate_hz(tracks: Sequence[Track]) -> float:
             "Synchronize all recordings with one --rate-hz."
         )
     return round(float(np.median(list(rates.values()))), 3)
-
-
-def _orientation(quaternions: AnyFloats) -> AnyFloats:
-    """Return unit quaternions (time, 4) of continuous sign; those that cannot be normalised become NaN."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return continuous(quaternions.astype(np.float64))

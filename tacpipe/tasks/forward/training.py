@@ -15,6 +15,7 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.arrays import AnyFloats
+from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.errors import TacpipeError
@@ -22,7 +23,7 @@ from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
@@ -67,13 +68,17 @@ def train(
     """
     if not training.recordings:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
-    codec = tracks.codec_of(next(iter(training.recordings.values())).table(), training.files)
+    first = next(iter(training.recordings.values()))
+    codec = tracks.codec_of(first.table(), training.files, first.name)
+    pose = tracks.pose_of(first, params.actions, params.arm)
+    unit = units.of_channels(first.table().schema, codec.channels)
     start = Forecaster.load(init) if init else None
     params = _resolved(params, codec, start)
     if init and start:
         _check_start(start, init, params, codec, training.files)
+        _check_pose(start, pose)
     parts = [
-        [tracks.track(shard, codec) for _, shard in sorted(dataset.recordings.items())]
+        [tracks.track(shard, codec, pose) for _, shard in sorted(dataset.recordings.items())]
         for dataset in (training, validation)
     ]
     rate_hz = tracks.rate_hz([one for part in parts for one in part])
@@ -117,6 +122,8 @@ def train(
             "tactile": list(codec.channels),
             "layout": [dict(one) for one in codec.layout],
             "orientation_reference": reference.tolist(),
+            **({} if unit == units.COUNT else {"unit": unit}),
+            **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
         },
         "scaling": _scaling(parts[0]),
         "largest_level": largest_level(np.concatenate([one.tactile[one.usable] for one in parts[0]])),
@@ -259,3 +266,31 @@ def _check_start(
         )
     check_codec(init, recordings)
     codecs.check_channels(start.codec.channels, codec.channels)
+
+
+def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
+    """Return what a user should know of a trained model, its ``files`` given: an architecture that is not the best known."""
+    config = json.loads(files[CONFIG])
+    raw, channels = config["codec"]["kind"] == "raw", config["inputs"]["layout"]
+    if params.architecture == forecasts.AUTO and raw and config["architecture"] != forecasts.TAXELWISE:
+        named = sum("taxel" in one for one in channels)
+        why = (
+            f"{named} of {len(channels)} channels state their taxel"
+            if named < len(channels)
+            else "sensors differ in size"
+        )
+        return [
+            f"{why}, so the architecture is {config['architecture']} and not {forecasts.TAXELWISE}. Write {{taxel}} in "
+            f"match of [streams.…] columns of the layout file where channels are taxels."
+        ]
+    return []
+
+
+def _check_pose(start: Forecaster, pose: Pose) -> None:
+    """Raise `TacpipeError` where the model to begin with reads another arm than the recordings have."""
+    if start.pose != pose:
+        read, there = (", ".join(one.columns) or "no arm" for one in (start.pose, pose))
+        raise TacpipeError(
+            f"The model of --init reads {read} and the recordings hold {there}. Give recordings of the same arm, or begin "
+            f"without --init."
+        )

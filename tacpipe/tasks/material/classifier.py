@@ -25,6 +25,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.losses import CHUNK, Network
+from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Params
 from tacpipe.tasks.material.slides import Layout, Slides, difference
 from tacpipe.tasks.opened import Chain
@@ -127,6 +128,7 @@ class Classifier:
         self.params: Params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         self.architecture: str = config["architecture"]
         self.classes: tuple[int, ...] = tuple(config["classes"])
+        self.naming = Naming.from_json(config)
         self.quantities = tuple(config["quantities"])
         self.layouts = {name: Layout.from_json(name, layout) for name, layout in config["sensors"].items()}
         self.readers: dict[str, Reader] = self._readers(files[WEIGHTS], WEIGHTS)
@@ -157,6 +159,8 @@ class Classifier:
         """Read a slide of noise of each sensor, and raise where a part does not fit another."""
         if not self.layouts or not self.classes or len({*self.classes}) != len(self.classes):
             raise ValueError(f"there are {len(self.layouts)} sensors and {len(self.classes)} classes")
+        if self.naming.names and not set(self.classes) <= set(range(len(self.naming.names))):
+            raise ValueError(f"there are {len(self.naming.names)} names for classes up to {max(self.classes)}")
         for name, layout in self.layouts.items():
             if not 0 < layout.frames <= MOST_FRAMES:
                 raise ValueError(f"slides of {name} have {layout.frames} frames")
@@ -214,7 +218,7 @@ class Classifier:
         only = tuple(self.layouts) if self.params.sensors else ()
         there = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
         only = tuple(name for name in only if name in there) or only
-        found = slides_of.read(recordings, only=only, quantities=self.quantities, labelled=labelled)
+        found = slides_of.read(recordings, only=only, quantities=self.quantities, naming=self.naming, labelled=labelled)
         for one in found.values():
             self.check(one)
         return found
@@ -222,16 +226,21 @@ class Classifier:
     def check(self, slides: Slides) -> None:
         """Raise `TacpipeError` where slides are of another layout than those that the model was trained on."""
         layout = self.layout(slides.layout.sensor)
-        if slides.layout != layout:
+        if not layout.alike(slides.layout):
             raise TacpipeError(
                 f"{slides.names[0]} {difference(layout, slides.layout)} as the model was trained on. "
                 f"Segment it with the same params, or train on slides like it."
             )
 
     def named(self, scores: Float32s) -> Int64s:
-        """Return the material of the highest score of each slide (slide,)."""
+        """Return the number of the class of the highest score of each slide (slide,)."""
         named: Int64s = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
         return named
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of ``classes``, as the labels of the recordings have them."""
+        return tuple(map(self.naming.name, self.classes))
 
     def partner(self, sensor: str) -> str:
         """Return the sensor whose classifier is exchanged with that of ``sensor``: the next one."""

@@ -15,9 +15,9 @@ from tacpipe.datasets import origin
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.printable import listed
 from tacpipe.tasks.material import headline as headlines
-from tacpipe.tasks.material import metrics
-from tacpipe.tasks.material import slides as slides_of
+from tacpipe.tasks.material import metrics, naming
 from tacpipe.tasks.material.classifier import CONFIG, MEAN_LEVEL, Classifier, NetworkReader, ReaderOutput, SpectraReader
 from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
 from tacpipe.tasks.material.params import XLSTM, Raec
@@ -79,8 +79,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
         "confusion.csv": metrics.confusion_csv(
             [sensor for sensor, _, _ in rows],
-            [int(one.slides.materials[at]) for _, one, at in rows],
-            [int(one.predicted[MODEL][at]) for _, one, at in rows],
+            [classifier.naming.named(one.slides.materials[[at]])[0] for _, one, at in rows],
+            [classifier.naming.named(one.predicted[MODEL][[at]])[0] for _, one, at in rows],
         ),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
@@ -95,8 +95,9 @@ def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evalu
     foreign = [index for index, one in enumerate(slides.materials) if int(one) not in classifier.classes]
     if foreign:
         raise TacpipeError(
-            f"{slides.names[foreign[0]]} is of material {slides.materials[foreign[0]]}, not one of those the model names; "
-            f"it names {len(classifier.classes)} from {classifier.classes[0]} to {classifier.classes[-1]}. Leave it out."
+            f"{slides.names[foreign[0]]} is of {classifier.naming.key} "
+            f"{classifier.naming.name(int(slides.materials[foreign[0]]))}, not one of those the model names: "
+            f"{listed(classifier.names, 20)}. Leave it out."
         )
     output = classifier.readers[sensor].read(slides.frames)
     predicted = {MODEL: classifier.named(output.scores)}
@@ -214,18 +215,18 @@ def predictions_table(
 
     ``sessions`` maps a slide to its session, where one is recorded.
     """
-    label, count = {"quantity": "label"}, {sensor: len(one.slides) for sensor, one in evaluated.items()}
+    named, count = classifier.naming.named, {sensor: len(one.slides) for sensor, one in evaluated.items()}
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), [name for one in evaluated.values() for name in one.slides.names]),
         (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
-        (pa.field("material", pa.int32(), metadata=label), _joined(one.slides.materials for one in evaluated.values())),
+        naming.field("material", named(_joined(one.slides.materials for one in evaluated.values())), "label"),
         (pa.field("seen", pa.bool_()), _joined(one.seen for one in evaluated.values())),
     ]
-    named = [(sessions or {}).get(name) for one in evaluated.values() for name in one.slides.names]
-    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in named]))
+    held = [(sessions or {}).get(name) for one in evaluated.values() for name in one.slides.names]
+    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in held]))
     for name in sorted({name for one in evaluated.values() for name in one.predicted}):
-        values = [one.predicted.get(name, np.full(len(one.slides), slides_of.UNKNOWN)) for one in evaluated.values()]
-        columns.append((pa.field(name, pa.int32(), metadata={"quantity": "prediction"}), _joined(values)))
+        values = [one.predicted.get(name, np.full(len(one.slides), naming.UNKNOWN)) for one in evaluated.values()]
+        columns.append(naming.field(name, named(_joined(values)), "prediction"))
     columns += score_columns(classifier, _joined(one.output.scores for one in evaluated.values()))
     latents = [one.output.latents for one in evaluated.values() if one.output.latents is not None]
     if latents:
@@ -238,8 +239,8 @@ def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Fie
     """Return a column of scores a material."""
     about = {"quantity": "score"}
     return [
-        (pa.field(f"score_{material:02d}", pa.float32(), metadata=about), scores[:, number])
-        for number, material in enumerate(classifier.classes)
+        (pa.field(f"score_{name.zfill(2)}", pa.float32(), metadata=about), scores[:, number])
+        for number, name in enumerate(classifier.names)
     ]
 
 

@@ -64,10 +64,10 @@ def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> Tree:
     return found
 
 
-def confusion_csv(sensors: Sequence[str], materials: Sequence[int], predicted: Sequence[int]) -> bytes:
+def confusion_csv(sensors: Sequence[str], materials: Sequence[Any], predicted: Sequence[Any]) -> bytes:
     """Return how often each sensor's slides of a material were given each name, as CSV."""
-    counts: dict[tuple[str, int, int], int] = {}
-    for key in zip(sensors, map(int, materials), map(int, predicted), strict=True):
+    counts: dict[tuple[str, Any, Any], int] = {}
+    for key in zip(sensors, materials, predicted, strict=True):
         counts[key] = counts.get(key, 0) + 1
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.arrays import Float32s, Int64s
+from tacpipe.arrays import Float32s
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.tasks.material import prediction
 from tacpipe.tasks.material.classifier import Classifier
@@ -24,26 +24,28 @@ class MaterialModel(Classifier):
     def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
 
     @overload
-    def predict(self, slides: Float32s | NDArray[np.float64], /, sensor: str = "") -> Int64s: ...
+    def predict(self, slides: Float32s | NDArray[np.float64], /, sensor: str = "") -> NDArray[Any]: ...
 
     def predict(
         self, given: Dataset | Recording | Float32s | NDArray[np.float64], /, sensor: str = ""
-    ) -> pa.Table | Int64s:
+    ) -> pa.Table | NDArray[Any]:
         """Return the material of slides: of a dataset or one of its recordings as a table, of arrays as an array.
 
-        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
-        a row a slide with ``recording``, ``sensor``, ``material`` (int32), a ``score_…`` of each class and, of networks, the
-        latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of a dataset are those of the command to the last bit;
-        those of one recording alone may differ in the last digits of a float32, because slides are computed together.
-        Raises `UsageError` where the recordings did not go through the stages that the model was trained behind.
+        **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict`
+        writes: a row a slide with ``recording``, ``sensor``, ``material`` (int32, or text where labels are), a
+        ``score_…`` of each class and, of networks, the latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of
+        a dataset are those of the command to the last bit; those of one recording alone may differ in the last digits
+        of a float32, because slides are computed together. Raises `UsageError` where the recordings did not go through
+        the stages that the model was trained behind.
 
-        **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them of a
-        recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64. Raises
-        `TacpipeError` for another shape than the model was trained on, and for values that are not finite.
+        **Arrays**: ``slides`` are device counts (slide, time, channel), or one (time, channel), as `frames` makes them
+        of a recording; ``sensor`` may be left out where the model knows but one. Returns materials (slide,), int64, or
+        text where labels are. Raises `TacpipeError` for another shape than the model was trained on, and for values
+        that are not finite.
         """
         if isinstance(given, Dataset | Recording):
             return prediction.predictions(self, opened(given, self.chain))
-        return self.named(self.scores(given, sensor))
+        return self.naming.named(self.named(self.scores(given, sensor)))
 
     def frames(self, recording: Recording) -> tuple[Float32s, str]:
         """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.

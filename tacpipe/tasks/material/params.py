@@ -19,11 +19,13 @@ from tacpipe.plugins.constraints import (
     Seed,
     StoredAs,
 )
+from tacpipe.plugins.params import added
 
+KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
-HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(NonNegativeInt, least=1)], between=";")]
+HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(least=1)], between=";")]
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class Material:
     # label of this run in a report, next to others of the same method, as blocked
     run_label: Annotated[str, StoredAs("setting")] = ""
     seed: Seed = 0  # random seed of kernels, initial weights, the order of slides and pairs
+    # label of the recordings that names the classes: whole numbers or any text
+    label: str = added(KEY)
     baselines: bool = True  # fit the mean-level and shuffled-label baselines too, for evaluate to compare with
     # labels to learn; permuted: those of the training slides in random order, a negative control
     labels: Literal["true", "permuted"] = "true"
@@ -51,7 +55,7 @@ class Material:
             *("seed", "baselines"),
         ),
         "Data": (
-            *("sensors", "quantities", "labels", "hold_out", "speeds", "use_validation", "pairing"),
+            *("label", "sensors", "quantities", "labels", "hold_out", "speeds", "use_validation", "pairing"),
             *("subsample_sensor", "subsample_percent", "run_label"),
         ),
     }

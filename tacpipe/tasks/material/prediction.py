@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.material import naming
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS, latent_columns, score_columns
 
@@ -38,7 +39,7 @@ def predictions(classifier: Classifier, recordings: Dataset) -> pa.Table:
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), names),
         (pa.field("sensor", pa.string()), sensors),
-        (pa.field("material", pa.int32(), metadata={"quantity": "prediction"}), classifier.named(scores)),
+        naming.field("material", classifier.naming.named(classifier.named(scores)), "prediction"),
         *score_columns(classifier, scores),
     ]
     latents = [one.latents for one in outputs if one.latents is not None]

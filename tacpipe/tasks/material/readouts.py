@@ -16,6 +16,7 @@ from tacpipe.models.spatial_spectrum import Bands, Sampling
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins.constraints import Assignments
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, MEAN_LEVEL, PERMUTED_LABELS, WEIGHTS, Config
+from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Minirocket, Params, Spectra
 from tacpipe.tasks.material.slides import Slides
 
@@ -65,7 +66,9 @@ def spectra(
     named = {name: {int(one) for one in some.labels} for name, some in labelled.items()}
     missing = sorted(set(config["classes"]) - set().union(*named.values()))
     if missing:
-        raise UsageError(f"hold_out leaves no sensor that learns material {missing[0]}; leave at least one.")
+        raise UsageError(
+            f"hold_out leaves no sensor that learns {Naming.from_json(config).name(missing[0])}; leave at least one."
+        )
     config = config | {
         "spectra": {
             "way_m": bands.way_m,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Bools, Float32s, Floats, Int64s
+from tacpipe.channels.absent import absent
 from tacpipe.errors import TacpipeError
+from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
 
 STREAM = "slide"
 TACTILE = "tactile"
-UNKNOWN = -1  # stands where a slide has no material
+NEAR = 0.02  # of a rate, by which two slides of a sensor may differ
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,12 @@ class Layout:
     frames: int
     rate_hz: float
     layout: str = "time"  # frames in the order of time; authors: as published, in another one
+
+    def alike(self, other: Layout) -> bool:
+        """Return whether slides of both can be read as one: the rate may differ a little, as stamps do, or be unknown."""
+        apart = abs(self.rate_hz - other.rate_hz)
+        near = 0.0 in (self.rate_hz, other.rate_hz) or apart <= NEAR * max(self.rate_hz, other.rate_hz)
+        return near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
 
     def to_json(self) -> dict[str, Any]:
         """Return what `from_json` reads."""
@@ -49,7 +58,7 @@ class Slides:
     layout: Layout
     names: tuple[str, ...]
     frames: Float32s  # (slide, time, channel), device counts
-    materials: Int64s  # (slide,); UNKNOWN where none is labelled
+    materials: Int64s  # (slide,), numbers of classes; UNKNOWN where none is labelled
     digests: tuple[str, ...]
     speeds_m_s: Floats  # (slide,); NaN where none is recorded
 
@@ -75,9 +84,12 @@ def read(
     *,
     only: Sequence[str] = (),
     quantities: Sequence[str] = (TACTILE,),
+    naming: Naming = NUMBERS,
     labelled: bool = False,
 ) -> dict[str, Slides]:
     """Return the slides of each sensor, by name; ``only`` names the sensors to read, none being all.
+
+    ``naming`` gives the number of each label.
 
     Columns of the ``quantities`` are read, as far as a sensor has them. ``labelled`` refuses slides without a material.
     Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
@@ -100,7 +112,17 @@ def read(
     if missing:
         known = ", ".join(sorted(there)) or "none"
         raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {known}. Give others.")
-    return {sensor: _bundle(several, labelled) for sensor, several in sorted(found.items())}
+    return {sensor: _bundle(several, naming, labelled) for sensor, several in sorted(found.items())}
+
+
+def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[str]:
+    """Return those of the quantities that no sensor has, by the first recording of each."""
+    first = {shard.attributes.get("sensor"): shard for _, shard in sorted(recordings.recordings.items(), reverse=True)}
+    there: set[str] = set()
+    for shard in first.values():
+        schema = shard.table(STREAM if STREAM in shard.streams else "").schema
+        there |= {(field.metadata or {}).get(b"quantity", b"").decode() for field in schema}
+    return [quantity for quantity in quantities if quantity not in there]
 
 
 def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
@@ -114,10 +136,7 @@ def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[L
     wanted = {quantity.encode() for quantity in quantities}
     channels = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") in wanted]
     if not channels:
-        wanted_quantity = " or ".join(quantities)
-        raise TacpipeError(
-            f"Recording {shard.name} has no {wanted_quantity} channel: no column's quantity is {wanted_quantity}."
-        )
+        raise absent(shard.name, " or ".join(quantities), table.schema)
     values = _columns(table, channels)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]
@@ -125,8 +144,16 @@ def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[L
             f"Recording {shard.name}, row {row}, {channels[column]} is not finite; a slide has a number in every frame. "
             f"Exclude the recording or segment it again."
         )
-    rate_hz = float(shard.attributes.get("rate_hz") or 0.0)
+    rate_hz = float(shard.attributes.get("rate_hz") or _nominal_hz(table))
     return Layout(sensor, tuple(channels), len(values), rate_hz, str(shard.attributes.get("layout") or "time")), values
+
+
+def _nominal_hz(table: pa.Table) -> float:
+    """Return the rate of the rows by their median step; 0 without stamps."""
+    if "t_ns" not in table.column_names or table.num_rows < 2:
+        return 0.0
+    step_ns = float(np.median(np.diff(table.column("t_ns").to_numpy())))
+    return round(1e9 / step_ns, 1) if step_ns > 0 else 0.0
 
 
 def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
@@ -136,19 +163,20 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
     return values
 
 
-def _bundle(several: Sequence[tuple[Recording, Layout, Float32s]], labelled: bool) -> Slides:
+def _bundle(several: Sequence[tuple[Recording, Layout, Float32s]], naming: Naming, labelled: bool) -> Slides:
     """Return the slides of one sensor, alike in layout."""
     first, layout, _ = several[0]
     for shard, other, _ in several:
-        if other != layout:
+        if not layout.alike(other):
             raise TacpipeError(
-                f"{shard.name} {difference(layout, other)} as {first.name}; slides of a sensor are alike."
+                f"{shard.name} {difference(layout, other)} as {first.name}; slides of a sensor are alike. `tacpipe segment "
+                f"slides` keeps as many frames of each (--frames, and --trigger load without static pressure)."
             )
     return Slides(
         layout,
         tuple(shard.name for shard, _, _ in several),
         np.stack([values for _, _, values in several]),
-        np.array([_material(shard, labelled) for shard, _, _ in several], np.int64),
+        np.array([_material(shard, naming, labelled) for shard, _, _ in several], np.int64),
         tuple(shard.digest for shard, _, _ in several),
         np.array([shard.attributes.get("speed_m_s") or np.nan for shard, _, _ in several], np.float64),
     )
@@ -171,22 +199,23 @@ def difference(wanted: Layout, found: Layout) -> str:
     return f"has {found.rate_hz:g} frames a second, not {wanted.rate_hz:g}"
 
 
-def _material(shard: Recording, labelled: bool) -> int:
-    """Return the number of a slide's material."""
-    material = shard.attributes.get("material")
-    if isinstance(material, int) and not isinstance(material, bool) and material >= 0:
-        return material
-    if material is not None:
+def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
+    """Return the number of a slide's class; `UNKNOWN` without a label, and where none is needed also for another one."""
+    label = shard.attributes.get(naming.key)
+    if labelled and label is None:
         raise TacpipeError(
-            f"Recording {shard.name} has material {material!r}; materials are whole numbers from 0. Set it right with "
-            f"`tacpipe label`."
+            f"Recording {shard.name} of the sensor {shard.attributes.get('sensor')} has no label {naming.key} to learn "
+            f"from; set it with `tacpipe label RECORDINGS {shard.name} --set {naming.key}=…` or `tacpipe label RECORDINGS "
+            f"--from TABLE`, or exclude it."
         )
-    if labelled:
+    try:
+        return naming.number(label)
+    except TacpipeError as error:
+        if not labelled:
+            return UNKNOWN
         raise TacpipeError(
-            f"Recording {shard.name} of the sensor {shard.attributes.get('sensor')} has no material to learn from; set it "
-            f"with `tacpipe label RECORDINGS {shard.name} --set material=3`, or exclude it."
-        )
-    return UNKNOWN
+            f"Recording {shard.name}: {error}. Correct it with `tacpipe label`, or exclude the recording."
+        ) from error
 
 
 def quantities(given: str) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import Assignments, CommaList
+from tacpipe.printable import listed
 from tacpipe.tasks.material import readouts
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import (
@@ -35,6 +36,7 @@ from tacpipe.tasks.material.classifier import (
     NetworkReader,
 )
 from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
+from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
 from tacpipe.tasks.material.params import XLSTM, Minirocket, Params, Raec, Spectra
 from tacpipe.tasks.material.slides import Slides
@@ -70,15 +72,19 @@ def train(
     _check(params, init)
     only = CommaList().items(params.sensors)
     kinds = slides_of.quantities(params.quantities) or QUANTITIES.get(params.architecture, (slides_of.TACTILE,))
-    known = slides_of.read(training, only=only, quantities=kinds, labelled=True)
+    naming = _naming(params.label, training, validation)
+    known = slides_of.read(training, only=only, quantities=kinds, naming=naming, labelled=True)
     watched: dict[str, Slides] = {}
     if validation is not None and validation.recordings:
-        watched = slides_of.read(validation, only=only, quantities=kinds, labelled=True)
+        watched = slides_of.read(validation, only=only, quantities=kinds, naming=naming, labelled=True)
     if not known:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     classes = sorted({int(one) for some in known.values() for one in some.materials})
     if len(classes) < 2:
-        raise TacpipeError(f"All training slides are of material {classes[0]}; there is nothing to classify.")
+        raise TacpipeError(
+            f"All training slides are of {naming.key} {naming.name(classes[0])}; there is nothing to classify."
+        )
+    absent = slides_of.absent_quantities(training, kinds)
     config: Config = {
         "task": TASK,
         "architecture": params.architecture,
@@ -87,6 +93,8 @@ def train(
         "quantities": kinds,
         "sensors": {name: some.layout.to_json() for name, some in known.items()},
         "classes": classes,
+        **naming.to_json(),
+        **({"absent": absent} if absent else {}),
         "counts": {
             role: {name: len(some) for name, some in part.items()}
             for role, part in (("train", known), ("val", watched))
@@ -101,8 +109,14 @@ def train(
     if isinstance(params, Minirocket):
         return readouts.rockets(params, config, known, watched)
     if isinstance(params, Spectra):
-        return readouts.spectra(params, config, known, watched, held_out(params.hold_out, classes, known))
+        return readouts.spectra(params, config, known, watched, held_out(params.hold_out, classes, known, naming))
     return _networks(params, config, known, watched, workspace, init)
+
+
+def _naming(key: str, *parts: Dataset | None) -> Naming:
+    """Return the naming of the labels ``key`` of all recordings to learn from or to choose by."""
+    every = [shard for part in parts if part is not None for shard in part.recordings.values()]
+    return Naming.of(key, (shard.attributes.get(key) for shard in every))
 
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
@@ -146,11 +160,11 @@ def _networks(
     joint = isinstance(params, Raec) and params.joint and len(known) > 1
     mapped_to = _frozen(params)
     if joint:
-        _same_materials(known)
+        _same_materials(known, Naming.from_json(config))
     kinds = headers.chosen(params.headers, {name: len(some.layout.channels) for name, some in known.items()})
     shapes = {name: _shape(params, some, kinds[name], len(config["classes"])) for name, some in known.items()}
     scalings = {name: Affine.fit(some.frames, params.scaling) for name, some in known.items()}
-    held = held_out(params.hold_out, config["classes"], known)
+    held = held_out(params.hold_out, config["classes"], known, Naming.from_json(config))
     if start:
         _same_space(start, mapped_to, config, known)
         shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
@@ -252,7 +266,9 @@ def _scaled(
     return ScaledSlides(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
 
 
-def held_out(given: str, classes: Sequence[int], sensors: Sequence[str] | BySensor) -> dict[str, set[int]]:
+def held_out(
+    given: str, classes: Sequence[int], sensors: Sequence[str] | BySensor, naming: Naming = NUMBERS
+) -> dict[str, set[int]]:
     """Return the materials whose labels each sensor does not learn; ``given`` is like ``roboskin=17,18,19,20``.
 
     >>> held_out("b=3,4", [1, 2, 3, 4], ["a", "b"])
@@ -260,26 +276,29 @@ def held_out(given: str, classes: Sequence[int], sensors: Sequence[str] | BySens
     """
     found: dict[str, set[int]] = {name: set() for name in sensors}
     for name, numbers in Assignments(str, between=";").items(given).items():
-        materials = set(CommaList(int).items(numbers))
+        try:
+            materials = {naming.read(word) for word in CommaList().items(numbers)}
+        except ValueError:
+            materials = {UNKNOWN}
         if name not in found or not materials <= set(classes):
             raise UsageError(
-                f"hold_out names {name}={numbers}; the sensors are {', '.join(found)} and the materials {classes[0]} to "
-                f"{classes[-1]}."
+                f"hold_out names {name}={numbers}; the sensors are {', '.join(found)} and the classes "
+                f"{listed(map(naming.name, classes), 20)}."
             )
         found[name] |= materials
     return found
 
 
-def _same_materials(known: BySensor) -> None:
+def _same_materials(known: BySensor, naming: Naming) -> None:
     """Refuse joint learning where a sensor lacks a material that another has."""
     materials = {name: {int(one) for one in some.materials} for name, some in known.items()}
     every = set().union(*materials.values())
     for name, own in materials.items():
         if own != every:
-            lacking = ", ".join(map(str, sorted(every - own)))
+            lacking = ", ".join(map(naming.name, sorted(every - own)))
             raise TacpipeError(
-                f"{name} has no training slide of material {lacking}, which other sensors have, so they cannot be learned "
-                f"jointly. Exclude those slides, record the material, or train with --no-joint."
+                f"{name} has no training slide of {naming.key} {lacking}, which other sensors have, so they cannot be "
+                f"learned jointly. Exclude those slides, record the material, or train with --no-joint."
             )
 
 
@@ -292,9 +311,10 @@ def _same_space(start: Classifier, known: str, config: Config, slides: BySensor)
             f"The model of --init is of the architecture {start.architecture}; its space must be of {RAEC}."
         )
     start.check(slides[known])
-    if list(start.classes) != config["classes"]:
+    if list(start.classes) != config["classes"] or start.naming != Naming.from_json(config):
         raise TacpipeError(
-            f"The model of --init names {len(start.classes)} materials and the recordings have {len(config['classes'])}; "
+            f"The model of --init names {listed(map(start.naming.name, start.classes))} and the recordings have "
+            f"{listed(map(Naming.from_json(config).name, config['classes']))}; "
             f"a known space is that of the same ones."
         )
 

@@ -100,3 +100,36 @@ def test_a_folder_without_tables_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("nothing")
     with pytest.raises(UsageError, match=r"\.csv"):
         guess.layout(tmp_path)
+
+
+def columns_of(folder: Path, frame: pd.DataFrame) -> dict[str, str]:
+    """Return the rules that are guessed for the columns of a table, by what they match."""
+    frame.to_csv(folder / "skin_1.csv", index=False)
+    lines = [line.strip() for line in guess.layout(folder).splitlines()]
+    return {line.split('"')[1]: line for line in lines if line.startswith("{ match")}
+
+
+def test_numbered_columns_that_are_or_may_be_taxels_state_which(tmp_path: Path) -> None:
+    counts = {f"{name}{n}": [n, 3, 4] for name in ("pad", "t") for n in range(3)}
+    joints = {f"q{n}": [0.5, 0.25, n / 8] for n in range(3)}
+    found = columns_of(tmp_path, pd.DataFrame({"time": [1.7e9, 1.7e9 + 1, 1.7e9 + 2], **counts, **joints}))
+    assert 'quantity = "tactile"' in found["pad{taxel}"] and 'quantity = "?"' in found["t{taxel}"]
+    assert 'quantity = "joint_position"' in found["q{number}"]
+
+
+def test_a_place_beside_a_quaternion_is_a_position_and_one_alone_is_asked_for(tmp_path: Path) -> None:
+    place, turned = (dict.fromkeys(names, (0.5, 0.25)) for names in ("xyz", ("qx", "qy", "qz", "qw")))
+    time = {"time": [1.7e9, 1.7e9 + 1]}
+    alone = columns_of(tmp_path, pd.DataFrame({**time, **place}))
+    beside = columns_of(tmp_path, pd.DataFrame({**time, **place, **turned}))
+    for part in "xyz":
+        assert 'quantity = "?"' in alone[part]
+        assert 'quantity = "position", unit = "?"' in beside[part]
+
+
+def test_a_guess_lists_quantities_and_units_to_choose_from(tmp_path: Path) -> None:
+    labs.write(tmp_path, 1)
+    head = guess.layout(tmp_path).partition("[streams")[0]
+    assert all(line.startswith("#") for line in head.splitlines() if line)
+    for word in ("tactile", "position", "orientation", "count", "kPa", "--requirements", "{taxel}"):
+        assert word in head

@@ -1,0 +1,112 @@
+"""What `train TASK --requirements` prints is what the task asks for: without it recordings are refused, or are not."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.requirements import REQUIREMENTS as FORWARD
+from tacpipe.tasks.material import slides as material_slides
+from tacpipe.tasks.material.requirements import REQUIREMENTS as MATERIAL
+from tests.conftest import Lab
+from tests.stages.learning_fakes import FakeShard
+from tests.tasks.material.textures import dataset as slides_of
+from tests.tasks.material.textures import slide
+
+TASKS = sorted(registry.entry_points()[registry.TASKS])
+DOCS = Path(__file__).parents[1] / "docs" / "tasks"
+
+
+def field(name: str, quantity: str, unit: str, kind: Any = None) -> pa.Field:
+    about = {"quantity": quantity, "unit": unit, "stream": name.partition("_")[0], "rest": "0"}
+    return pa.field(name, kind or pa.float64(), metadata=about)
+
+
+FIELDS = [
+    pa.field("t_ns", pa.int64()),
+    *(field(f"skin_t{n}", "tactile", "V") for n in range(3)),
+    *(field(f"arm_{part}", "position", "cm") for part in "xyz"),
+    *(field(f"arm_q{part}", "orientation", "1") for part in "xyzw"),
+    *(field(f"arm_j{n}", "joint_position", "rad") for n in range(7)),
+    *(field(f"arm_v{n}", "joint_velocity", "rad/s") for n in range(7)),
+    field("hand_width", "finger_width", "mm"),
+    pa.field("contact", pa.int32(), metadata={"quantity": "label"}),
+]
+
+
+def without(quantity: str) -> FakeShard:
+    """A recording that has all that forecasts can read but ``quantity``."""
+    kept = [one for one in FIELDS if (one.metadata or {}).get(b"quantity") != quantity.encode()]
+    columns = [pa.array([1] * 40, one.type) if one.name != "t_ns" else pa.array(range(40), pa.int64()) for one in kept]
+    return FakeShard("trial", pa.Table.from_arrays(columns, schema=pa.schema(kept)), {"object": "cup"})
+
+
+def read(shard: Any, actions: str) -> tracks.Track:
+    codec = tracks.codec_of(shard.content, {}, shard.name)
+    return tracks.track(shard, codec, tracks.pose_of(shard, actions))
+
+
+@pytest.mark.parametrize("quantity", [one.quantity for one in FORWARD.channels])
+def test_forecasts_refuse_recordings_without_what_is_needed_and_read_those_without_the_rest(quantity: str) -> None:
+    if quantity in FORWARD.needed:
+        with pytest.raises(TacpipeError, match=f'{quantity}.*quantity = "{quantity}".*layout file'):
+            read(without(quantity), "none")
+    else:
+        assert read(without(quantity), "none").usable.all()
+
+
+def test_what_forecasts_can_do_without_is_everything_but_touch() -> None:
+    assert FORWARD.needed == ("tactile",)
+    assert set(FORWARD.needed) < {(one.metadata or {}).get(b"quantity", b"").decode() for one in FIELDS}
+    with pytest.raises(TacpipeError, match="--actions none"):
+        read(without("position"), "planned")
+
+
+@pytest.mark.parametrize("label", [one.name for one in MATERIAL.labels])
+def test_materials_refuse_slides_without_a_needed_label_and_read_those_without_the_rest(label: str) -> None:
+    given = slides_of(slide("biotac", 1, 0, **{"session": "a", label: None}))
+    needed = {one.name for one in MATERIAL.labels if not one.without}
+    if label in needed:
+        with pytest.raises(TacpipeError, match=f"no label {label}"):
+            material_slides.read(given, labelled=True)
+    else:
+        assert len(material_slides.read(given, labelled=True)["biotac"]) == 1
+
+
+def test_materials_refuse_slides_without_touch() -> None:
+    bare = slide("biotac", 1, 0)
+    bare.tables["slide"] = bare.tables["slide"].select(["t_ns"])  # type: ignore[index]
+    with pytest.raises(TacpipeError, match=r'quantity = "tactile".*layout file'):
+        material_slides.read(slides_of(bare), labelled=True)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_prints_what_it_needs_without_a_dataset_and_its_page_has_it(lab: Lab, task: str) -> None:
+    stage = registry.load(f"train.{task}")
+    assert stage.requirements is not None and stage.requirements.task == task
+    printed = lab.run(f"train {task} --requirements").out
+    assert printed == stage.requirements.to_text() + "\n"
+    for channels in stage.requirements.channels:
+        assert channels.quantity in printed and all(unit in printed for unit in channels.units)
+    assert printed in (DOCS / f"{task}.md").read_text()
+    assert max(map(len, printed.splitlines())) <= 112
+    known = registry.stages()
+    for name in stage.requirements.stages:
+        assert name.replace(" ", ".") in known
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_options_that_requirements_name_exist(task: str) -> None:
+    stage = registry.load(f"train.{task}")
+    assert stage.requirements is not None
+    flags = {f"--{name.replace('_', '-')}" for name in params_of.fields(stage)}
+    flags |= {f"--{name.replace('_', '-')}" for name in params_of.fields(registry.load("segment.slides"))} | {"--from"}
+    assert set(re.findall(r"--[a-z-]+", stage.requirements.to_text())) <= flags
