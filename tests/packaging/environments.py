@@ -39,12 +39,19 @@ LEARN = (
 CLOUDS = ("candidates box.pcd",)
 DEVICES = ("sensors probe",)
 SILENT = 5  # where the computer has a serial port, and nothing answers there
+HDF5 = ("export hdf5 data/recordings -o hdf5", "ingest hdf5 hdf5 --guess")
+ROS = ("export mcap data/recordings -o mcap", "ingest mcap mcap -o data/from-mcap")
+ZARR = ("export zarr data/synced -o zarr", "ingest zarr zarr --guess")
 EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not without
     "learn": LEARN,
     "clouds": CLOUDS,
     "devices": DEVICES,
     "frames": (),
-    "all": (*LEARN, *CLOUDS, *DEVICES),
+    "hdf5": HDF5,
+    "lsl": (),
+    "ros": ROS,
+    "zarr": ZARR,
+    "all": (*LEARN, *CLOUDS, *DEVICES, *HDF5, *ROS, *ZARR),
 }
 IMPORT_ALL = """
 import importlib, pkgutil, sys
