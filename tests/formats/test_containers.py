@@ -150,6 +150,9 @@ def test_a_wrong_layout_of_a_container_is_one_sentence(text: str, named: str) ->
         COMMAND.parsed(given(text))
 
 
-def test_a_folder_without_containers_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"\.fake"):
-        COMMAND.discover(NONE, tmp_path)
+@pytest.mark.parametrize("name", ["", "a.yaml", "gone"])
+def test_what_holds_no_container_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.yaml").write_text("a: 1")
+    for look in (lambda: COMMAND.discover(NONE, tmp_path / name), lambda: COMMAND.guess(tmp_path / name)):
+        with pytest.raises(UsageError, match=name if name == "gone" else r"\.fake"):
+            look()

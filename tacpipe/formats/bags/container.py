@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, ros, sqlite_file
+from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, protobuf_messages, ros, sqlite_file
 from tacpipe.formats.bags.own import Own
 from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
 from tacpipe.formats.bags.topics import Decoder, Topic, TopicError
@@ -27,6 +27,7 @@ LOOK_MESSAGES = 20_000  # after which a look at a file ends
 MOST_BYTES = 1 << 22  # of a metadata.yaml
 READERS = {".mcap": mcap_file.records, ".db3": sqlite_file.records, ".bag": bag_file.records}
 ZSTD = ".zstd"  # the ending of a file that was compressed as a whole
+ACTIVE = ".active"  # of a ROS 1 bag that is being written, or whose recorder was killed
 OF = ":"  # between a topic and what names one of its streams, as "/tf:gripper"
 OWN = "rosbag2"  # the metadata record that a ROS 2 bag writes about itself
 
@@ -54,14 +55,14 @@ class Bag:
             files, messages_compressed, notes = _files(self.path, stack)
             reading = _Reading(sources, messages_compressed)
             for number, file in enumerate(files):
-                reading.take(READERS[file.suffix.lower()](file), number, most)
+                reading.take(_records(file), number, most)
         contents = reading.contents()
         return Contents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
 
 
 def opened(path: Path) -> Bag:
     """Return the bag at ``path``. Raises `MissingModuleError` where a library is missing."""
-    extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard")
+    extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard", "google.protobuf")
     return Bag(path)
 
 
@@ -85,9 +86,15 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
     return [_unpacked(one, stack) for one in there], compressed, notes
 
 
+def _records(path: Path) -> Iterator[Record]:
+    if _ending(path) not in READERS:
+        raise TacpipeError(f"{path} is not a bag by its name; {', '.join(READERS)} are read.")
+    return READERS[_ending(path)](path)
+
+
 def _ending(path: Path) -> str:
-    """Return the ending of a file, that below .zstd where it is compressed as a whole."""
-    return (path.with_suffix("") if path.suffix.lower() == ZSTD else path).suffix.lower()
+    """Return the ending of a file, that below .zstd where it is compressed as a whole, or .active where it was cut off."""
+    return (path.with_suffix("") if path.suffix.lower() in (ZSTD, ACTIVE) else path).suffix.lower()
 
 
 def _described(path: Path) -> dict[str, Any]:
@@ -124,6 +131,7 @@ class _Reading:
 
     sources: Collection[str] | None
     compressed: bool
+    ended_early: bool = False
     topics: dict[str, Topic] = field(default_factory=dict)
     types: dict[str, str] = field(default_factory=dict)  # of each topic
     skipped: dict[str, str] = field(default_factory=dict)
@@ -138,6 +146,7 @@ class _Reading:
             if isinstance(record, Message):
                 self._message(record, file)
                 if most is not None and (most := most - 1) <= 0:
+                    self.ended_early = True
                     return
             elif isinstance(record, Channel):
                 self._channel(record, file)
@@ -211,11 +220,16 @@ class _Reading:
                 source = f"{topic}{OF}{one.suffix}" if one.suffix else topic
                 if self.sources is not None and source not in self.sources:
                     continue
+                rows = None if self.ended_early else one.table.num_rows
                 before = self.own.get(topic)
                 name = before.stream if before is not None and before.stream else source
-                found.append((before, SourceStream(source, name, one.time, one.table, one.table.num_rows)))
+                found.append((before, SourceStream(source, name, one.time, one.table, rows)))
                 if one.note:
                     self.notes.append(f"{plain(source)}: {one.note}; its log times are used.")
+        if self.ended_early:
+            self.notes.append(
+                f"The first {LOOK_MESSAGES} messages of each file were looked at; later ones may have other topics."
+            )
         if not found and not self.skipped:
             self.skipped = dict.fromkeys(self.topics, "it has no messages")
         streams = [stream if before is None else own.restored(stream, before) for before, stream in found]
@@ -244,4 +258,8 @@ def _decoder(channel: Channel) -> Decoder:
         return ros.Ros(name, ros.types(name, kind, text), channel.encoding == "cdr")
     if channel.encoding == "json":
         return json_messages.Json(text)
-    raise TopicError(f"its messages are written as {plain(channel.encoding) or 'nothing known'}, not ros1, cdr or json")
+    if channel.encoding == "protobuf":
+        return protobuf_messages.Protobuf(channel.type, channel.schema)
+    raise TopicError(
+        f"its messages are written as {plain(channel.encoding) or 'nothing known'}, not ros1, cdr, json or protobuf"
+    )

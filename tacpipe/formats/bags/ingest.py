@@ -22,7 +22,7 @@ def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
 
 @stage(version=1, discover=_MCAP.discover, preview=_MCAP.preview, guess=_MCAP.guess)
 def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
-    """Read MCAP files (ROS 1, ROS 2 or JSON messages).
+    """Read MCAP files (ROS, JSON or protobuf messages).
 
     Each file is a recording, each topic a stream. Usual messages have names, quantities and units of their own; others
     are read by their definition. The time of a row is its header's stamp, or the log time where there is none.

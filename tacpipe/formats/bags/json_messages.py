@@ -1,4 +1,4 @@
-"""JSON messages of an MCAP file: an object a message, whose paths become columns."""
+"""JSON messages of an MCAP file: an object a message."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
-from tacpipe.formats.bags.topics import HEADER, Block, TopicError
-
-MOST_COLUMNS = 4096  # of a message
-_STAMPS = ("header.stamp", "timestamp")
+from tacpipe.formats.bags import paths
+from tacpipe.formats.bags.topics import Block, TopicError
 
 
 @dataclass(frozen=True)
@@ -30,34 +27,21 @@ class Json:
         rows: list[dict[str, Any]] = []
         for message in messages:
             try:
-                value = json.loads(bytes(message))
+                value = json.loads(message)
             except (ValueError, RecursionError) as error:
                 raise TopicError("a message is not JSON") from error
             if not isinstance(value, dict):
                 raise TopicError("a message is not a JSON object")
-            rows.append(flat(value))
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        if len(names) > MOST_COLUMNS:
-            raise TopicError(f"its messages have more than {MOST_COLUMNS} values")
-        columns = {}
-        stamp = next((name for name in _STAMPS if any(name in row for row in rows)), None)
-        for name in names:
-            values = [row.get(name) for row in rows]
-            if name == stamp:
-                columns[HEADER] = pa.array([value if isinstance(value, int) else 0 for value in values], pa.int64())
-            elif name in encoded:
-                columns[_named(name)] = _bytes(values)
-            else:
-                columns[_named(name)] = _array(values)
-        yield Block("", np.arange(len(rows)), columns, {name: {} for name in columns if name != HEADER})
+            row = flat(value)
+            row |= {name: _decoded(row[name]) for name in encoded if name in row}
+            rows.append(row)
+        yield paths.block(rows, dict.fromkeys(encoded, pa.binary()))
 
     def _encoded(self) -> set[str]:
         try:
             schema = json.loads(self.schema or "{}")
-            return {
-                name for name, one in schema.get("properties", {}).items() if one.get("contentEncoding") == "base64"
-            }
-        except (ValueError, AttributeError, RecursionError):
+            return {name for name, one in schema["properties"].items() if one.get("contentEncoding") == "base64"}
+        except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
             return set()
 
 
@@ -81,23 +65,8 @@ def flat(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     return found
 
 
-def _named(path: str) -> str:
-    return path.replace(".", "_")
-
-
-def _array(values: Sequence[Any]) -> pa.Array:
+def _decoded(value: Any) -> bytes:
     try:
-        found = pa.array(values)
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-        numbers = all(isinstance(one, int | float | None) for one in values)
-        found = pa.array([float(one) for one in values]) if numbers else pa.array([str(one) for one in values])
-    if pa.types.is_null(found.type):
-        return pa.array([""] * len(values), pa.string())
-    return found
-
-
-def _bytes(values: Sequence[Any]) -> pa.Array:
-    try:
-        return pa.array([base64.b64decode(one or "") for one in values], pa.binary())
+        return base64.b64decode(value or "")
     except (binascii.Error, TypeError, ValueError) as error:
         raise TopicError("a value is not base64, as its schema states") from error

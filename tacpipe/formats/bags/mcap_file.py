@@ -15,7 +15,8 @@ from tacpipe.io import memory, regular
 from tacpipe.printable import plain
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0C, 0x0F
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x09
+METADATA, DATA_END = 0x0C, 0x0F
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQI")  # first and last time, size and check sum of what is inside
@@ -44,7 +45,10 @@ def records(path: Path) -> Iterator[Record]:
                     ended = kind in (FOOTER, DATA_END)
                     if file.tell() + length > size:
                         raise _BrokenError(CUT_OFF)
-                    file.seek(length, io.SEEK_CUR)
+                    end = file.tell() + length
+                    if kind == ATTACHMENT:
+                        yield Damage(f"{path}: the attachment {_attached(file.read(min(length, 4096)))} is not read.")
+                    file.seek(end)
                     continue
                 there = min(length, size - file.tell())
                 memory.require(there, f"A record of {path}")
@@ -120,6 +124,11 @@ class _Reader:
             elif kind in (SCHEMA, CHANNEL):
                 yield from self.record(kind, view[at : at + length])
             at += length
+
+
+def _attached(content: bytes) -> str:
+    """Return the name in an attachment: after two times, and its length."""
+    return plain(content[20 : 20 + int.from_bytes(content[16:20], "little")].decode(errors="replace"))
 
 
 def _message(view: memoryview, at: int, length: int) -> Message:

@@ -6,9 +6,11 @@ Units follow REP 103 (SI). Types are recognised wherever they stand inside a mes
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from tacpipe.formats.bags.wire import TEXT, Leaf, Path, Shape
 
@@ -79,7 +81,7 @@ def _geometry() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
         found[field_of, ("magnetic_field", part)] = (f"magnetic_field_{part}_t", "magnetic_field", "T", part)
     found["sensor_msgs/msg/Temperature", ("temperature",)] = ("temperature_degc", "temperature", "degC", "")
     found["sensor_msgs/msg/FluidPressure", ("fluid_pressure",)] = ("pressure_pa", "static_pressure", "Pa", "")
-    found["sensor_msgs/msg/Range", ("range",)] = ("range_m", "distance", "m", "")
+    found["sensor_msgs/msg/Range", ("range",)] = ("range_m", "proximity", "m", "")
     return found
 
 
@@ -202,6 +204,27 @@ def _joint(leaf: Leaf, index: int, number: int, joint: str) -> Column:
     return Column(name.format(number), leaf, index, _about(quantity, unit, joint=joint))
 
 
+def _multi_array(shape: Shape) -> list[Part]:
+    """Return an array of std_msgs: a column a number, whose metadata are its place where the layout names dimensions."""
+    layout = {leaf.path[1:]: leaf for leaf in shape.leaves if leaf.path[0] == "layout"}
+    dimensions = [
+        (shape.text(layout[path]), shape.number(layout[(*path[:2], "size")])) for path in layout if path[-1] == "label"
+    ]
+    names = [name or f"dimension{number}" for number, (name, _) in enumerate(dimensions, 1)]
+    sizes = [size for _, size in dimensions]
+    made = Part()
+    for leaf in shape.leaves:
+        if leaf.path[0] != "layout":
+            made.columns += columns(leaf, "_".join(map(str, leaf.path)))
+    if dimensions and math.prod(sizes) == len(made.columns) and len(set(names)) == len(names):
+        places = itertools.product(*map(range, sizes))
+        made.columns = [
+            replace(column, about=tuple(zip(names, map(str, place), strict=True)))
+            for column, place in zip(made.columns, places, strict=True)
+        ]
+    return [made]
+
+
 def _transforms(shape: Shape) -> list[Part]:
     """Return the transforms of a message, a part for each pair of frames."""
     places = sorted({leaf.path[1] for leaf in shape.leaves}, key=int)
@@ -273,4 +296,6 @@ _MEANINGS: Mapping[str, Callable[[], Meaning]] = {
 
 def of(name: str) -> Meaning:
     """Return the meaning of the messages of one topic, whose type has this name."""
+    if name.startswith("std_msgs/msg/") and name.endswith("MultiArray"):
+        return Meaning(_multi_array, lambda leaf: leaf.path[0] == "layout")
     return _MEANINGS.get(name, lambda: Meaning(plain_parts))()

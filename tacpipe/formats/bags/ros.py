@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -90,12 +90,26 @@ class Ros:
                 known = self._shapes.setdefault(bytes(mark), [])
                 own = [messages[row] for row in chosen.tolist()] if len(chosen) < len(messages) else messages
                 self._expect_fitting(bytes(own[0]), encoding)
+                single: dict[Any, _Single] = {}
                 for shape, rows, matrix in wire.shapes(own, self.types, self.name, encoding, known):
+                    if len(rows) == 1:
+                        self._take(shape, int(chosen[rows[0]]), meaning, single)
+                        continue
                     for same, one in _by_keys(shape, matrix, meaning):
                         yield from _blocks(one, chosen[rows[same]], matrix[same], meaning)
+                for found in single.values():
+                    yield from found.blocks()
                 del known[MOST_SHAPES:]
         except wire.WireError as error:
             raise TopicError(str(error)) from error
+
+    def _take(self, shape: Shape, row: int, meaning: meanings.Meaning, single: dict[Any, _Single]) -> None:
+        """Add a message that is alone with its shape to those with the same leaves."""
+        keys = tuple(shape.first[leaf.offset : leaf.offset + leaf.size] for leaf in shape.leaves if meaning.keys(leaf))
+        same = (tuple(shape.counts), keys)
+        if same not in single:
+            single[same] = _Single.of(shape, meaning)
+        single[same].add(shape, row)
 
     def _expect_fitting(self, message: bytes, encoding: Encoding) -> None:
         """Take ROS's own definition of the type where the file's does not fit: old recorders wrote another type's."""
@@ -108,6 +122,65 @@ class Ros:
                 self.types = own
 
 
+@dataclass
+class _Single:
+    """Messages with the same leaves whose texts have lengths of their own, value by value."""
+
+    parts: list[meanings.Part]
+    leaves: dict[Leaf, int]  # positions
+    rows: list[int] = field(default_factory=list)
+    values: list[list[list[Any]]] = field(default_factory=list)  # by part and column
+
+    @classmethod
+    def of(cls, shape: Shape, meaning: meanings.Meaning) -> _Single:
+        """Return the columns of messages such as the first of a shape."""
+        parts = [one for one in meaning.parts(shape) if one.columns]
+        for one in parts:
+            one.columns = [*_about_time(one), *one.columns]
+        leaves = {leaf: position for position, leaf in enumerate(shape.leaves)}
+        return cls(parts, leaves, [], [[[] for _ in one.columns] for one in parts])
+
+    def add(self, shape: Shape, row: int) -> None:
+        """Take in the values of a message."""
+        self.rows.append(row)
+        for part, values in zip(self.parts, self.values, strict=True):
+            for column, cells in zip(part.columns, values, strict=True):
+                cells.append(shape.value(shape.leaves[self.leaves[column.leaf]], column.index))
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the columns."""
+        for part, values in zip(self.parts, self.values, strict=True):
+            columns: dict[str, pa.Array] = {}
+            about: dict[str, Mapping[str, str]] = {}
+            for column, cells in zip(part.columns, values, strict=True):
+                name = _free(column.name, columns)
+                columns[name] = pa.array(cells, _type(column))
+                if column.name not in (HEADER, FRAME):
+                    about[name] = dict(column.about)
+            yield Block(part.suffix, np.array(self.rows), columns, about)
+
+
+def _about_time(part: meanings.Part) -> list[Column]:
+    """Return the columns of a part's header."""
+    found = [(HEADER, part.stamp), (FRAME, part.frame)]
+    return [Column(name, leaf) for name, leaf in found if leaf is not None]
+
+
+def _type(column: Column) -> pa.DataType:
+    leaf = column.leaf
+    if leaf.kind in (TEXT, "stamp"):
+        return pa.string() if leaf.kind == TEXT else pa.int64()
+    if column.index is None and leaf.count is not None:
+        return pa.binary()
+    return pa.bool_() if leaf.kind == "bool" else pa.from_numpy_dtype(np.dtype(wire.NUMBERS[leaf.kind]))
+
+
+def _free(name: str, taken: Mapping[str, Any]) -> str:
+    while name in taken:
+        name = f"{name}_"
+    return name
+
+
 def _by_keys(
     shape: Shape, matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[tuple[np.ndarray[Any, np.dtype[np.int64]], Shape]]:
@@ -117,11 +190,11 @@ def _by_keys(
     if not keys:
         yield left, shape
         return
-    places = np.concatenate([np.arange(leaf.offset, leaf.offset + (leaf.count or 0)) for leaf in keys])
+    places = np.concatenate([np.arange(leaf.offset, leaf.offset + leaf.size) for leaf in keys])
     while len(left):
         first = matrix[left[0]]
         same = (matrix[left][:, places] == first[places]).all(axis=1)
-        yield left[same], Shape(shape.encoding, shape.size, shape.leaves, shape.lengths, first.tobytes())
+        yield left[same], replace(shape, first=first.tobytes())
         left = left[~same]
 
 
@@ -137,9 +210,7 @@ def _blocks(
         if part.frame is not None:
             columns[FRAME] = _texts(part.frame, matrix)
         for column in part.columns:
-            name = column.name
-            while name in columns:
-                name = f"{name}_"
+            name = _free(column.name, columns)
             columns[name] = _array(shape, column, matrix, cache)
             about[name] = dict(column.about)
         if about:

@@ -23,9 +23,14 @@ NUMBERS = {
     **{"bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"},
 }
+_CODES = {  # struct's own, whose "l" has four bytes where numpy's has eight
+    name: ({"i8": "q", "u8": "Q"}.get(kind, np.dtype(kind).char), np.dtype(kind).itemsize)
+    for name, kind in NUMBERS.items()
+}
 STAMPS = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 TEXT = "text"
 MOST_LEAVES = 1 << 16  # of a message
+TRIED, MANY = 8, 4  # after so many shapes of fewer messages each, others of this size are taken one by one
 _BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags.interfaces.Nodetype
 
 
@@ -42,6 +47,14 @@ class Leaf:
     offset: int  # bytes from the start
     count: int | None  # of an array; of a text its bytes; None: a single number
     within: tuple[tuple[int, str], ...]  # message types around it: length of their path, name
+
+    @property
+    def size(self) -> int:
+        """How many bytes it takes."""
+        if self.kind == "stamp":
+            return 8
+        width = 1 if self.kind == TEXT else np.dtype(NUMBERS[self.kind]).itemsize
+        return width * (1 if self.count is None else self.count)
 
 
 @dataclass(frozen=True)
@@ -73,11 +86,29 @@ class Shape:
     size: int
     leaves: list[Leaf] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)  # offsets of the 4-byte words that hold a length
+    counts: list[int] = field(default_factory=list)  # of its sequences: messages with the same have the same leaves
     first: bytes = b""
 
     def text(self, leaf: Leaf) -> str:
         """Return a text of the first message."""
         return self.first[leaf.offset : leaf.offset + (leaf.count or 0)].decode(errors="replace")
+
+    def value(self, leaf: Leaf, index: int | None) -> Any:
+        """Return a value of the first message: a text, a number, one of an array, a stamp in nanoseconds, or bytes."""
+        if leaf.kind == TEXT:
+            return self.text(leaf)
+        if leaf.kind == "stamp":
+            seconds, rest = struct.unpack_from(f"{self.encoding.order}iI", self.first, leaf.offset)
+            return seconds * 10**9 + rest
+        if index is None and leaf.count is not None:
+            return self.first[leaf.offset : leaf.offset + leaf.size]
+        code, width = _CODES[leaf.kind]
+        (found,) = struct.unpack_from(f"{self.encoding.order}{code}", self.first, leaf.offset + (index or 0) * width)
+        return bool(found) if leaf.kind == "bool" else found
+
+    def number(self, leaf: Leaf) -> int:
+        """Return a whole number of the first message."""
+        return int(self.numbers(leaf, np.frombuffer(self.first, np.uint8)[None])[0])
 
     def numbers(self, leaf: Leaf, matrix: Matrix) -> npt.NDArray[Any]:
         """Return a number (message,), an array of numbers (message, position), or stamps (message,) in nanoseconds."""
@@ -113,13 +144,19 @@ def shapes(
         content = messages[int(rows[0])] if len(rows) == 1 else b"".join([messages[row] for row in rows.tolist()])
         matrix = np.frombuffer(content, np.uint8).reshape(len(rows), int(size))
         candidates = [shape for shape in known if shape.size == size]
+        tried = taken = 0
         while len(rows):
+            if tried >= TRIED and taken < MANY * tried:  # texts of any length: hardly two are alike
+                for row, message in zip(rows.tolist(), matrix, strict=True):
+                    yield walked(message.tobytes(), types, name, encoding), np.array([row]), message[None]
+                break
             shape = next(iter(candidates), None)
             if shape is None:
                 shape = walked(matrix[0].tobytes(), types, name, encoding)
                 known.append(shape)
             candidates = candidates[1:]
             same = _alike(shape, matrix)
+            tried, taken = tried + 1, taken + int(same.sum())
             if same.all():
                 yield shape, rows, matrix
                 break
@@ -181,6 +218,7 @@ class _Walk:
         count: int = inner[1]
         if node != _ARRAY:
             count, at = self._length(at)
+            self.shape.counts.append(count)
         kind = element[1][0] if int(element[0]) == _BASE else ""
         if kind in NUMBERS:
             width = np.dtype(NUMBERS[kind]).itemsize

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+from tacpipe.errors import UsageError
 from tacpipe.formats.containers.container import Container
 from tacpipe.io import files as file_system
 from tacpipe.io import regular
@@ -27,7 +28,7 @@ KINDS: Mapping[str, Kind] = {
     "mcap": Kind("tacpipe.formats.bags.container:opened", (".mcap",)),
     "rosbag": Kind(
         "tacpipe.formats.bags.container:opened",
-        (".bag", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
+        (".bag", ".bag.active", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
         ("metadata.yaml",),
         b"rosbag2_bagfile_information",
     ),
@@ -60,7 +61,7 @@ def _marks(path: Path, content: bytes) -> bool:
 
 def found(kind: str, source: Path) -> list[Path]:
     """Return the containers of this kind at or below ``source``, sorted; what lies within one is part of it."""
-    paths: list[Path] = [] if source.is_dir() else [source]
+    paths = [source] if not source.is_dir() and is_one(kind, source) else []
     for place, folders, names in file_system.walk(source) if source.is_dir() else ():
         if is_one(kind, Path(place)):
             paths.append(Path(place))
@@ -73,8 +74,17 @@ def found(kind: str, source: Path) -> list[Path]:
 def described(kind: str) -> str:
     """Return how containers of this kind are recognised, for errors."""
     one = KINDS[kind]
-    parts = [f"files named *{ending}" for ending in one.endings] + [f"folders with {mark}" for mark in one.marks]
-    return " or ".join(parts)
+    files = [f"files named {', '.join(f'*{ending}' for ending in one.endings)}"] if one.endings else []
+    folders = [f"folders with {' or '.join(one.marks)}"] if one.marks else []
+    return " or ".join([*files, *folders])
+
+
+def none(kind: str, source: Path) -> UsageError:
+    """Return the error for a source without a container of this kind."""
+    if not source.exists():
+        return UsageError(f"There is no {source} to read recordings from.")
+    verb = "holds no" if source.is_dir() else "is not a"
+    return UsageError(f"{source} {verb} recording for ingest {kind}, which reads {described(kind)}.")
 
 
 def members(path: Path) -> dict[str, Path]:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from tacpipe.errors import UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream, Time
 from tacpipe.formats.table import pattern
@@ -26,7 +25,7 @@ def layout(kind: str, source: Path) -> str:
     """
     paths = kinds.found(kind, source)
     if not paths:
-        raise UsageError(f"{source} holds no {kind}: there are no {kinds.described(kind)}.")
+        raise kinds.none(kind, source)
     file = kinds.opened(kind, paths[0])
     return of(file.look(next(iter(file.episodes()), None)), f"tacpipe ingest {kind}", paths[0])
 
@@ -38,6 +37,7 @@ def of(contents: Contents, command: str, path: Path) -> str:
         f"#   {command} FOLDER --layout THIS --dry-run"
     ]
     parts += [f"# {plain(source)} is left out: {why}" for source, why in contents.skipped.items()]
+    parts += [f"# {plain(one, 400)}" for one in contents.notes]
     parts += [_stream(one) for one in contents.streams]
     return "\n\n".join(parts) + "\n"
 

@@ -101,10 +101,23 @@ def contained(path: Path, found: SourceStream, stream: Stream) -> pa.Table:
     for one in found.table.schema:
         if one.type not in columns.TYPES.values():
             raise TacpipeError(f"{path}: column {plain(one.name)} of {plain(found.source)} holds {one.type}.")
-    made = _table(ContainedRows(path, found.source, found.table), stream, None, declared)
+    rows = found.table
+    if stream.time.column in rows.column_names and stream.time.column != found.time.column:
+        rows = _in_order(rows, stream.time.column)
+    made = _table(ContainedRows(path, found.source, rows), stream, None, declared)
     stamped = declared.get(stream.time.column)
     about = {key.decode(): value.decode() for key, value in (stamped.metadata or {}).items()} if stamped else {}
     return parquet.with_metadata(made, {TIME: {k: v for k, v in about.items() if k not in ("unit", "quantity")}})
+
+
+def _in_order(table: pa.Table, column: str) -> pa.Table:
+    """Return the rows in the order of another clock than the one that the container put them in."""
+    kind = table.schema.field(column).type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return table
+    stamps = table.column(column).to_numpy()
+    backwards = bool((np.diff(stamps) < 0).any())
+    return table.combine_chunks().take(pa.array(np.argsort(stamps, kind="stable"))) if backwards else table
 
 
 @dataclass(frozen=True)

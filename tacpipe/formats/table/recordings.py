@@ -80,7 +80,7 @@ def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
     """
     paths = kinds.found(kind, source)
     if not paths:
-        raise UsageError(f"{source} holds no {kind}: there are no {kinds.described(kind)}.")
+        raise kinds.none(kind, source)
     sources = []
     for path, stem in kinds.names(paths, source).items():
         stem = os.fsencode(stem).decode(errors="replace")

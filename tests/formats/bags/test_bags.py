@@ -172,7 +172,7 @@ def test_usual_messages_have_quantities_and_units(tmp_path: Path) -> None:
         "geometry_msgs/msg/AccelStamped": ("acceleration_x_m_s2", "acceleration", "m/s^2"),
         "sensor_msgs/msg/Imu": ("acceleration_z_m_s2", "acceleration", "m/s^2"),
         "sensor_msgs/msg/Temperature": ("temperature_degc", "temperature", "degC"),
-        "sensor_msgs/msg/Range": ("range_m", "distance", "m"),
+        "sensor_msgs/msg/Range": ("range_m", "proximity", "m"),
         "lab_msgs/msg/Grip": ("left_torque_x_nm", "torque", "N m"),
     }
     sent: list[Sent] = [
@@ -281,6 +281,23 @@ def test_arrays_that_change_their_length_leave_nan(tmp_path: Path) -> None:
     table = only(writers.ros2(tmp_path / "a", sent))
     assert table.column("data_0").type == pa.int16()
     assert str(table.column("data_2").to_pylist()) == "[nan, nan, 2.0]"
+
+
+def test_the_dimensions_of_an_array_are_the_places_of_its_columns(tmp_path: Path) -> None:
+    name = "std_msgs/msg/UInt8MultiArray"
+    dimensions = [{"label": "row", "size": 2, "stride": 6}, {"label": "column", "size": 3, "stride": 3}]
+    message = writers.build(TYPES, name, layout={"dim": dimensions}, data=range(6))
+    table = only(writers.ros2(tmp_path / "a", [("/skin", name, START_NS, message)]))
+    assert table.column_names == ["t_log_ns", *(f"data_{number}" for number in range(6))]
+    assert table.schema.field("data_4").metadata == {b"row": b"1", b"column": b"1"}
+
+
+def test_a_table_layout_that_takes_another_file_for_a_bag_is_refused(lab: Lab) -> None:
+    (lab.folder / "in").mkdir()
+    (lab.folder / "in" / "a.csv").write_text("t\n1\n")
+    (lab.folder / "l.toml").write_text('[streams.s]\nfiles = "{trial}.csv"\nformat = "rosbag"\nsource = "/s"')
+    refused = lab.call("ingest table in --layout l.toml -o data/rec")
+    assert refused.code == 1 and "a.csv" in refused.err
 
 
 def test_images_are_kept_as_encoded_frames(tmp_path: Path) -> None:
@@ -472,6 +489,20 @@ def test_a_look_has_the_columns_of_the_whole(tmp_path: Path) -> None:
     assert looked == {name: one.table.schema for name, one in streams(bag).items()}
 
 
+def test_a_look_that_ended_early_states_no_number_of_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tacpipe.formats.bags.container.LOOK_MESSAGES", 10)
+    contents = opened(WAYS["ros2-mcap"](tmp_path)).look(None)
+    assert [(one.table.num_rows, one.rows) for one in contents.streams] == [(5, None), (5, None)]
+    assert contents.notes
+
+
+def test_a_bag_whose_recorder_was_killed_is_found(lab: Lab) -> None:
+    path = writers.ros1(lab.folder / "a.bag", arm(TYPES1))
+    path.rename(lab.folder / "run.bag.active")
+    lab.run("ingest rosbag . -o data/rec")
+    assert list(lab.manifest("data/rec").recordings) == ["run"]
+
+
 def test_only_the_topics_that_were_asked_for_are_read(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
     contents = opened(bag).read(["/left/skin"], None)
@@ -505,3 +536,18 @@ def test_a_bag_of_others_is_read(path: str, rows: dict[str, int], skipped: int) 
     assert {name: found.get(name) for name in rows} == rows
     assert len(contents.skipped) == skipped
     assert not contents.notes
+
+
+def test_messages_with_texts_of_any_length_are_read_in_their_order(tmp_path: Path) -> None:
+    name = "rcl_interfaces/msg/Log"
+    rng = np.random.default_rng(3)
+    texts = [["x" * int(length) for length in rng.integers(0, 9, 4)] for _ in range(400)]
+    sent: list[Sent] = []
+    for number, (message, *others) in enumerate(texts):
+        fields = dict(zip(("name", "file", "function"), others, strict=True))
+        log = writers.build(TYPES, name, level=number % 50, msg=message, line=number, **fields)
+        sent.append(("/rosout", name, START_NS + number, log))
+    table = only(writers.ros2(tmp_path / "a", sent))
+    assert table.column("line").to_pylist() == list(range(400))
+    assert table.column("line").type == pa.uint32()
+    assert [[row["msg"], row["name"], row["file"], row["function"]] for row in table.to_pylist()] == texts

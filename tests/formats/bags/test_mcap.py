@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 
@@ -122,6 +123,19 @@ def test_a_message_that_is_not_an_object_of_json_costs_its_topic(tmp_path: Path,
     assert ([one.source for one in contents.streams], list(contents.skipped)) == (["/good"], ["/bad"])
 
 
+def test_an_attachment_is_named_as_one_that_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        writer.add_attachment(START_NS, START_NS, "calibration.yaml", "text/yaml", b"x" * 10_000)
+        writer.add_message(writer.register_channel("/a", "json", 0), START_NS, b'{"v": 1}', START_NS)
+        writer.finish()  # type: ignore[no-untyped-call]
+    contents = read(path)
+    assert len(contents.streams) == 1
+    assert "calibration.yaml" in contents.notes[0]
+
+
 def test_a_publish_time_of_its_own_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
@@ -196,7 +210,7 @@ def test_one_recording_as_csv_mcap_and_bag_gives_the_same_numbers(lab: Lab) -> N
         (lab.folder / "ros1").mkdir(exist_ok=True)
         writers.ros1(lab.folder / "ros1" / f"t{trial}.bag", _messages(types1, skin, arm), "LZ4")
     tables = {}
-    bag = ('source = "/skin"', "data_{taxel}", ', { match = "layout_*", skip = true }', 'source = "/joint_states"')
+    bag = ('source = "/skin"', "data_{taxel}", "", 'source = "/joint_states"')
     joints = '[{ match = "joint_{n}", name = "joint{n}_rad", quantity = "joint_position", unit = "rad" }]'
     ways = {
         "csv": (
@@ -237,6 +251,24 @@ def test_a_bag_needs_no_layout(lab: Lab) -> None:
     field = one.table("joint_states").schema.field("t_ns")
     assert field.metadata == {b"unit": b"ns", b"quantity": b"time", b"clock": b"header stamp", b"frame": b"base"}
     assert one.table("joint_states").column("t_log_ns").to_pylist() == (arm["t_ns"] + 300_000).tolist()
+
+
+def test_a_layout_may_choose_the_log_time_whatever_the_order_of_the_headers(lab: Lab) -> None:
+    types, name = writers.store(), "geometry_msgs/msg/WrenchStamped"
+    sent = []
+    for number, late_ns in enumerate((0, 30, 20)):
+        header = writers.header(types, START_NS - late_ns)
+        message = writers.build(types, name, header=header, wrench={"force": {"z": number}})
+        sent.append(("/w", name, START_NS + number, message))
+    writers.ros2(lab.folder / "bags" / "t0", sent)
+    (lab.folder / "l.toml").write_text('[streams.w]\nsource = "/w"\ntime = { column = "t_log_ns", unit = "ns" }')
+    lab.run("ingest rosbag bags -o data/header")
+    lab.run("ingest rosbag bags --layout l.toml -o data/log")
+    found = {}
+    for way in ("header", "log"):
+        (one,) = tacpipe.open(lab.folder / "data" / way)
+        found[way] = one.table("w").column("force_z_n").to_pylist()
+    assert found == {"header": [1, 2, 0], "log": [0, 1, 2]}
 
 
 def test_a_guess_of_a_bag_given_back_reads_the_same(lab: Lab) -> None:
@@ -285,3 +317,74 @@ def test_a_file_that_tacpipe_exported_comes_back_with_its_names_and_metadata(tmp
     assert stream.table.to_pylist() == [{"t_header_ns": START_NS, "Force X": 7, "frame": b"ab"}]
     assert stream.table.schema.field("Force X").metadata == {b"unit": b"count", b"quantity": b"tactile"}
     assert contents.attributes == {"material": "cork", "n": 3}
+
+
+def _touch_type() -> tuple[Any, bytes]:
+    """Return the class of a message of a lab's own, and the descriptors that describe it."""
+    file = descriptor_pb2.FileDescriptorProto(name="lab.proto", package="lab", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    message = file.message_type.add(name="Touch")
+    point = message.nested_type.add(name="Point")
+    kinds = descriptor_pb2.FieldDescriptorProto
+    for number, axis in enumerate("xy", 1):
+        point.field.add(name=axis, number=number, type=kinds.TYPE_DOUBLE, label=kinds.LABEL_OPTIONAL)
+    fields = [
+        ("timestamp", kinds.TYPE_MESSAGE, kinds.LABEL_OPTIONAL, ".google.protobuf.Timestamp"),
+        ("count", kinds.TYPE_UINT32, kinds.LABEL_OPTIONAL, ""),
+        ("force", kinds.TYPE_FLOAT, kinds.LABEL_REPEATED, ""),
+        ("contact", kinds.TYPE_BOOL, kinds.LABEL_OPTIONAL, ""),
+        ("data", kinds.TYPE_BYTES, kinds.LABEL_OPTIONAL, ""),
+        ("at", kinds.TYPE_MESSAGE, kinds.LABEL_OPTIONAL, ".lab.Touch.Point"),
+        ("name", kinds.TYPE_STRING, kinds.LABEL_OPTIONAL, ""),
+    ]
+    for number, (name, kind, label, of) in enumerate(fields, 1):
+        message.field.add(name=name, number=number, type=kind, label=label, type_name=of or None)
+    stamps = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamps)
+    described = descriptor_pb2.FileDescriptorSet(file=[stamps, file])
+    pool = descriptor_pool.DescriptorPool()
+    for one in described.file:
+        pool.Add(one)
+    made = message_factory.GetMessageClass(pool.FindMessageTypeByName("lab.Touch"))
+    return made, described.SerializeToString()
+
+
+def _protobuf(path: Path, contents: list[bytes], schema: bytes) -> Path:
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        channel = writer.register_channel("/touch", "protobuf", writer.register_schema("lab.Touch", "protobuf", schema))
+        for step, content in enumerate(contents):
+            writer.add_message(channel, START_NS + step, content, START_NS + step)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def test_protobuf_messages_are_read_by_their_descriptors(tmp_path: Path) -> None:
+    made, schema = _touch_type()
+    contents = []
+    for step in range(3):
+        message = made(count=step, force=[0.1, step], contact=step > 1, data=b"\xff" * step, at={"x": 1.5}, name="tip")
+        message.timestamp.FromNanoseconds(START_NS + step - 5)
+        contents.append(message.SerializeToString())
+    table = only(_protobuf(tmp_path / "a.mcap", contents, schema))
+    assert table.column("t_header_ns").to_pylist() == [START_NS - 5, START_NS - 4, START_NS - 3]
+    assert table.select(["count", "force_1", "contact", "data", "at_x", "name"]).to_pylist()[2] == {
+        "count": 2,
+        "force_1": 2.0,
+        "contact": True,
+        "data": b"\xff\xff",
+        "at_x": 1.5,
+        "name": "tip",
+    }
+    assert (table.schema.field("force_0").type, table.schema.field("count").type) == (pa.float32(), pa.uint32())
+
+
+@pytest.mark.parametrize(("content", "schema"), [(b"\xff\xff", None), (b"", b""), (b"", b"\xff")])
+def test_protobuf_that_does_not_fit_its_descriptors_costs_its_topic(
+    tmp_path: Path, content: bytes, schema: bytes | None
+) -> None:
+    given = _touch_type()[1] if schema is None else schema
+    contents = read(_protobuf(tmp_path / "a.mcap", [content], given))
+    assert (list(contents.streams), list(contents.skipped)) == ([], ["/touch"])
+    assert "lab.Touch" in contents.skipped["/touch"]

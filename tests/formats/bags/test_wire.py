@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,11 @@ def test_every_value_of_a_message_is_where_rosbags_finds_it(name: str, form: str
                     assert text == wanted[leaf.path]
                 else:
                     np.testing.assert_array_equal(shape.numbers(leaf, matrix)[at], wanted[leaf.path])
+                one = replace(shape, first=matrix[at].tobytes())
+                if leaf.count is None or leaf.kind == wire.TEXT:
+                    np.testing.assert_array_equal(one.value(leaf, None), wanted[leaf.path])
+                elif leaf.count:
+                    np.testing.assert_array_equal(one.value(leaf, leaf.count - 1), wanted[leaf.path][-1])
     assert sorted(seen) == list(range(40))
 
 
