@@ -67,6 +67,7 @@ def test_of_two_positions_the_stream_named_is_taken_and_else_the_robot() -> None
     assert pose.pose(both, "object").position[0] == "object_x"
     with pytest.raises(TacpipeError, match="--arm"):
         pose.pose(pa.schema([*arm("left"), *arm("right")]))
+    assert pose.pose(pa.schema([*arm("left"), *arm("right")]), needed=False) == pose.Pose()
     with pytest.raises(UsageError, match=r"wrist.*robot, object"):
         pose.pose(both, "wrist")
 

@@ -38,11 +38,12 @@ NAMED = Pose(
 )
 
 
-def pose(schema: pa.Schema, arm: str = "") -> Pose:
+def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
     """Return the columns of the arm's pose; of no arm where no column's quantity is position.
 
     ``arm`` names the stream of the arm; without it that is the only one with a position, or else the one named robot.
-    An arm without a quaternion has no orientation. Raises `TacpipeError` for several positions, for components that are
+    An arm without a quaternion has no orientation. Where none is ``needed`` and several streams hold a position, as markers
+    do, none of them is the arm. Raises `TacpipeError` for several positions, for components that are
     not x, y and z, and `UsageError` where ``arm`` has no position.
     """
     found = _vectors(schema, POSITION)
@@ -55,6 +56,8 @@ def pose(schema: pa.Schema, arm: str = "") -> Pose:
         return Pose()
     stream = arm or (streams[0] if len(streams) == 1 else USUAL)
     here = [fields for (owner, _), fields in found.items() if owner == stream]
+    if not here and not needed:
+        return Pose()
     if len(here) != 1:
         several = listed(field.name for fields in found.values() for field in fields)
         raise TacpipeError(

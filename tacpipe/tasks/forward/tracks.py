@@ -115,7 +115,7 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
     """
     schema = shard.table().schema
     try:
-        found = poses.pose(schema, arm)
+        found = poses.pose(schema, arm, needed=actions != "none")
     except UsageError as error:
         raise UsageError(f"{shard.name}: {error}") from error
     except TacpipeError as error:
