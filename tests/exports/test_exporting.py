@@ -144,6 +144,15 @@ def test_a_lost_file_is_brought_back_without_running(rig: Lab) -> None:
     assert (rig.folder / "out/trial-00/skin.csv").exists()
 
 
+def test_what_a_killed_run_left_in_folders_of_any_depth_is_swept(rig: Lab) -> None:
+    rig.run("export card rec -o out")
+    draft = rig.folder / "out/data/skin/.trial-00.parquet.0123456789ab.draft"
+    draft.write_bytes(b"half")
+    (draft.parent / "trial-00.parquet").unlink()
+    rig.run("export card rec -o out")
+    assert not draft.exists()
+
+
 def test_the_manifest_leads_back_to_the_recordings(rig: Lab) -> None:
     rig.run("export mcap rec -o out")
     manifest = rig.manifest("out")
