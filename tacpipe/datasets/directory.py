@@ -163,7 +163,8 @@ def _remove(directory: Path, paths: set[str]) -> None:
     for path in paths:
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
             (directory / path).unlink()
-    for folder in {(directory / path).parent for path in paths} - {directory}:
+    folders = {directory / folder for path in paths for folder in list(Path(path).parents)[:-1]}
+    for folder in sorted(folders, key=lambda one: len(one.parts), reverse=True):  # the deepest first
         with contextlib.suppress(OSError):  # not empty, or gone already
             folder.rmdir()
 

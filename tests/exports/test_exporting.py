@@ -121,8 +121,10 @@ def test_another_stage_s_output_is_replaced_only_with_replace(rig: Lab) -> None:
     ran = rig.call("export mcap rec -o out")
     assert ran.code == 2
     assert "--replace" in ran.err
+    rig.run("export card rec -o out --replace")
     rig.run("export mcap rec -o out --replace")
-    assert not list((rig.folder / "out").glob("**/*.csv"))
+    names = sorted(path.name for path in (rig.folder / "out").rglob("*"))
+    assert names == ["README.md", "manifest.json", "trial-00.mcap", "trial-01.mcap"]
     assert rig.call("export mcap rec -o rec").code == 2
 
 
