@@ -267,7 +267,7 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
             found[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
             found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
-        elif kind in ("Trial", "Values", "Name"):
+        elif kind in ("Trial", "Values", "RecordingName"):
             found[name] = inputs[name]
         elif kind == "Roles":
             found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}

@@ -55,7 +55,7 @@ def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: 
     stage = execution.stage_of(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
-    named = stage.argument("Name")
+    named = stage.argument("RecordingName")
 
     def task(name: str, entry: Entry) -> Task:
         inputs = {recording: of_recording(entry, stage.reads or ()), **fitted, **({named: name} if named else {})}

@@ -18,7 +18,7 @@ from tacpipe.exports import contents, croissant, readme
 from tacpipe.exports.contents import Contents, shown
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.constraints import Names
-from tacpipe.plugins.stage import Name, RecordingOutput, Result, stage
+from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 from tacpipe.printable import plain
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Params:
 
 
 @stage(version=1)
-def part(params: Params, recording: Recording, name: Name) -> Result:
+def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the Parquet files of one recording, with its name in each row."""
     from tacpipe.io.parquet import to_parquet
 

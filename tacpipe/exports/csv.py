@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, Contents, Stream, shown
 from tacpipe.exports.files import Content, Files
-from tacpipe.plugins.stage import Name, RecordingOutput, Result, stage
+from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -47,7 +47,7 @@ class Params:
 
 
 @stage(version=1)
-def part(params: Params, recording: Recording, name: Name) -> Result:
+def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return a file a stream."""
     files, losses = {}, []
     for stream in recording.streams:

@@ -20,7 +20,7 @@ from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, shown
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.constraints import Rate
-from tacpipe.plugins.stage import ALL, Attribute, Name, RecordingOutput, Result, stage
+from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     import h5py
@@ -81,7 +81,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
 
 
 @stage(version=1, reads=ALL)
-def part(params: Params, recording: Recording, name: Name) -> Result:
+def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the file of one recording, or nothing where all are in one."""
     if params.structure == "robomimic":
         from tacpipe.exports import arrays

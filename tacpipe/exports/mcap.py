@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, shown
 from tacpipe.exports.files import Files
-from tacpipe.plugins.stage import ALL, Name, RecordingOutput, Result, stage
+from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -50,7 +50,7 @@ class Params:
 
 
 @stage(version=1, reads=ALL)
-def part(params: Params, recording: Recording, name: Name) -> Result:
+def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the MCAP file of one recording."""
     losses: list[str] = []
     content = _written(params, recording, name, losses)

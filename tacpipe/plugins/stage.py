@@ -12,7 +12,7 @@ by its annotation what the stage reads:
 ``Model``       a trained model: a `Dataset` whose ``files`` hold weights and configuration; ``init`` may be left out
 ``Fitted``      the files that the stage's ``fit`` made of the training recordings
 ``Parts``       what the stage's ``part`` gave for each recording, as a `Dataset`
-``Name``        the name of the one recording; part of its key
+``RecordingName``  the name of the one recording; part of its key
 ``Files``       the files of one recording of a source; the stage's ``discover`` finds them
 ``Values``      what ``discover`` gave for one recording beside its files, as labels; part of its key
 ``Trial``       the number of one recording to simulate, from 0 to ``params.trials``
@@ -43,7 +43,7 @@ Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
 Values = Mapping[str, Any]  # of JSON, by name
 Fitted = Mapping[str, bytes]  # file name, content
-Name = str
+RecordingName = str
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
@@ -51,7 +51,7 @@ P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
 ALL = ("*",)  # as ``reads``: every attribute
 _KINDS = (
-    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "Name"),
+    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "RecordingName"),
     *("Files", "Values", "Trial", "Roles", "Workspace"),
 )
 
