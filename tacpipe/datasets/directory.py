@@ -89,7 +89,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         if before is not None and lasting:
             adoption.adopt(store, directory, before)
         store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
-        sweep(directory, shards=bool(stale))
+        sweep(directory, shards=bool(stale), deep=manifest.exported)
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
                 place(store, objects[path], directory / path, copy=manifest.copied)
@@ -100,12 +100,13 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
             _settle(store, directory, stale)
 
 
-def sweep(directory: Path, *, shards: bool = True) -> None:
+def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:
     """Remove what a process left that was killed while it wrote here: drafts by our names for them, and nothing else.
 
-    Without ``shards`` those of the manifest alone.
+    Without ``shards`` those of the manifest alone; ``deep``: in folders at any depth, as exports have them.
     """
-    for folder in (directory, *(listed(directory) if shards else ())):
+    below = (Path(place) for place, _, _ in walk(directory, links=False)) if deep else listed(directory)
+    for folder in (directory, *(below if shards else ())):
         if folder == directory or (folder.is_dir() and not folder.is_symlink()):
             for path in listed(folder, f".*{_DRAFT}"):
                 if _OURS.fullmatch(path.name):
@@ -162,7 +163,8 @@ def _remove(directory: Path, paths: set[str]) -> None:
     for path in paths:
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
             (directory / path).unlink()
-    for folder in {(directory / path).parent for path in paths} - {directory}:
+    folders = {directory / folder for path in paths for folder in list(Path(path).parents)[:-1]}
+    for folder in sorted(folders, key=lambda one: len(one.parts), reverse=True):  # the deepest first
         with contextlib.suppress(OSError):  # not empty, or gone already
             folder.rmdir()
 

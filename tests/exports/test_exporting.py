@@ -121,8 +121,10 @@ def test_another_stage_s_output_is_replaced_only_with_replace(rig: Lab) -> None:
     ran = rig.call("export mcap rec -o out")
     assert ran.code == 2
     assert "--replace" in ran.err
+    rig.run("export card rec -o out --replace")
     rig.run("export mcap rec -o out --replace")
-    assert not list((rig.folder / "out").glob("**/*.csv"))
+    names = sorted(path.name for path in (rig.folder / "out").rglob("*"))
+    assert names == ["README.md", "manifest.json", "trial-00.mcap", "trial-01.mcap"]
     assert rig.call("export mcap rec -o rec").code == 2
 
 
@@ -142,6 +144,15 @@ def test_a_lost_file_is_brought_back_without_running(rig: Lab) -> None:
     (rig.folder / "out/trial-00/skin.csv").unlink()
     assert counts(rig.run("export csv rec -o out --json").out) == (0, 2)
     assert (rig.folder / "out/trial-00/skin.csv").exists()
+
+
+def test_what_a_killed_run_left_in_folders_of_any_depth_is_swept(rig: Lab) -> None:
+    rig.run("export card rec -o out")
+    draft = rig.folder / "out/data/skin/.trial-00.parquet.0123456789ab.draft"
+    draft.write_bytes(b"half")
+    (draft.parent / "trial-00.parquet").unlink()
+    rig.run("export card rec -o out")
+    assert not draft.exists()
 
 
 def test_the_manifest_leads_back_to_the_recordings(rig: Lab) -> None:

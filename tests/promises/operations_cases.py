@@ -182,7 +182,10 @@ def _of(chain: str, names: dict[int, str]) -> list[Case]:
 def _export(names: Sequence[str], dataset: str, before: int) -> list[Case]:
     """Return cases that export a dataset of the chain, made by its first commands."""
     chain = CHAINS["two forward"][:before]
-    return [Case(f"export.{name}", f"export {name} {dataset} -o data/out", chain) for name in names]
+    return [
+        Case(f"export.{name}", f"export {name} {dataset} -o data/out{' --license mit' * (name == 'card')}", chain)
+        for name in names
+    ]
 
 
 def _ingest(name: str) -> Case:
