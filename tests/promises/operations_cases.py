@@ -188,8 +188,11 @@ def _export(names: Sequence[str], dataset: str, before: int) -> list[Case]:
     ]
 
 
+CONTAINERS = ("hdf5", "lerobot", "mcap", "rosbag", "xdf", "zarr")
+
+
 def _ingest(name: str) -> Case:
-    options = " --layout src/layout.toml" if name == "table" else ""
+    options = {"table": " --layout src/layout.toml", "zarr": " --layout rate.toml"}.get(name, "")
     command = f"ingest {name} src -o data/r{options}"
     return Case(f"ingest.{name}", command, sources=lambda lab: _publish(name, lab / "src"), durable=True)
 
@@ -197,6 +200,9 @@ def _ingest(name: str) -> Case:
 def _publish(name: str, place: Path) -> None:
     """Write recordings in a published format."""
     from tests.formats import grasp_files, slide_files, xela_files
+    from tests.formats.arrays import files as array_files
+    from tests.formats.lerobot import files as lerobot_files
+    from tests.promises import targets
 
     if name == "biotac-slide":
         slide_files.write_biotac(place, arm=False)
@@ -213,6 +219,14 @@ def _publish(name: str, place: Path) -> None:
         )
     elif name == "xela-flat":
         xela_files.write_flat(place / "data_sample_2021-11-24-15-19-34")
+    elif name == "lerobot":
+        lerobot_files.write_v3(place / "three")
+    elif name == "zarr":
+        array_files.replay(place / "a.zarr")
+        (place.parent / "rate.toml").write_text(targets.RATE)
+    elif name in CONTAINERS:
+        place.mkdir()
+        targets.TREES[name](place)
     else:
         xela_files.write_psc(place / "data_sample_2022-02-21-09-58-49")
 
@@ -236,6 +250,7 @@ STAGES = (
     *_export(("card", "csv", "hdf5", "mcap"), "data/r", 1),
     *_export(("lerobot", "zarr"), "data/synced", 2),
     *(_ingest(name) for name in ("biotac-slide", "roboskin", "table", "vision2tactile", "xela-flat", "xela-psc")),
+    *(_ingest(name) for name in CONTAINERS),
 )
 CASES = {case.name: case for case in (*TOYS, *STAGES)}
 assert len(CASES) == len(TOYS) + len(STAGES)

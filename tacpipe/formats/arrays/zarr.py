@@ -127,7 +127,14 @@ class ZarrTree:
         return {key: value for key, value in found[0].items() if key != "shape"} if found is not None else None
 
     def _has(self, name: str) -> bool:
-        return os.path.lexists(self.path / name) if self.names is None else name in self.names
+        if self.names is not None:
+            return name in self.names
+        with regular.failing(self.path):
+            try:
+                os.lstat(self.path / name)
+            except (FileNotFoundError, NotADirectoryError):
+                return False
+        return True
 
     def _below(self, group: str) -> list[str]:
         """Return the names of the folders in a group."""
@@ -233,6 +240,7 @@ def _library() -> Any:
     import zarr.storage
     from numcodecs import blosc
 
+    zarr.config.set({"threading.max_workers": 1})  # commands have a process a core; and the order of reads is one
     before = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method("fork", force=True)
     try:

@@ -25,6 +25,7 @@ from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import Description, Episode, Feature
+from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import ParquetTable
 from tacpipe.plugins.stage import Attribute
@@ -90,7 +91,7 @@ class LeRobotContainer:
     def _native(self, episode: Episode) -> dict[str, Path]:
         """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
         folder, file = self.path / NATIVE / episode.name, self.path / NATIVE / f"{episode.name}.parquet"
-        found = {path.stem: path for path in sorted(folder.glob("*.parquet"))} if folder.is_dir() else {}
+        found = {path.stem: path for path in file_system.listed(folder, "*.parquet")}
         return {"": file} if file.is_file() and not found else found
 
     def _contents(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> Contents:

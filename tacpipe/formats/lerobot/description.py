@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import plain_attributes
+from tacpipe.io import files as file_system
 from tacpipe.io import regular
 from tacpipe.io.parquet import BROKEN
 from tacpipe.plugins.stage import Attribute
@@ -110,7 +111,8 @@ class Description:
             )
 
     def _of_parquet(self) -> Iterator[Episode]:
-        paths = sorted((self.root / "meta/episodes").glob("**/*.parquet"))
+        folders = file_system.walk(self.root / "meta/episodes")
+        paths = sorted(Path(place, name) for place, _, names in folders for name in names if name.endswith(".parquet"))
         if not paths:
             raise TacpipeError(
                 f"{self.root / 'meta/episodes'} holds no Parquet file; a dataset of version 3.0 has one."
