@@ -74,6 +74,18 @@ def listed(folder: Path, pattern: str = "*") -> list[Path]:
     return [folder / name for name in sorted(names) if fnmatchcase(name, pattern)]
 
 
+def present(path: Path | str) -> bool:
+    """Return whether something lies at a path, be it a link to nothing.
+
+    What the system answers otherwise (EIO, EACCES, …) is raised as `OSError`: `os.path.lexists` takes it for an absence.
+    """
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[str], list[str]]]:
     """Yield ``source`` and each folder below it with the folders and files in it, sorted, from the top down.
 

@@ -28,6 +28,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import Array
+from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
 
@@ -130,11 +131,7 @@ class ZarrTree:
         if self.names is not None:
             return name in self.names
         with regular.failing(self.path):
-            try:
-                os.lstat(self.path / name)
-            except (FileNotFoundError, NotADirectoryError):
-                return False
-        return True
+            return file_system.present(self.path / name)
 
     def _below(self, group: str) -> list[str]:
         """Return the names of the folders in a group."""

@@ -7,7 +7,6 @@ nanosecond; else they are the column's own float32 seconds. The metadata of ``t_
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -69,7 +68,8 @@ class LeRobotContainer:
         one = self._named(episode)
         about = self._about
         found = [self.path / one.file, *self._native(one).values()]
-        files = {path.relative_to(self.path).as_posix(): path for path in found if os.path.lexists(path)}
+        with regular.failing(self.path):
+            files = {path.relative_to(self.path).as_posix(): path for path in found if file_system.present(path)}
         stated = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": one.index}
         stated |= {"tasks": list(one.tasks), "videos": dict(one.videos), "attributes": dict(one.attributes)}
         stated |= {"length": one.length}
