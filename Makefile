@@ -60,7 +60,7 @@ result-pages: $(VENV)/.dev ## compute the three result pages of a release from t
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
-test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: some 6 minutes on 2 cores
+test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: some 5 minutes on 2 cores
 	@$(PYTEST) -m "not faults and not long and not rig"
 
 test-long: $(VENV)/.dev ## run the tests that take long: training, kills and crowds, DVC's chains, the docs' commands
