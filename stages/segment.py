@@ -299,7 +299,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     Example: tacpipe segment slides data/touched -o data/slides
     """
     from tacpipe.channels import arm
-    from tacpipe.channels.finger import finger, mended
+    from tacpipe.channels.finger import finger, without_spikes
     from tacpipe.channels.streams import of_quantity
     from tacpipe.datasets.streams import streams_of
     from tacpipe.signals import slides as found
@@ -310,7 +310,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
     if params.trigger == "load":
         return _slide_by_load(params, recording.name, streams, table)
     attributes: dict[str, Attribute]
-    table, spikes = mended(table, params.spike_frames, params.spike_deviations, params.spike_count)
+    table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, params.spike_count)
     pressures = of_quantity(table, "static_pressure")
     if not pressures:
         notes = [_KEPT_WHOLE.format(len(t_ns))] if len(t_ns) > params.frames else []
@@ -346,7 +346,7 @@ def _slide_by_load(params: SlideParams, name: str, streams: Mapping[str, pa.Tabl
     import numpy as np
 
     from tacpipe.channels import arm
-    from tacpipe.channels.finger import mended
+    from tacpipe.channels.finger import without_spikes
     from tacpipe.channels.streams import of_quantity
     from tacpipe.signals import slides as found
     from tacpipe.signals.contact import ENDS, Thresholds, load, noise_thresholds
@@ -376,7 +376,7 @@ def _slide_by_load(params: SlideParams, name: str, streams: Mapping[str, pa.Tabl
         raise TacpipeError(f"Recording {name}: {error}") from error
     kept = slice(first, stop)
     height = params.spike_count if unit == COUNT else limits.on
-    table, spikes = mended(table, params.spike_frames, params.spike_deviations, height)
+    table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, height)
     attributes: dict[str, Attribute] = {
         "load_mean": float(f"{loaded[kept].mean():.4g}"),
         "load_trigger": float(f"{limits.on:.4g}"),

@@ -30,7 +30,7 @@ def finger(name: str, streams: Mapping[str, pa.Table]) -> pa.Table:
     return streams[found[0]]
 
 
-def mended(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, Int64s]:
+def without_spikes(table: pa.Table, rows: int, deviations: float, floor_count: float) -> tuple[pa.Table, Int64s]:
     """Return the stream with spikes of its tactile channels removed, and how many each row had (time,); see `hampel`."""
     import pyarrow as pa
 
