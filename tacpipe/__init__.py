@@ -98,6 +98,7 @@ def run(
     params_file: str | PathLike[str] | None = None,
     block: str | None = None,
     jobs: int = 0,
+    executor: str = "",
     skip_bad: bool = False,
     rerun: bool = False,
     replace: bool = False,
@@ -140,7 +141,7 @@ def run(
         output,
         {key: given for key, given in named.items() if given is not None},
         params,
-        calling.How(fold, role, preset, params_file, block, jobs, skip_bad, rerun, replace, progress),
+        calling.How(fold, role, preset, params_file, block, jobs, executor, skip_bad, rerun, replace, progress),
     )
 
 

@@ -73,6 +73,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         fold=given.get("fold") or 0,
         role=given.get("role"),
         jobs=given["jobs"],
+        executor=given["executor"] or "",
         skip_bad=given["skip_bad"],
         check=given["check"],
         compare=given["compare"],
@@ -190,6 +191,11 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
         ),
         ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
+        (
+            "executor",
+            str | None,
+            typer.Option(None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT."),
+        ),
         ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),
         ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
         (

@@ -32,6 +32,7 @@ class How:
     params_file: str | PathLike[str] | None = None
     block: str | None = None
     jobs: int = 0
+    executor: str = ""
     skip_bad: bool = False
     rerun: bool = False
     replace: bool = False
@@ -69,6 +70,7 @@ def call(
         fold=how.fold,
         role=how.role,
         jobs=how.jobs,
+        executor=how.executor,
         skip_bad=how.skip_bad,
         rerun=how.rerun,
         replace=how.replace,

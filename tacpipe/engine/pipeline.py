@@ -15,6 +15,7 @@ from tacpipe.datasets.manifest import Entry, Manifest, shard_path
 from tacpipe.engine import by_recording, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.execution import Task
+from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
@@ -45,8 +46,9 @@ def run(request: Request) -> Outcome:
     replacing.refuse_inputs(request.output, request.reads)
     store = locate()
     inputs = Inputs(request, store)
-    work = _Run(request, store, inputs, inputs.identity())
-    made = output.settle(store, request, inputs.plan(), work)
+    with Chosen(request.executor, request.jobs) as chosen:
+        work = _Run(request, store, inputs, inputs.identity(), chosen)
+        made = output.settle(store, request, inputs.plan(), work)
     outcome = work.outcome
     outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results()]
     outcome.rows = made.rows
@@ -57,8 +59,10 @@ def run(request: Request) -> Outcome:
 class _Run:
     """What a request asks for, of the store or by running what is missing there."""
 
-    def __init__(self, request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any]) -> None:
-        self.request, self.store, self.inputs, self.identity = request, store, inputs, identity
+    def __init__(
+        self, request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any], chosen: Chosen
+    ) -> None:
+        self.request, self.store, self.inputs, self.identity, self.chosen = request, store, inputs, identity, chosen
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
         self.reads = [found.digest for found in inputs.used]
@@ -147,7 +151,7 @@ class _Run:
 
     @property
     def _by_recording(self) -> ByRecording:
-        return ByRecording(self.store, self.request, self.outcome)
+        return ByRecording(self.store, self.request, self.outcome, self.chosen)
 
     def _chain(self) -> Sequence[Mapping[str, Any]]:
         if "model" in self.inputs.named:
@@ -257,9 +261,15 @@ class _Run:
             rerun=self.request.rerun,
             run=self.store.run,
         )
-        done = execution.compute(task)
+        executor = self.chosen.opened()
+        if executor.elsewhere:
+            (done,) = executor.run(execution.compute, [task], [])
+        else:
+            done = execution.compute(task)
         if done.record is None:
             raise by_recording.error(done.exit_code, done.error)
+        if executor.elsewhere:
+            self.store.announce(records.named(done.record["result"]))
         self.outcome.add_record(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:

@@ -1,4 +1,4 @@
-"""Names of stages, formats, exports, tasks, reports and sensors, found through entry points and loaded when asked for."""
+"""Names of stages, formats, exports, tasks, reports, sensors and executors, found through entry points and loaded when asked for."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from tacpipe.printable import plain
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
 EXPORTS = "tacpipe.exports"
 REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS)
+EXECUTORS = "tacpipe.executors"
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS, EXECUTORS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
@@ -123,6 +124,18 @@ def load_sensor(name: str) -> Any:
     target = sensors().get(name)
     if target is None:
         raise UsageError(f"There is no sensor {plain(name)}; there are {', '.join(sensors())}.")
+    return _import(name, target)
+
+
+def load_executor(name: str) -> Any:
+    """Return the function that connects to the executor of this name (`tacpipe.engine.executors.executor.Executor`).
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = entry_points()[EXECUTORS].get(name)
+    if target is None:
+        names = ", ".join(sorted(entry_points()[EXECUTORS]))
+        raise UsageError(f"There is no executor {plain(name)}; there are {names}.")
     return _import(name, target)
 
 
