@@ -194,7 +194,9 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         (
             "executor",
             str | None,
-            typer.Option(None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT."),
+            typer.Option(
+                None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT."
+            ),
         ),
         ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),
         ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),

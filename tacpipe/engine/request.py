@@ -21,7 +21,12 @@ from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
 
 # what options of a run may be that are no params
-OPTIONS = {"jobs": NonNegativeInt, "executor": str, "fold": NonNegativeInt, "role": Literal["train", "val", "test"] | None}
+OPTIONS = {
+    "jobs": NonNegativeInt,
+    "executor": str,
+    "fold": NonNegativeInt,
+    "role": Literal["train", "val", "test"] | None,
+}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Names of stages, formats, exports, tasks, reports, sensors and executors, found through entry points and loaded when asked for."""
+"""Names of what plug-ins bring (stages, formats, sensors and so on): found through entry points, loaded when asked for."""
 
 from __future__ import annotations
 

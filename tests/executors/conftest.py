@@ -30,7 +30,7 @@ def scheduler() -> Iterator[str]:
             processes=False,
             protocol="tcp",
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
         )
         yield cluster.scheduler_address.replace("tcp://", "dask://")
@@ -66,7 +66,7 @@ class Cluster:
         environment = {**os.environ, "DASK_DISTRIBUTED__COMM__RETRY__COUNT": "0", "OMP_NUM_THREADS": "1"}
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", "distributed.cli.dask_scheduler" if words[0] == "scheduler" else "distributed.cli.dask_worker", *words[1:], "--no-dashboard"],
+                [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"],
                 cwd="/",
                 env=environment,
                 stdin=subprocess.DEVNULL,

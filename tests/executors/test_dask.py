@@ -45,7 +45,9 @@ def test_a_record_names_the_worker(lab: Lab, scheduler: str) -> None:
     lab.run(f"scale data/rec -o data/out --executor {scheduler}")
     made = [record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "scale"]
     assert [one["worker"] for one in made] and all(one["worker"] != "" for one in made)
-    others = [record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "simulate.toy"]
+    others = [
+        record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "simulate.toy"
+    ]
     assert not any("worker" in one for one in others)
 
 
@@ -71,9 +73,7 @@ def test_a_worker_with_other_versions_is_refused_in_one_sentence(
     assert "Traceback" not in ran.err
 
 
-def test_a_worker_that_sees_another_store_is_refused(
-    lab: Lab, scheduler: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_sees_another_store_is_refused(lab: Lab, scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
     monkeypatch.setattr(dask, "_at_work", lambda run: False)
     ran = lab.call(f"scale data/rec -o data/out --executor {scheduler}")

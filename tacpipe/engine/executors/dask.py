@@ -127,7 +127,8 @@ class Dask:
             ) from error
         except CancelledError as error:
             raise TacpipeError(
-                f"The scheduler at {self.client.scheduler.address} is gone. What was finished is kept: run the same command again."
+                f"The scheduler at {self.client.scheduler.address} is gone. What was finished is kept: run the same command "
+                f"again."
             ) from error
         except ModuleNotFoundError as error:
             raise TacpipeError(
@@ -140,19 +141,22 @@ def _started(workers: int) -> Iterator[Dask]:
     """Yield workers of this computer, each a process of one thread, that end with the block or with this process."""
     with extras.named("The executor dask"):
         import cryptography  # noqa: F401  (TLS of one command's own: other users of this computer reach its port)
+        import dask
         from distributed import Client, LocalCluster, Security
 
     _quiet()
     security = Security.temporary()
     with (
+        dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
             protocol="tls",
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             memory_limit=0,
+            scheduler_kwargs={"dashboard": False},
             silence_logs=logging.CRITICAL,
             security=security,
         ) as cluster,
