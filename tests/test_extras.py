@@ -94,6 +94,7 @@ LACK = {  # and for each that does need one, with that extra
     "export mcap data/recordings -o {o}": "ros",
     "export hdf5 data/recordings -o {o}": "hdf5",
     "export zarr data/synced -o {o}": "zarr",
+    "split data/segments --scheme random --seed 7 -o {o} --executor dask": "dask",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
