@@ -27,15 +27,18 @@ class Local:
 
     elsewhere = False
 
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
+    def __init__(self, jobs: int, pool_from: int = _POOL_FROM) -> None:
+        """Take the number of processes, 0 for one a usable core, and how many tasks are worth starting them."""
+        self.jobs, self._pool_from = jobs or usable_cores(), pool_from
 
     def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
         """Yield ``compute(task)`` of every task, in any order.
 
         Raises `TacpipeError` if a worker dies (out of memory, killed); what the others finished is in the store by then.
         """
-        return _run(compute, tasks, self.jobs or usable_cores(), preload)
+        jobs = min(self.jobs, len(tasks))
+        alone = jobs <= 1 or len(tasks) < self._pool_from
+        return map(compute, tasks) if alone else _run(compute, tasks, jobs, preload)
 
 
 @contextlib.contextmanager
@@ -47,10 +50,6 @@ def connected(address: str, jobs: int) -> Iterator[Local]:
 
 
 def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
-    jobs = min(jobs, len(tasks))
-    if jobs <= 1 or len(tasks) < _POOL_FROM:
-        yield from map(compute, tasks)
-        return
     from multiprocessing.connection import wait  # 10 ms that a hit does not pay
 
     left = chunks.of(tasks, jobs)
