@@ -144,9 +144,9 @@ def _started(workers: int) -> Iterator[Dask]:
         import dask
         from distributed import Client, LocalCluster, Security
 
-    _quiet()
     security = Security.temporary()
     with (
+        _quiet(),
         dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=workers,
@@ -170,17 +170,31 @@ def _client(address: str) -> Iterator[Client]:
     with extras.named("The executor dask"):
         from distributed import Client
 
-    _quiet()
+    with _quiet():
+        try:
+            client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="tacpipe")
+        except (OSError, TimeoutError, ValueError, RuntimeError, TypeError) as error:
+            raise TacpipeError(f"No scheduler of Dask answers at {address}: {error}") from error
+        with client:
+            yield client
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Have Dask log nothing in the block: a worker or scheduler that is gone is a sentence of ours."""
+    loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *_dask_loggers())]
+    before = [one.level for one in loggers]
+    for one in loggers:
+        one.setLevel(logging.CRITICAL + 1)
     try:
-        client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="tacpipe")
-    except (OSError, TimeoutError, ValueError, RuntimeError, TypeError) as error:
-        raise TacpipeError(f"No scheduler of Dask answers at {address}: {error}") from error
-    with client:
-        yield client
+        yield
+    finally:
+        for one, level in zip(loggers, before, strict=True):
+            one.setLevel(level)
 
 
-def _quiet() -> None:
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it would log, our sentences state
+def _dask_loggers() -> list[str]:
+    return [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
 
 
 def _is_here(address: str) -> bool:
