@@ -11,7 +11,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Chunks, Loss, Run
 from tacpipe.sensors.icub_skin import IcubSkin
 from tacpipe.sensors.scans import CAN, can_frame
-from tests.sensors import made, told
+from tests.sensors import described, made
 
 PATCH = IcubSkin(board=9, triangles=(0, 1, 5))
 MS = 1_000_000
@@ -173,7 +173,7 @@ def test_the_board_is_told_what_the_published_driver_tells_it() -> None:
     sensor = IcubSkin(board=9)
     device = sensor.device()
 
-    written = told.hold(sensor.opening({}), device)
+    written = described.hold(sensor.opening({}), device)
 
     assert written == [
         can_frame(0x209, bytes.fromhex("4D 00 14 F0")),  # type 0, 20 ms, no load 240
@@ -189,7 +189,7 @@ def test_a_board_of_the_older_configuration_streams_once_it_is_configured() -> N
     sensor = IcubSkin(board=9, old=True)
     device = sensor.device()
 
-    written = told.hold(sensor.opening({}), device)
+    written = described.hold(sensor.opening({}), device)
 
     assert written == [
         can_frame(0x209, bytes.fromhex("4C 01 01 01 00 22 00 00")),

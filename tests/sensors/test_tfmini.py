@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.tfmini import TfMini, command
-from tests.sensors import made, told
+from tests.sensors import described, made
 
 # 59 59, 300 cm, strength 1000, temperature 2288 / 8 - 256 = 30 °C; the sum of 59 59 2C 01 E8 03 F0 08 is 2C2
 PLUS = bytes.fromhex("59 59 2C 01 E8 03 F0 08 C2")
@@ -66,7 +66,7 @@ def test_the_device_answers_the_opening_and_takes_the_rate() -> None:
     sensor = TfMini(rate_hz=500, unit="mm")
     device = sensor.device()
 
-    written = told.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
+    written = described.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
 
     assert written == [command(5, b"\x06"), command(3, b"\xf4\x01"), command(0x11), command(7, b"\x01")]
     assert device.rate_hz == 500 and device.streaming

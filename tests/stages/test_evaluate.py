@@ -29,7 +29,7 @@ def model(codec_files: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return dataset(files=files)
 
 
-def test_a_model_with_a_codec_is_judged_in_counts_beside_the_codecs_own_loss(model: Any, codec_files: Any) -> None:
+def test_a_model_with_a_codec_is_evaluated_in_counts_beside_the_codecs_own_loss(model: Any, codec_files: Any) -> None:
     result = EVALUATE(EVALUATE.params(), model, compressed(motion(20), motion(21), files=codec_files))
     metrics = json.loads(result.files["metrics.json"])
     assert {"model", "persistence", "codec", "codec_persistence", "context_mean", "skill", "counts"} < set(metrics)

@@ -78,7 +78,7 @@ def trained(
     )
 
 
-def judged(model: Mapping[str, bytes], recordings: Any) -> tuple[dict[str, Any], Result]:
-    """``metrics.json`` and the result of judging a model."""
+def evaluated(model: Mapping[str, bytes], recordings: Any) -> tuple[dict[str, Any], Result]:
+    """``metrics.json`` and the result of evaluating a model."""
     result: Result = material.evaluate(model, recordings)
     return json.loads(result.files["metrics.json"]), result

@@ -104,8 +104,8 @@ def trained(folder: Path, training: Any = None, validation: Any = None, **change
     return touch.train(params(**changed), training or recordings(), validation or dataset(), folder)
 
 
-def judged(model: Mapping[str, bytes], given: Any) -> tuple[dict[str, Any], Result]:
-    """``metrics.json`` and the result of judging a model."""
+def evaluated(model: Mapping[str, bytes], given: Any) -> tuple[dict[str, Any], Result]:
+    """``metrics.json`` and the result of evaluating a model."""
     result: Result = touch.evaluate(model, given)
     return json.loads(result.files["metrics.json"]), result
 
