@@ -66,7 +66,7 @@ def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
     import json
 
     from tacpipe.report import page
-    from tests.stages.learning_fakes import FakeDataset
+    from tests.fake_recordings import FakeDataset
 
     (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
     (tmp_path / "own/own.egg-info/entry_points.txt").write_text("[tacpipe.reports]\nweighing = own_report\n")

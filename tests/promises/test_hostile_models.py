@@ -26,10 +26,10 @@ from tacpipe.tasks.material import task as material
 from tacpipe.tasks.touch import task as touch
 from tests import chain
 from tests.conftest import tacpipe as ran
+from tests.fake_recordings import FakeDataset
 from tests.promises.counts import count
 from tests.promises.limits import GIB, bounded, is_sentence, some
 from tests.promises.mutations import mutated
-from tests.stages.learning_fakes import FakeDataset
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade

@@ -202,12 +202,12 @@ def test_a_board_of_the_older_configuration_streams_once_it_is_configured() -> N
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"board": 16}, "from 1 to 14"),
-        ({"triangles": (1, 0)}, "each once, in order"),
-        ({"triangles": ()}, "each once, in order"),
-        ({"triangles": (16,)}, "from 0 to 15"),
-        ({"rate_hz": 60}, "whole milliseconds"),
-        ({"rate_hz": 2}, "up to 255"),
+        ({"board": 16}, r"\b1\b.*\b14\b"),
+        ({"triangles": (1, 0)}, "triangles"),
+        ({"triangles": ()}, "triangles"),
+        ({"triangles": (16,)}, r"\b0\b.*\b15\b"),
+        ({"rate_hz": 60}, r"rate_hz.*\b60\b"),
+        ({"rate_hz": 2}, r"\b255\b"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused(options: dict[str, object], words: str) -> None:

@@ -101,5 +101,5 @@ def test_a_tare_is_answered_and_a_closing_stops() -> None:
 
 
 def test_a_rate_of_no_whole_milliseconds_is_refused() -> None:
-    with pytest.raises(UsageError, match="whole milliseconds"):
+    with pytest.raises(UsageError, match="rate_hz"):
         WeissWts(rate_hz=60)

@@ -10,7 +10,8 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
-from tests.stages.learning_fakes import dataset, motion
+from tests.fake_recordings import dataset
+from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import compressed, trained
 
 EVALUATE = registry.load("evaluate")

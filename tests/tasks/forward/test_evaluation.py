@@ -19,7 +19,8 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import parquet
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
     HORIZON,

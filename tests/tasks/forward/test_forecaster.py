@@ -19,8 +19,8 @@ from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel, load
 from tests.conftest import sample_data
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeRecording, FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
     HORIZON,

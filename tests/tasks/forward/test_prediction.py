@@ -10,7 +10,8 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.tasks.forward import task as forward
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, predicted_windows, trained
 
 TEST = motion(20)

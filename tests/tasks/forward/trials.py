@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +21,8 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
-from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 
 CONTEXT, HORIZON = 5, 4
 LENGTH = CONTEXT + HORIZON
@@ -46,7 +46,7 @@ def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, rep
     assert stage.fit is not None
     asked = stage.params(components=3, representation=representation)
     files = dict(files or stage.fit(asked, dataset(*shards)).files)
-    latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
+    latent = [one.with_table(stage(asked, one, files)) for one in shards]
     return dataset(*latent, files=files)
 
 

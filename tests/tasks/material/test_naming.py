@@ -14,7 +14,7 @@ from tacpipe.report.material.methods import Run
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
 WORDS = {1: "cork", 2: "felt", 3: "foam, soft", 4: "über-rubber"}  # in the order of their numbers, as sorted

@@ -14,8 +14,7 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.material import task as material
 from tests.asked import fitting
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 
 MATERIALS = (1, 2, 3, 4)
 FRAMES = {"biotac": 40, "roboskin": 24}

@@ -20,8 +20,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch.grasps import Grasps
 from tests.asked import fitting
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 
 OBJECTS = {"ball": 0.03, "melon": 0.05}  # metres, half the size
 POINTS = 40
