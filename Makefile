@@ -19,8 +19,10 @@ DATA := $(TACPIPE_SAMPLE_DATA)
 EVERY := 1
 SLOW := 1/1
 TARGETS :=
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto
-FAULTS := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST) --every $(EVERY)
+FAULTS :=
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --dist worksteal
+COUNTED := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST)
+EXHAUSTIVE := $(COUNTED) --every $(EVERY)
 export PYTHONDONTWRITEBYTECODE := # a command that finds its bytecode starts in a third of the time; tests start hundreds
 PROPERTIES := $(wildcard $(addprefix tests/, test_hashing.py test_keys.py test_dataset.py sensors/test_framing.py \
     sensors/test_every_sensor.py signals/test_clocks.py))
@@ -34,6 +36,14 @@ if [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null; then \
 else \
     echo "The Debian packages $(1) are missing: run 'sudo apt-get install -y $(1)', then make again." >&2; exit 1; \
 fi
+endef
+
+# Install what makes system calls fail, and begin the file of counts.
+define exhaustive
+if ! command -v strace > /dev/null; then \
+    ($(call debian,strace)) || echo "Until then the tests that make system calls fail are skipped." >&2; \
+fi; \
+mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
 .PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
@@ -69,21 +79,21 @@ test-long: $(VENV)/.dev ## run the tests that take long: training, kills and cro
 test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
 	@$(PYTEST) -m "rig and not faults"
 
-test-ci: $(VENV)/.dev ## run the tests of all three in one go, which is faster; SLOW=2/3 runs every third of the slow ones, from the second
-	@$(PYTEST) -m "not faults" --slow $(SLOW)
+test-ci: $(VENV)/.dev ## run the tests of all three in one go; SLOW=2/3 runs every third of the slow ones, FAULTS=2/80 adds a part of test-faults
+	@$(if $(FAULTS),$(exhaustive))
+	@$(COUNTED) --slow $(SLOW) $(if $(FAULTS),--faults $(FAULTS),-m "not faults")
+	@$(if $(FAULTS),$(COUNTED) -n 0 --hypothesis-profile=faults --every $(FAULTS) $(PROPERTIES))
+	@$(if $(FAULTS),$(BIN)/python -m tests.promises.counts $(COUNTS))
 
 test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight other processes keep the computer busy
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20
-	@if ! command -v strace > /dev/null; then \
-	    ($(call debian,strace)) || echo "Until then the tests that make system calls fail are skipped." >&2; \
-	fi
-	@mkdir -p $(dir $(COUNTS)) && : > $(COUNTS)
-	@$(FAULTS) tests/promises
-	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)
-	@$(FAULTS) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one
+	@$(exhaustive)
+	@$(EXHAUSTIVE) tests/promises
+	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
+	@$(EXHAUSTIVE) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
 
 test-exits: $(VENV)/.dev ## run 2,000 times `tacpipe show` and other commands that end after reading Parquet, and count exit codes

@@ -138,7 +138,7 @@ def prepare(folder: Path) -> None:
     xela_files.write_flat(folder / "flat" / "trial_1")
     xela_files.write_psc(folder / "psc" / "trial_1")
     slide_files.write_biotac(folder / "biotac")
-    slide_files.write_roboskin(folder / "roboskin", slide_files.felt())
+    slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
     points_m = shapes.seen(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]

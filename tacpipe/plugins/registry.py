@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import importlib
 import importlib.util
@@ -22,7 +23,10 @@ STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.
 EXPORTS = "tacpipe.exports"
 REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
 EXECUTORS = "tacpipe.executors"
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS, EXECUTORS)
+DEMOS = "tacpipe.demos"  # by the name of a task: what `tacpipe demo` runs of it
+COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
+OWN = "tacpipe"  # the name of its own entry point there
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
@@ -70,6 +74,23 @@ def stages() -> dict[str, str]:
     return dict(sorted({**found[STAGES], **formats, **exports}.items()))
 
 
+def commands() -> dict[str, str]:
+    """Return the summary of each command that is a stage or a group of stages, in the order of help.
+
+    A plug-in's entry point in the group ``tacpipe.commands`` is a dict of names in their order, each with the line of a
+    group, or "" where the stage has its own. tacpipe's own come first, names that are in none last, in alphabetical order.
+    """
+    first: dict[str, str] = {}
+    for name in reversed(stages()):
+        first[name.partition(".")[0]] = name
+    lines: dict[str, str] = {}
+    for name, target in sorted(entry_points()[COMMANDS].items(), key=lambda item: (item[0] != OWN, item[0])):
+        with contextlib.suppress(TacpipeError):  # one that cannot be loaded spoils its own order alone
+            lines = {**lines, **_import(name, target)}
+    names = [*(name for name in lines if name in first), *sorted(set(first) - set(lines))]
+    return {name: lines.get(name) or summary(first[name]) for name in names}
+
+
 def whole(name: str) -> str:
     """Return the name of the stage that a fit or a part belongs to, or the name of a stage itself.
 
@@ -93,11 +114,16 @@ def load(name: str) -> AnyStage:
     return found
 
 
+def tasks() -> list[str]:
+    """Return the names of all tasks."""
+    return sorted(entry_points()[TASKS])
+
+
 def load_task(name: str) -> Any:
     """Return the module of the task of this name."""
     target = entry_points()[TASKS].get(str(name))
     if target is None:
-        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
+        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(tasks())}.")
     return _import(name, target)
 
 
@@ -109,6 +135,14 @@ def load_report(task: str) -> Any:
     """
     target = entry_points()[REPORTS].get(task)
     return None if target is None else _import(task, target)
+
+
+def demos() -> dict[str, Any]:
+    """Return of each task that brings one the function that describes its part of `tacpipe demo`, by name.
+
+    Called with the folder to write to, it returns a `tacpipe.tasks.demonstration.Demo`.
+    """
+    return {name: _import(name, target) for name, target in sorted(entry_points()[DEMOS].items())}
 
 
 def sensors() -> dict[str, str]:

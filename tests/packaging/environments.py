@@ -103,7 +103,8 @@ def tried(folder: Path, package: Path, extra: str) -> float:
     venv.create(environment, with_pip=True)
     python, bare_mb = environment / "bin" / "python", size_mb(environment)
     wanted = f"{package}[{extra}]" if extra else str(package)
-    run([str(python), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), wanted], folder)
+    pip = [str(python), "-m", "pip", "install", "-q", "--no-compile"]  # bytecode is no part of what is measured
+    run([*pip, "-c", str(ROOT / "constraints.txt"), wanted], folder)
     installed_mb = size_mb(environment) - bare_mb
     (testing,) = environment.glob("lib/python*/site-packages/tacpipe/testing")
     shutil.rmtree(testing)  # what runs does not need it

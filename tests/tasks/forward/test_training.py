@@ -17,8 +17,9 @@ from tacpipe.models.forecasts import ARCHITECTURES
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import task as forward
 from tacpipe.training import checkpoint
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
-from tests.tasks.forward.trials import HORIZON, compressed, judged, params, trained
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
+from tests.tasks.forward.trials import HORIZON, compressed, evaluated, params, trained
 
 TRAIN, VAL = [motion(seed) for seed in range(3)], [motion(10), motion(11)]
 FILES = {"model.safetensors", "baselines.safetensors", "config.json", "history.jsonl"}
@@ -110,12 +111,12 @@ def test_a_channel_that_never_moves_and_one_recording_without_rows_do_no_harm(tm
     def dead(one: FakeShard) -> FakeShard:
         at = one.content.column_names.index(CHANNELS[4])
         still = pa.array(np.full(one.content.num_rows, 16003.0, np.float32))
-        return dataclasses.replace(one, content=one.content.set_column(at, one.content.schema.field(at), still))
+        return one.with_table(one.content.set_column(at, one.content.schema.field(at), still))
 
     given = dataset(*map(dead, TRAIN))
     files = trained(tmp_path / "dead", given, dataset(dead(VAL[0])), architecture="taxelwise")
     assert config(files)["scaling"]["channel_count"][4] == 1.0
-    metrics, _ = judged(files, dead(motion(20)))
+    metrics, _ = evaluated(files, dead(motion(20)))
     assert np.isfinite(metrics["model"]["mse_standard"]["mean"])
     empty = FakeShard("empty", table(np.zeros((0, len(CHANNELS)))))
     with_empty = trained(tmp_path / "a", dataset(empty, *TRAIN), dataset(empty, *VAL), epochs=1)
@@ -133,7 +134,7 @@ def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
     one = motion(0)
     at = one.content.column_names.index("contact")
     content = one.content.set_column(at, one.content.schema.field(at), pa.array(contact.astype(np.int32)))
-    given = dataset(dataclasses.replace(one, content=content))
+    given = dataset(one.with_table(content))
     windows = {
         chosen: config(trained(tmp_path / chosen, given, given, epochs=1, windows=chosen))["counts"]["train"]["windows"]
         for chosen in ("all", "contact")
@@ -145,7 +146,7 @@ def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
 def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_path: Path) -> None:
     sizes = {"epochs": 15, "patience": 15, "learning_rate": 0.01, "baselines": False}
     files = trained(tmp_path, dataset(*map(strolling, range(3))), dataset(strolling(10)), actions=actions, **sizes)
-    metrics, _ = judged(files, strolling(20), strolling(21))
+    metrics, _ = evaluated(files, strolling(20), strolling(21))
     skill = metrics["skill"]["mse_counts"][f"t{HORIZON}"]["mean"]
     assert skill > 0.9 if actions == "planned" else skill < 0.2
 
@@ -245,15 +246,12 @@ def test_baselines_can_be_left_out(tmp_path: Path) -> None:
     files = trained(tmp_path, baselines=False)
     assert set(files) == FILES - {"baselines.safetensors"}
     assert not {"baselines", "anticipation"} & set(config(files))
-    metrics, _ = judged(files, motion(20))
+    metrics, _ = evaluated(files, motion(20))
     assert {"model", "persistence", "context_mean", "skill", "counts"} == set(metrics)
 
 
 def test_ground_truth_columns_change_nothing(tmp_path: Path) -> None:
-    given = [
-        dataclasses.replace(one, content=one.content.append_column("gt_slip", pa.array(np.arange(80.0))))
-        for one in TRAIN
-    ]
+    given = [one.with_table(one.content.append_column("gt_slip", pa.array(np.arange(80.0)))) for one in TRAIN]
     files = [trained(tmp_path / name, dataset(*part), epochs=1) for name, part in (("a", given), ("b", TRAIN))]
     assert files[0] == files[1]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +21,8 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
-from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 
 CONTEXT, HORIZON = 5, 4
 LENGTH = CONTEXT + HORIZON
@@ -46,7 +46,7 @@ def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, rep
     assert stage.fit is not None
     asked = stage.params(components=3, representation=representation)
     files = dict(files or stage.fit(asked, dataset(*shards)).files)
-    latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
+    latent = [one.with_table(stage(asked, one, files)) for one in shards]
     return dataset(*latent, files=files)
 
 
@@ -56,14 +56,14 @@ def track(content: pa.Table, name: str = "trial", **attributes: Any) -> tracks.T
     return tracks.track(shard, tracks.codec_of(content, {}))
 
 
-def judged(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
-    """``metrics.json`` and the result of judging a model on recordings."""
+def evaluated(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
+    """``metrics.json`` and the result of evaluating a model on recordings."""
     result: Result = forward.evaluate(model, dataset(*shards, files=files))
     return json.loads(result.files["metrics.json"]), result
 
 
-def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, Int64s, Predicted]:
-    """What a model says of all windows of a recording, with the windows' first rows."""
+def predicted_windows(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, Int64s, Predicted]:
+    """What a model predicts for all windows of a recording, with the windows' first rows."""
     found = tracks.track(shard, forecaster.codec)
     starts = found.starts(forecaster.context, forecaster.horizon)
     (some,) = predicted(forecaster, found, starts)
