@@ -62,16 +62,19 @@ _KINDS = (
 class RecordingOutput:
     """What a stage returns for one recording: a table, or one a stream, attributes to add, and notes for the user.
 
+    A stream that memory need not hold is a ``pyarrow.RecordBatchReader``: its batches are stored as they come, to the bytes
+    of the table that they make. What is raised on the way is an error of the recording.
+
     A note is a sentence about a result that is valid but probably not what was wanted. Commands print it as a warning, on
     a cache hit too; it is kept in the record and is part of no key or digest.
     """
 
-    tables: pa.Table | Mapping[str, pa.Table]
+    tables: pa.Table | pa.RecordBatchReader | Mapping[str, pa.Table | pa.RecordBatchReader]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
     @property
-    def streams(self) -> dict[str, pa.Table]:
+    def streams(self) -> dict[str, pa.Table | pa.RecordBatchReader]:
         """The tables by stream name; a recording of one table has the name ``""``."""
         return dict(self.tables) if isinstance(self.tables, Mapping) else {"": self.tables}
 
