@@ -193,15 +193,17 @@ class ParquetTable:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
 
 
-def owned(content: bytes) -> pa.Buffer:
-    """Return the bytes in memory of Arrow's own.
+def owned(*pieces: bytes | memoryview) -> pa.Buffer:
+    """Return bytes, one after another, in memory of Arrow's own.
 
     Arrow's threads may let go of a buffer after the table is read. One of Python's they cannot release while Python ends:
     then the process aborts, its work done.
     """
-    sink = pa.BufferOutputStream()
-    sink.write(content)
-    return sink.getvalue()
+    buffer = pa.allocate_buffer(sum(map(len, pieces)))
+    with pa.FixedSizeBufferWriter(buffer) as sink:
+        for piece in pieces:
+            sink.write(piece)
+    return buffer
 
 
 def _unread(size: int, error: Exception) -> TacpipeError:
