@@ -16,6 +16,7 @@ from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest, shard_path
 from tacpipe.engine import provenance
+from tacpipe.engine.shared import SharedFiles
 from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
 from tacpipe.io import memory
 from tacpipe.io.drafts import Hashed
@@ -282,17 +283,24 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
             found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
         elif kind in ("Trial", "Values", "RecordingName"):
             found[name] = inputs[name]
+        elif kind == "Shared":
+            found[name] = SharedFiles(store) if store.run else None
         elif kind == "Roles":
             found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}
         else:
-            found[name] = store.root / "checkpoints" / digest(task.identity)
-            if found[name].is_symlink():
-                raise StorageError(f"{found[name]} is a symbolic link, and none is followed within a store. Remove it.")
-            found[name].mkdir(parents=True, exist_ok=True)
+            found[name] = _workspace(store, task.identity)
     yield found
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
+
+
+def _workspace(store: Store, identity: Mapping[str, Any]) -> Path:
+    folder = store.root / "checkpoints" / digest(identity)
+    if folder.is_symlink():
+        raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:

@@ -15,6 +15,7 @@ by its annotation what the stage reads:
 ``RecordingName``  the name of the one recording; part of its key, so only stages that need it take it
 ``Files``          the files of one recording of a source; the stage's ``discover`` finds them
 ``Values``         what ``discover`` gave for one recording beside its files, as labels; part of its key
+``Shared``         files that the recordings of a run share, each made once; ``Shared | None``, since there may be no run
 ``Trial``          the number of one recording to simulate, from 0 to ``params.trials``
 ``Roles``          the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
 ``Workspace``      a folder that survives an interruption, for checkpoints
@@ -30,13 +31,14 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, TypeVar
 
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.io.drafts import Draft
     from tacpipe.plugins.requirements import Requirements
 
 ROLES = ("train", "val", "test")
@@ -49,12 +51,21 @@ Fitted = Mapping[str, bytes]  # file name, content
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
+
+
+class Shared(Protocol):
+    """Files that the recordings of a run share; they are removed with its end."""
+
+    def file(self, of: Any, make: Callable[[Draft], None]) -> Path:
+        """Return the file that ``make`` wrote for ``of``, a value of JSON: now, or before in any process of the run."""
+
+
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
 ALL = ("*",)  # as ``reads``: every attribute
 _KINDS = (
     *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "RecordingName"),
-    *("Files", "Values", "Trial", "Roles", "Workspace"),
+    *("Files", "Values", "Shared", "Trial", "Roles", "Workspace"),
 )
 
 

@@ -99,7 +99,15 @@ class Store:
             try:
                 yield
             finally:
+                self._sweep_drafts()
                 self._run = None
+
+    def _sweep_drafts(self) -> None:
+        """Remove what this run left in ``tmp/``."""
+        with contextlib.suppress(TacpipeError, OSError):  # a collection does it later
+            for path in layout.entries(self.root, "tmp"):
+                if path.name.startswith(f"{Path(self.run).stem}."):
+                    path.unlink(missing_ok=True)
 
     @property
     def run(self) -> str:
@@ -152,7 +160,7 @@ class Store:
 
         For content that memory need not hold; else as `put`. Where ``write`` raises, nothing of it is kept.
         """
-        path = self._draft()
+        path = self.draft()
         with drafts.begun(path, self.root, mode=0o444) as draft:
             write(draft)
             draft.sync()
@@ -282,11 +290,14 @@ class Store:
         """
         self._refuse_linked(path)
         with readable_errors(self.root):
-            return write_whole(str(path), content, self._draft(), mode=mode, exclusive=exclusive)
+            return write_whole(str(path), content, self.draft(), mode=mode, exclusive=exclusive)
 
-    def _draft(self) -> str:
-        """Return a new name in ``tmp/``, from which a collection sees whether the run that writes there is over."""
-        return f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
+    def draft(self, name: str = "") -> str:
+        """Return a path in ``tmp/``, of a new name or of this one (32 hex digits), that begins with the run's.
+
+        From that a collection sees whether the run that wrote there is over.
+        """
+        return f"{self._root}/tmp/{Path(self.run).stem}.{name or uuid.uuid4().hex}"
 
     def _refuse_linked(self, path: Path | str) -> None:
         if layout.is_linked(self._root, path):

@@ -17,12 +17,13 @@ from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream
-from tacpipe.formats.table import ahead, binary, columns, stamps
+from tacpipe.formats.table import ahead, binary, columns, parted, stamps
 from tacpipe.formats.table.columns import TIME, CellError, Chosen, Declared
 from tacpipe.formats.table.layout import Stream
 from tacpipe.formats.table.text import TextTable
 from tacpipe.io import parquet
-from tacpipe.plugins.stage import Attribute
+from tacpipe.io.drafts import Draft
+from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals import resampling
 
@@ -77,13 +78,17 @@ def opened(path: Path, stream: Stream) -> Rows:
     return binary.opened(path, kind)
 
 
-def batches(file: Rows, stream: Stream, recording: str | None = None) -> pa.RecordBatchReader:
+def batches(
+    file: Rows, stream: Stream, recording: str | None = None, shared: Shared | None = None
+) -> pa.RecordBatchReader:
     """Return the rows of the stream with ``t_ns`` as they are read; ``recording`` is the one to pick where there are many.
+
+    With ``shared`` the file is then cut into its recordings once, and not read for each.
 
     Raises `TacpipeError`, naming file, row and column, for what is not as the layout says, for stamps that run backwards,
     and for a file without rows; also as batches are taken. Of a wide table one block is in memory.
     """
-    return _batches(file, stream, recording, columns.NOTHING)
+    return _batches(file, stream, recording, columns.NOTHING, shared)
 
 
 def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
@@ -135,7 +140,9 @@ class Recorded:
     notes: Sequence[str] = ()  # what was left out or is missing
 
 
-def recorded(streams: Sequence[Stream], paths: Mapping[str, Path], within: str | None) -> Recorded:
+def recorded(
+    streams: Sequence[Stream], paths: Mapping[str, Path], within: str | None, shared: Shared | None = None
+) -> Recorded:
     """Return the recording whose files are ``paths`` by stream; ``within`` is its name where a file holds many.
 
     Streams of one container are read in one pass. Raises as `table` does, and for a stream that its container lacks,
@@ -151,7 +158,7 @@ def recorded(streams: Sequence[Stream], paths: Mapping[str, Path], within: str |
         if stream.contained:
             together.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
         else:
-            tables[stream.name] = batches(opened(paths[stream.name], stream), stream, within)
+            tables[stream.name] = batches(opened(paths[stream.name], stream), stream, within, shared)
     for (kind, path), several in together.items():
         contents = kinds.opened(kind, path).read([one.source for one in several], within)
         there = {one.source: one for one in contents.streams}
@@ -193,7 +200,9 @@ def _lacking(path: Path, stream: Stream, contents: Contents, look: Contents) -> 
     )
 
 
-def _batches(file: Rows, stream: Stream, recording: str | None, declared: Declared) -> pa.RecordBatchReader:
+def _batches(
+    file: Rows, stream: Stream, recording: str | None, declared: Declared, shared: Shared | None = None
+) -> pa.RecordBatchReader:
     path, names = file.path, file.names()
     apart = [name for name in (stream.time.column, stream.recording) if name]
     if stream.long is not None:
@@ -206,14 +215,15 @@ def _batches(file: Rows, stream: Stream, recording: str | None, declared: Declar
     blocks: Iterable[Block]
     start_ns = _start_ns(stream) if stream.time.origin == "start" or not stream.time.column else 0
     if stream.long is not None:
-        fields, blocks = _long(file, stream, recording)
+        fields, blocks = _long(file, stream, recording, shared)
     else:
         wanted = columns.chosen(stream, [name for name in names if name not in apart], path, declared)
         types = {**_types(file, stream), **{one.name: one.read_as for one in wanted}}
         as_is = bool(declared)  # a container's own NaN and infinity are values
         fields = [one.field for one in wanted]
         blocks = (
-            _converted(stream, block, wanted, place, as_is) for block, place in _blocks(file, stream, types, recording)
+            _converted(stream, block, wanted, place, as_is)
+            for block, place in _blocks(file, stream, types, recording, shared)
         )
     made = pa.schema([_time_field(stream), *fields])
     stamped = _stamps_checked(blocks, file, stream, recording, start_ns)
@@ -279,21 +289,35 @@ def _types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:
 
 
 def _blocks(
-    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None
+    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None, shared: Shared | None
 ) -> Iterator[tuple[pa.Table, Place]]:
     """Yield the blocks of a file, of one recording alone where it holds many, and what names a row of each in errors."""
+    for block, in_file in _picked(file, stream, types, recording, shared):
+
+        def place(row: int, in_file: Indices = in_file) -> str:
+            return f"{file.path}, {file.place(int(in_file[row]))}"
+
+        yield block, place
+
+
+def _picked(
+    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None, shared: Shared | None
+) -> Iterator[tuple[pa.Table, Indices]]:
+    """Yield the blocks of a file, or of a recording in it, and which rows of the file they are."""
+    if stream.recording and shared is not None:
+
+        def cut(draft: Draft) -> None:
+            parted.cut(ahead.of(file.batches(types)), stream.recording, draft)
+
+        yield from parted.rows(shared.file([str(file.path), stream.name], cut), str(recording))
+        return
     begun = 0
     for block in ahead.of(file.batches(types)):
         rows = np.arange(block.num_rows)
         if stream.recording:
             rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
-        in_file = rows + begun  # (row,), counted from the first row of the file
+        yield (block.take(pa.array(rows)) if stream.recording else block), rows + begun
         begun += block.num_rows
-
-        def place(row: int, in_file: Indices = in_file) -> str:
-            return f"{file.path}, {file.place(int(in_file[row]))}"
-
-        yield (block.take(pa.array(rows)) if stream.recording else block), place
 
 
 def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place, as_is: bool) -> Block:
@@ -334,7 +358,9 @@ def _start_ns(stream: Stream) -> int:
     return int(seconds.timestamp()) * 10**9 + at.microsecond * 1000
 
 
-def _long(file: Rows, stream: Stream, recording: str | None) -> tuple[list[pa.Field], list[Block]]:
+def _long(
+    file: Rows, stream: Stream, recording: str | None, shared: Shared | None
+) -> tuple[list[pa.Field], list[Block]]:
     """Return a table in long form (a row a channel and moment) as a column a channel, NaN where none was; with stamps.
 
     All of it is in memory: rows of a moment may be anywhere.
@@ -346,7 +372,7 @@ def _long(file: Rows, stream: Stream, recording: str | None) -> tuple[list[pa.Fi
         )
     types = {**_types(file, stream), stream.long.channel: pa.string(), stream.long.value: pa.float64()}
     times, channels, values = [], [], []
-    for block, place in _blocks(file, stream, types, recording):
+    for block, place in _blocks(file, stream, types, recording, shared):
         times.append(_stamped(block.column(stream.time.column), stream, place))
         channels.append(block.column(stream.long.channel).cast(pa.string()).combine_chunks())
         values.append(block.column(stream.long.value).cast(pa.float64()).to_numpy())
