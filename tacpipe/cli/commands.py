@@ -17,6 +17,7 @@ SUMMARIES = {
     "acquire": "Record every stream of a rig.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
+    "track": "Give models and results to trackers of experiments.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage what keeps the bytes: verify, repair, push, pull.",
@@ -88,6 +89,23 @@ def _show(program: typer.Typer) -> None:
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
 
 
+def _track(program: typer.Typer) -> None:
+    @program.command(
+        "track",
+        help=SUMMARIES["track"]
+        + "\n\nParams, the epochs of the history and the figures of each; a model that was trained with --track is the "
+        "same run again.\n\nExample: tacpipe track models/forward results/forward --to tensorboard",
+    )
+    def track(
+        datasets: Annotated[list[Path], typer.Argument(help="Models and results.")],
+        to: Annotated[list[str], typer.Option("--to", help="Tracker, NAME or NAME:PLACE: tensorboard, mlflow, wandb.")],
+    ) -> None:
+        from tacpipe.cli import track as tracking
+
+        for name in tracking.run(datasets, to):
+            terminal.result(name)
+
+
 def _explain(program: typer.Typer) -> None:
     @program.command("explain", help=SUMMARIES["explain"] + "\n\nExample: tacpipe explain results/forward")
     def explain(dataset: Annotated[Path, typer.Argument(help="A dataset or report.")], as_json: AsJson = False) -> None:
@@ -150,6 +168,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _acquire,
     "label": _label,
     "show": _show,
+    "track": _track,
     "explain": _explain,
     "sensors": _sensors,
     "store": _store,

@@ -7,8 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from tacpipe.cli import headline_table
-from tacpipe.datasets import manifest
+from tacpipe.cli import headline_table, identities
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
@@ -51,7 +50,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
     """Return what a person asks of a result: how the model compares with its baselines, on how much, and of which role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
-    identity = _identity(store, found.digest)
+    identity = identities.of_manifests(store).get(found.digest, {})
     return {
         **_architecture(config),
         "headline": None if headlines is None else [one.to_json() for one in headlines],
@@ -185,16 +184,6 @@ def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
         name: [f"{places.get(one['manifest'], 'in no known location')} [{one['dataset'][:12]}]" for one in several]
         for name, several in inputs.items()
     }
-
-
-def _identity(store: Store, name: str) -> Mapping[str, Any]:
-    """Return what the run that gave a manifest was asked for; empty where no record of it is left."""
-    for _, record in store.records():
-        file = record["result"]["files"].get(manifest.NAME)
-        if file is not None and file["digest"] == name:
-            found: Mapping[str, Any] = record["identity"]
-            return found
-    return {}
 
 
 def _tree(opened: Dataset, name: str) -> dict[str, Any]:

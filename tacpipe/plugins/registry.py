@@ -1,4 +1,7 @@
-"""Names of stages, formats, exports, tasks, reports and sensors, found through entry points and loaded when asked for."""
+"""Names of stages, formats, exports, tasks, reports, sensors and trackers.
+
+They are found through entry points and loaded when asked for.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ from tacpipe.printable import plain
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
 EXPORTS = "tacpipe.exports"
 REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS)
+TRACKERS = "tacpipe.trackers"
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS, TRACKERS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
@@ -123,6 +127,22 @@ def load_sensor(name: str) -> Any:
     target = sensors().get(name)
     if target is None:
         raise UsageError(f"There is no sensor {plain(name)}; there are {', '.join(sensors())}.")
+    return _import(name, target)
+
+
+def trackers() -> dict[str, str]:
+    """Return the target of every tracker by name."""
+    return dict(sorted(entry_points()[TRACKERS].items()))
+
+
+def load_tracker(name: str) -> Any:
+    """Return what makes the tracker of this name, a `tacpipe.trackers.tracker.Tracker`, from the place to write to.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = trackers().get(name)
+    if target is None:
+        raise UsageError(f"There is no tracker {plain(name)}; there are {', '.join(trackers())}.")
     return _import(name, target)
 
 

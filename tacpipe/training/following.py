@@ -86,7 +86,7 @@ def tracked(trackers: Sequence[Follower]) -> Iterator[None]:
 def in_workspace(workspace: Path, *shown: Follower) -> Iterator[None]:
     """Have each training in the block followed by a file in ``workspace``, by ``shown``, and by the command's trackers."""
     file = _HistoryFile(workspace / HISTORY)
-    before = _current.set((file, *shown, *_trackers.get()))
+    before = _current.set((file, *_trackers.get(), *shown))
     try:
         yield
     finally:

@@ -180,13 +180,15 @@ def train(
 
 def _follow(run: _Run, work: Work, schedule: Schedule, workspace: Path, network: Network) -> None:
     """Train all epochs that are left, each reported to the followers."""
+    random = torch.get_rng_state()
     with following.network(network, list(run.history)) as followers:
+        torch.set_rng_state(random)  # whatever a tracker drew
         while not run.over(schedule):
             done = len(run.history)
             with following.resumable(network, done):
                 line = _epoch(run, work, schedule, followers)
                 run.save(workspace)
-            with torch.random.fork_rng(devices=[]):  # whatever a tracker draws
+            with torch.random.fork_rng(devices=[]):
                 followers.line(line, schedule.of_epoch(done + 1))
 
 
