@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from tacpipe.cli import headline_table, identities
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
+from tacpipe.io import tables
 from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
 from tacpipe.store.store import Store
@@ -86,7 +88,8 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
     if value["headline"] is None:
         lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
     else:
-        lines = headline.text([headline.Headline.from_json(one) for one in value["headline"]]).splitlines()
+        found = [headline.Headline.from_json(one) for one in value["headline"]]
+        lines = headline_table.text(found, tables.width_of(sys.stdout)).splitlines()
     parts = {name: flat(one) for name, one in value["by_part"].items()}
     fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
     described = [
