@@ -61,6 +61,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "label data/recordings trial-000 --set object=cup",
     "show data/synced",
     "show models/forward",
+    "compare results/forward",
     "explain report.html",
     "acquire --recover",
     "sensors list",

@@ -17,6 +17,7 @@ SUMMARIES = {
     "acquire": "Record every stream of a rig.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
+    "compare": "Compare results: the best first, columns for what differs.",
     "track": "Give models and results to trackers of experiments.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
@@ -87,6 +88,36 @@ def _show(program: typer.Typer) -> None:
 
         most = None if full or as_json else overview.SHOWN
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
+
+
+def _compare(program: typer.Typer) -> None:
+    @program.command(
+        "compare",
+        help=SUMMARIES["compare"]
+        + "\n\nErrors, and the gain over the best baseline with its interval. Runs that differ in seed or fold alone are "
+        "pooled.\n\nExample: tacpipe compare results/forward results/forward-gru",
+    )
+    def compare(
+        results: Annotated[list[Path], typer.Argument(help="Results of `tacpipe evaluate`.")],
+        each: Annotated[bool, typer.Option("--each", help="A row a result: pool no folds and seeds.")] = False,
+        as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+        as_json: AsJson = False,
+    ) -> None:
+        from tacpipe.cli import compare as comparing
+        from tacpipe.io import tables
+
+        if as_csv and as_json:
+            raise typer.BadParameter("give --csv or --json, not both", param_hint="--csv")
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        found = comparing.run(results, pool=not each)
+        if as_json:
+            terminal.result_json(found.to_json())
+        elif as_csv:
+            terminal.result(found.to_csv())
+        else:
+            for number, table in enumerate(found.tables()):
+                terminal.result("") if number else None
+                tables.show(table, result=True)
 
 
 def _track(program: typer.Typer) -> None:
@@ -168,6 +199,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _acquire,
     "label": _label,
     "show": _show,
+    "compare": _compare,
     "track": _track,
     "explain": _explain,
     "sensors": _sensors,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -62,12 +63,13 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
         "fold": identity.get("fold"),
         "role": (identity.get("role") or "test") if "split" in opened.source.inputs else None,
         "trained_on": _learned(config)["trained_on"],
+        "params": params_of.named(f"train.{config.get('task')}", config.get("params", {})),
         "inputs": _inputs(opened.source.inputs, store),
     }
 
 
 def model_text(value: Mapping[str, Any]) -> list[str]:
-    """Return the lines that `of_model` is shown as."""
+    """Return the lines that `of_model` is shown as: what it is and how well it did, params, then where it comes from."""
     described = [
         ("task", value["task"]),
         ("architecture", value["architecture"]),
@@ -80,7 +82,17 @@ def model_text(value: Mapping[str, Any]) -> list[str]:
         ("behind", ", then ".join(value["chain"]) or None),
         *_from(value["inputs"]),
     ]
-    return _aligned(described)
+    return [_summary(value), "", *_aligned(described)]
+
+
+def _summary(value: Mapping[str, Any]) -> str:
+    """Return architecture, task, epochs and the best of them in a line."""
+    parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
+    if value["epochs"]:
+        parts.append(headline.counted(value["epochs"], "epochs"))
+    if value["validation"]:
+        parts.append(f"validation: {flat(value['validation'])}")
+    return "; ".join(parts)
 
 
 def result_text(value: Mapping[str, Any]) -> list[str]:
@@ -99,6 +111,7 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
         *((f"  {name}", text) for name, text in parts.items()),
         ("role", f"{value['role']}{fold}" if value["role"] else None),
         ("baselines", ", ".join(value["baselines"]) or None),
+        ("params", flat(value["params"]) if value["params"] else None),
         *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
         *_from(value["inputs"]),
     ]
@@ -224,7 +237,37 @@ def _parameters(opened: Dataset) -> int | None:
 
 
 def _aligned(described: list[tuple[str, Any]]) -> list[str]:
-    """Return names and values in two columns; what is None is left out."""
+    """Return names and values in two columns, long values on several lines; what is None is left out."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
-    width = max((len(name) for name, _ in shown), default=0)
-    return [f"{name:<{width}}  {value}" for name, value in shown]
+    width = max((len(name) for name, _ in shown), default=0) + 2
+    room = max(tables.width_of(sys.stdout) - width, 20)
+    return [
+        f"{'' if at else name:<{width}}{line}" for name, value in shown for at, line in enumerate(_wrapped(value, room))
+    ]
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Return text as lines that end behind a comma.
+
+    >>> _wrapped("epochs 2, learning rate 0.002, seed 0", 20)
+    ['epochs 2,', 'learning rate 0.002,', 'seed 0']
+    """
+    kept = text.replace(" ", "\0").replace(",\0", ", ")
+    lines = textwrap.wrap(kept, width, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\0", " ") for line in lines]
+
+
+def files_text(files: Mapping[str, int]) -> list[str]:
+    """Return names and sizes of files.
+
+    >>> files_text({"config.json": 15696, "history.jsonl": 188})
+    ['files  config.json 15.7 kB, history.jsonl 188 bytes']
+    """
+    return _aligned([("files", ", ".join(f"{name} {_size(size)}" for name, size in files.items()))])
+
+
+def _size(count: int) -> str:
+    for factor, unit in ((1e6, "MB"), (1e3, "kB")):
+        if count >= factor:
+            return f"{count / factor:.1f} {unit}"
+    return f"{count} bytes"
