@@ -79,6 +79,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         compare=given["compare"],
         rerun=given["rerun"],
         replace=given["replace"],
+        track=tuple(given.get("track") or ()),
         **paths,
     )
     shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
@@ -174,6 +175,9 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     if "init" in stage.arguments:
         text = "A model to begin with."
         found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+    if stage.tracked:
+        text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
+        found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))
     if "Roles" in kinds:
         text = "An older split whose roles to keep."
         found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))

@@ -37,6 +37,7 @@ class How:
     rerun: bool = False
     replace: bool = False
     progress: bool = False
+    track: Sequence[str] = ()
 
 
 def call(
@@ -74,6 +75,7 @@ def call(
         skip_bad=how.skip_bad,
         rerun=how.rerun,
         replace=how.replace,
+        track=tuple(how.track),
         **paths,
     )
     with progress.shown(how.progress):
@@ -96,7 +98,8 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         "extend": "Roles" in kinds,
     }
     given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
-    reads |= {"fold": reads["split"], "role": stage.reads_model}
+    given["track"] = bool(how.track)
+    reads |= {"fold": reads["split"], "role": stage.reads_model, "track": stage.tracked}
     for key in given:
         if given[key] and not reads[key]:
             raise UsageError(f"The stage {name} does not read {key}; leave it out.")

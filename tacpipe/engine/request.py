@@ -51,6 +51,7 @@ class Request:
     check: bool = False
     compare: bool = False
     rerun: bool = False  # compute what is stored too, and store what comes out
+    track: Sequence[str] = ()  # trackers that follow the training, as ``NAME`` or ``NAME:PLACE``
     replace: bool = False  # the output may hold another stage's dataset, or recordings and labels that will go
 
     @property

@@ -26,7 +26,8 @@ EXECUTORS = "tacpipe.executors"
 DEMOS = "tacpipe.demos"  # by the name of a task: what `tacpipe demo` runs of it
 COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
 OWN = "tacpipe"  # the name of its own entry point there
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS)
+TRACKERS = "tacpipe.trackers"
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
@@ -170,6 +171,22 @@ def load_executor(name: str) -> Any:
     if target is None:
         names = ", ".join(sorted(entry_points()[EXECUTORS]))
         raise UsageError(f"There is no executor {plain(name)}; there are {names}.")
+    return _import(name, target)
+
+
+def trackers() -> dict[str, str]:
+    """Return the target of every tracker by name."""
+    return dict(sorted(entry_points()[TRACKERS].items()))
+
+
+def load_tracker(name: str) -> Any:
+    """Return what makes the tracker of this name, a `tacpipe.trackers.tracker.Tracker`, from the place to write to.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = trackers().get(name)
+    if target is None:
+        raise UsageError(f"There is no tracker {plain(name)}; there are {', '.join(trackers())}.")
     return _import(name, target)
 
 

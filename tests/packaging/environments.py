@@ -49,7 +49,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "frames": (),
     "hdf5": HDF5,
     "lsl": (),
+    "mlflow": (),
     "ros": ROS,
+    "tensorboard": (),
+    "track": (),
+    "wandb": (),
     "zarr": ZARR,
     "all": (*LEARN, *CLOUDS, *DEVICES, *HDF5, *ROS, *ZARR),
 }
