@@ -144,9 +144,7 @@ def run(
         output,
         {key: given for key, given in named.items() if given is not None},
         params,
-        calling.How(
-            fold, role, preset, params_file, block, jobs, executor, skip_bad, rerun, replace, progress, track
-        ),
+        calling.How(fold, role, preset, params_file, block, jobs, executor, skip_bad, rerun, replace, progress, track),
     )
 
 
