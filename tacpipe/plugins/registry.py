@@ -218,8 +218,13 @@ def _package(target: str) -> str | None:
     """Return the name of the installed package whose entry point ``target`` is, if it is known."""
     from importlib.metadata import entry_points as every
 
-    found = (point for group in GROUPS for point in every(group=group))
-    return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
+    found = (point.dist for group in GROUPS for point in every(group=group) if point.value == target)
+    try:
+        return next((one.name for one in found if one is not None), None)
+    except (
+        FileNotFoundError
+    ):  # `importlib_metadata`, which takes over where it was imported, wants metadata to be there
+        return None
 
 
 def summary(name: str) -> str:

@@ -1,15 +1,13 @@
-"""A scheduler of Dask with two workers, in this process for quick tests and in processes of their own for others."""
+"""A scheduler and workers of Dask, in processes of their own: as threads of this one they would disturb other tests."""
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,30 +16,11 @@ import pytest
 GIVE_UP_S = 300.0  # only what hangs takes so long
 
 
-@pytest.fixture(scope="session")
-def scheduler() -> Iterator[str]:
-    """The executor of two workers that are threads of this process."""
-    distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        cluster = distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            processes=False,
-            protocol="tcp",
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
-        yield cluster.scheduler_address.replace("tcp://", "dask://")
-        cluster.close()
-
-
 class Cluster:
     """A scheduler and workers as a lab starts them, in processes that a test may kill."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, **environment: str) -> None:
+        self.folder, self.environment = folder, environment
         self.scheduler = self._start("scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0")
         self.address = self._found("scheduler", r"Scheduler at:\s+tcp://(\S+)")
         self.workers: dict[str, subprocess.Popen[bytes]] = {}
@@ -63,7 +42,7 @@ class Cluster:
             process.wait()
 
     def _start(self, name: str, *words: str) -> subprocess.Popen[bytes]:
-        environment = {**os.environ, "DASK_DISTRIBUTED__COMM__RETRY__COUNT": "0", "OMP_NUM_THREADS": "1"}
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", **self.environment}
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"],
@@ -83,6 +62,17 @@ class Cluster:
                 return found[1]
             time.sleep(0.05)
         raise AssertionError((self.folder / f"{name}.log").read_text())
+
+
+@pytest.fixture(scope="session")
+def scheduler(tmp_path_factory: pytest.TempPathFactory, plugin: Path) -> Iterator[str]:
+    """The executor of two workers that find the plug-in of ``lab``."""
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    found = Cluster(tmp_path_factory.mktemp("scheduler"), PYTHONPATH=str(plugin))
+    found.work("first")
+    found.work("second")
+    yield found.executor
+    found.close()
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::Depr
 TRIALS = 12  # more than this process would compute by itself
 
 
-@pytest.fixture(params=["local", "dask"])
+@pytest.fixture(params=["local", pytest.param("dask", marks=pytest.mark.long)])
 def executor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """An executor as `--executor` takes it."""
     found: str = "local" if request.param == "local" else request.getfixturevalue("scheduler")

@@ -17,7 +17,7 @@ def split_lab(lab: Lab) -> Lab:
     return lab
 
 
-@pytest.mark.parametrize("executor", ["local", "dask"])
+@pytest.mark.parametrize("executor", ["local", pytest.param("dask", marks=pytest.mark.long)])
 def test_several_folds_give_what_each_alone_gives(
     split_lab: Lab, executor: str, request: pytest.FixtureRequest
 ) -> None:
