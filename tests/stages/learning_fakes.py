@@ -25,6 +25,9 @@ class FakeShard:
     def digest(self) -> str:
         return digest([self.name, self.content.num_rows])
 
+    def columns(self, stream: str = "") -> pa.Table:
+        return self.table(stream)
+
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
         return self.content if columns is None else self.content.select(list(columns))
 
