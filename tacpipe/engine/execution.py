@@ -179,7 +179,13 @@ class _Reader:
         try:
             return self._store.read(name, size)
         except MissingError as error:
-            content = _adopt(self._store, name, path, self._beside, size)
+            try:
+                content = _adopt(self._store, name, path, self._beside, size)
+            except StorageError as unread:  # a copy may be there: the stage that made it is the other way to have it
+                try:
+                    return _remake(self._store, name, path, str(error), size)
+                except DamagedError:
+                    raise unread from error
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
     def __reduce__(self) -> tuple[Any, ...]:
