@@ -17,6 +17,7 @@ SUMMARIES = {
     "acquire": "Record every stream of a rig.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
+    "view": "Show recordings on one time axis, in Rerun's viewer.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage what keeps the bytes: verify, repair, push, pull.",
@@ -135,6 +136,12 @@ def _candidates(program: typer.Typer) -> None:
     candidates.add(program, SUMMARIES["candidates"])
 
 
+def _view(program: typer.Typer) -> None:
+    from tacpipe.cli import view
+
+    view.add(program, SUMMARIES["view"])
+
+
 def _acquire(program: typer.Typer) -> None:
     from tacpipe.cli import acquire
 
@@ -150,6 +157,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _acquire,
     "label": _label,
     "show": _show,
+    "view": _view,
     "explain": _explain,
     "sensors": _sensors,
     "store": _store,
