@@ -77,14 +77,28 @@ def _label(program: typer.Typer) -> None:
 
 
 def _show(program: typer.Typer) -> None:
-    @program.command("show", help=SUMMARIES["show"] + "\n\nExample: tacpipe show data/recordings")
+    @program.command(
+        "show",
+        help=SUMMARIES["show"]
+        + "\n\nExample: tacpipe show data/recordings"
+        + "\n\nExample: tacpipe show data/recordings trial-003 --plot trial-003.png",
+    )
     def show(
         dataset: Annotated[Path, typer.Argument(help="A dataset.")],
+        recording: Annotated[str | None, typer.Argument(help="Name of the recording that --plot draws.")] = None,
+        plot: Annotated[
+            Path | None, typer.Option("--plot", help="Draw one recording over time: .png, .svg or .pdf.")
+        ] = None,
         as_json: AsJson = False,
         full: Annotated[bool, typer.Option("--full", help="All recordings, not the first 20, and all labels.")] = False,
     ) -> None:
         from tacpipe.cli import show as overview
 
+        if plot is not None or recording is not None:
+            from tacpipe.cli import plot as pictures
+
+            terminal.result(pictures.write(dataset, recording, plot))
+            return
         most = None if full or as_json else overview.SHOWN
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
 

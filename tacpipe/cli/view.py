@@ -47,6 +47,9 @@ def view(
         Path | None, typer.Option("--predictions", help="What `tacpipe predict` or `tacpipe evaluate` wrote of them.")
     ] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, help="Maximum number of recordings, by name.")] = LIMIT,
+    all_rows: Annotated[
+        bool, typer.Option("--all-rows", help="All rows of streams over 30,000 rows, not their envelope; slower.")
+    ] = False,
     save: Annotated[
         Path | None, typer.Option("--save", help="Write a file (.rrd) for the viewer instead of opening it.")
     ] = None,
@@ -64,7 +67,7 @@ def view(
         from tacpipe.viewer import session
 
         drawn = _drawn(shown, _predictions(predictions))
-        files = session.write(drawn, Path(folder), str(dataset), several=len(shown) > 1)
+        files = session.write(drawn, Path(folder), str(dataset), several=len(shown) > 1, all_rows=all_rows)
         if save is not None:
             session.merge(files, save)
             terminal.result(save)

@@ -11,6 +11,7 @@ from tacpipe.arrays import AnyArray, Bytes, Floats
 
 # distinguished by eyes that do not distinguish red from green (Okabe and Ito), bright enough for dark ground
 DISTINCT = ("#56b4e9", "#e69f00", "#35b779", "#f0e442", "#cc79a7", "#d55e00", "#8c9eff", "#9aa5b1")
+PRINTED = ("#0969da", "#d1480c", "#1a7f37", "#8250df", "#bf8700", "#0e7490", "#bf3989", "#57606a")  # on light ground
 AXES = ("#e8604c", "#5fbf60", "#5b8ff9", "#c9a227")  # x, y, z, w: as tools for robots have them
 FAULT = "#e5484d"  # of gaps and events
 TRUTH = "#9aa5b1"  # of what a simulation knows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from tacpipe.channels.streams import TRUTH
 from tacpipe.printable import plain
 from tacpipe.viewer.contents import Contents
 
@@ -12,10 +11,10 @@ MOST = 40  # labels
 def text(contents: Contents) -> str:
     """Return the labels, streams and events of a recording as Markdown."""
     lines = [f"# {plain(contents.name)}", "", f"{contents.duration_s:.3g} s", ""]
-    labels = {name: value for name, value in contents.attributes.items() if not name.startswith(TRUTH)}
+    labels = contents.labels
     if labels:
         lines += ["| label | value |", "| --- | --- |"]
-        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in sorted(labels.items())[:MOST]]
+        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(labels.items())[:MOST]]
         lines += [f"| … | {len(labels) - MOST} more |"] if len(labels) > MOST else []
     lines += ["", "| stream | rows | Hz |", "| --- | --- | --- |"]
     lines += [

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Attribute
 
 EVENTS = "events"
+# quantities, in the order in which they are looked for
+FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,21 @@ class Contents:
     def empty(self) -> bool:
         """Whether there is nothing to draw."""
         return not (self.curves or self.taxels or self.paths or self.clouds or self.frames)
+
+    @property
+    def labels(self) -> dict[str, Attribute]:
+        """The attributes by name, without those that a simulation adds."""
+        return {name: self.attributes[name] for name in sorted(self.attributes) if not name.startswith(TRUTH)}
+
+    @property
+    def by_interest(self) -> list[str]:
+        """The streams with curves, those first whose quantities a reader looks for first."""
+
+        def rank(name: str) -> int:
+            here = [one.quantity for one in self.curves if one.stream == name]
+            return min((FIRST.index(one) for one in here if one in FIRST), default=len(FIRST))
+
+        return sorted(dict.fromkeys(one.stream for one in self.curves), key=rank)
 
     @property
     def duration_s(self) -> float:

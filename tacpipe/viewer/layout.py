@@ -17,8 +17,6 @@ from tacpipe.viewer.contents import Contents
 LANE, LEAST, MOST = 0.35, 1.1, 2.2  # height of the spans next to that of the touch, 3: a lane, and its limits
 MAPS_A_ROW = 3
 SHORT_S, LOOP_S = 20.0, 10.0  # a recording that plays as a whole; what plays of a longer one
-# quantities, in the order in which they are looked for
-FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
 
 
 def signature(contents: Contents) -> tuple[Any, ...]:
@@ -118,7 +116,7 @@ def _tabs(contents: Contents) -> list[Any]:
     import rerun.blueprint as rrb
 
     found = []
-    for name in _by_interest(contents):
+    for name in contents.by_interest:
         views = [
             _plot(_origin(stream.SERIES, name, one.title), one.title) for one in contents.curves if one.stream == name
         ]
@@ -134,16 +132,6 @@ def _tabs(contents: Contents) -> list[Any]:
     if contents.events:
         found.append(rrb.TextLogView(origin=stream.EVENTS, name="events"))
     return found
-
-
-def _by_interest(contents: Contents) -> list[str]:
-    """Return the streams with curves, those first whose quantities a reader looks for first."""
-
-    def rank(name: str) -> int:
-        here = [one.quantity for one in contents.curves if one.stream == name]
-        return min((FIRST.index(one) for one in here if one in FIRST), default=len(FIRST))
-
-    return sorted(dict.fromkeys(one.stream for one in contents.curves), key=rank)
 
 
 def _space(contents: Contents) -> Any:

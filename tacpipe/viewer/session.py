@@ -16,8 +16,13 @@ NAME = "tacpipe"
 ENDING = ".rrd"
 
 
-def write(recordings: Iterable[Contents], folder: Path, dataset: str, *, several: bool = True) -> list[Path]:
-    """Write a file of Rerun's for each recording and return the files; the viewer lists them by name below ``dataset``."""
+def write(
+    recordings: Iterable[Contents], folder: Path, dataset: str, *, several: bool = True, all_rows: bool = False
+) -> list[Path]:
+    """Write a file of Rerun's for each recording and return the files; the viewer lists them by name below ``dataset``.
+
+    Lines of more than 30,000 rows are written as their envelope, unless ``all_rows``; `several` recordings get their list.
+    """
     import rerun as rr
 
     from tacpipe.viewer import layout, stream
@@ -32,7 +37,7 @@ def write(recordings: Iterable[Contents], folder: Path, dataset: str, *, several
         recording.save(written[-1])
         recording.send_recording_name(contents.name)
         recording.send_blueprint(layout.blueprint(contents, several=several))
-        stream.Stream(recording, contents.ends_ns[0]).send(contents)
+        stream.Stream(recording, contents.ends_ns[0], all_rows=all_rows).send(contents)
         recording.disconnect()  # writes what is left
     return written
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Floats, Indices, Times
+from tacpipe.signals.envelope import envelope
 from tacpipe.traces import carpet, palette, taxels
 from tacpipe.traces.curves import Curves
 from tacpipe.traces.forecasts import Forecast
@@ -29,6 +30,9 @@ MAPS, SPANS, SPACE, CAMERAS, CARPET, ABOUT, EVENTS = "taxels", "spans", "space",
 AXES = "xyz"
 COMPARED = ("predicted", "residual")
 FRAMES_HZ = 60.0  # of maps and paths, at most: what a display shows
+MOST_ROWS = (
+    30_000  # of a plot's lines; of longer ones the envelope: 13 million points a frame are too many for a viewer
+)
 POINTS = 4000  # of a path drawn as a line
 BINS, HEIGHT = 1200, 330  # of the carpet, pixels
 EVENT_WIDTH = 1 / 200  # of the recording, for which an event is drawn
@@ -38,8 +42,8 @@ RAMP = 24  # steps of a colour scale
 class Stream:
     """What writes one recording's contents to a stream of Rerun's; times count from ``start_ns``."""
 
-    def __init__(self, recording: rr.RecordingStream, start_ns: int) -> None:
-        self._recording, self._start_ns = recording, start_ns
+    def __init__(self, recording: rr.RecordingStream, start_ns: int, *, all_rows: bool = False) -> None:
+        self._recording, self._start_ns, self._all_rows = recording, start_ns, all_rows
 
     def send(self, contents: Contents) -> None:
         """Write everything that is drawn of a recording."""
@@ -77,6 +81,8 @@ class Stream:
         """Write values (time, channel) as the lines of one plot, each with a name and a colour."""
         rr = _rerun()
         names, colours = [name for name, _ in named], [palette.rgb(colour) for _, colour in named]
+        if not self._all_rows:
+            t_ns, values = envelope(t_ns, values, MOST_ROWS)
         self._static(parts, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(named)))
         self._columns(parts, t_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(values)))
 
