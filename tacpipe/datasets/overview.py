@@ -57,8 +57,9 @@ def recording_html(recording: Recording) -> str:
     """Return a recording for a notebook: its labels and a small picture of its streams; every text is escaped."""
     from tacpipe.traces import curves, sparkline, taxels
 
-    labels = [f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)]
-    title = f"<b>{escape(printable.shown(recording.name))}</b> {escape(printable.lines([listed(labels, _LABELS)])) if labels else ''}"
+    known = [f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)]
+    labels = escape(printable.lines([listed(known, _LABELS)])) if known else ""
+    title = f"<b>{escape(printable.shown(recording.name))}</b> {labels}"
     try:
         tables = (
             {} if recording.streams == ("",) and "t_ns" not in recording.table().column_names else streams_of(recording)

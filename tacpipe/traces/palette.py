@@ -16,6 +16,7 @@ AXES = ("#e8604c", "#5fbf60", "#5b8ff9", "#c9a227")  # x, y, z, w: as tools for 
 FAULT = "#e5484d"  # of gaps and events
 TRUTH = "#9aa5b1"  # of what a simulation knows
 MEASURED = "#e8eaed"
+SHADES = 257  # of a scale, an odd number: 0 has one of its own
 _RISING = ("#2b3040", "#4b2a7b", "#8f2d80", "#d3436e", "#f8765c", "#febb81", "#fcfdbf")  # dark to bright
 _BOTH = ("#7cc4ff", "#2f7fd0", "#2b3040", "#e07b39", "#ffd08a")  # below, at and above 0
 
@@ -39,12 +40,13 @@ def coloured(values: AnyArray, low: float, high: float) -> Bytes:
     """
     anchors: Floats = np.array([rgb(one) for one in (_BOTH if low < 0 < high else _RISING)], dtype=np.float64)
     table = np.stack(
-        [np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, len(anchors)), channel) for channel in anchors.T], axis=1
+        [np.interp(np.linspace(0, 1, SHADES), np.linspace(0, 1, len(anchors)), channel) for channel in anchors.T],
+        axis=1,
     )
     width = high - low if high > low else 1.0
     finite = np.isfinite(values)
     place = np.clip((np.where(finite, values, low) - low) / width, 0, 1)
-    found = np.round(table).astype(np.uint8)[np.round(255 * place).astype(np.intp)]
+    found = np.round(table).astype(np.uint8)[np.round((SHADES - 1) * place).astype(np.intp)]
     found[~finite] = 0
     return np.asarray(found)
 
