@@ -19,6 +19,7 @@ SUMMARIES = {
     "show": "Show what is in a dataset, split, model or result.",
     "compare": "Compare results: the best first, columns for what differs.",
     "track": "Give models and results to trackers of experiments.",
+    "view": "Show recordings on one time axis, in Rerun's viewer.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage what keeps the bytes: verify, repair, push, pull.",
@@ -78,14 +79,28 @@ def _label(program: typer.Typer) -> None:
 
 
 def _show(program: typer.Typer) -> None:
-    @program.command("show", help=SUMMARIES["show"] + "\n\nExample: tacpipe show data/recordings")
+    @program.command(
+        "show",
+        help=SUMMARIES["show"]
+        + "\n\nExample: tacpipe show data/recordings"
+        + "\n\nExample: tacpipe show data/recordings trial-003 --plot trial-003.png",
+    )
     def show(
         dataset: Annotated[Path, typer.Argument(help="A dataset.")],
+        recording: Annotated[str | None, typer.Argument(help="Name of the recording that --plot draws.")] = None,
+        plot: Annotated[
+            Path | None, typer.Option("--plot", help="Draw one recording over time: .png, .svg or .pdf.")
+        ] = None,
         as_json: AsJson = False,
         full: Annotated[bool, typer.Option("--full", help="All recordings, not the first 20, and all labels.")] = False,
     ) -> None:
         from tacpipe.cli import show as overview
 
+        if plot is not None or recording is not None:
+            from tacpipe.cli import plot as pictures
+
+            terminal.result(pictures.write(dataset, recording, plot))
+            return
         most = None if full or as_json else overview.SHOWN
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
 
@@ -184,6 +199,12 @@ def _candidates(program: typer.Typer) -> None:
     candidates.add(program, SUMMARIES["candidates"])
 
 
+def _view(program: typer.Typer) -> None:
+    from tacpipe.cli import view
+
+    view.add(program, SUMMARIES["view"])
+
+
 def _acquire(program: typer.Typer) -> None:
     from tacpipe.cli import acquire
 
@@ -201,6 +222,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "show": _show,
     "compare": _compare,
     "track": _track,
+    "view": _view,
     "explain": _explain,
     "sensors": _sensors,
     "store": _store,
