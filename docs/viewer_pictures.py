@@ -41,7 +41,9 @@ PICTURES = {  # the recordings of each, and the time at the cursor
 
 def run(command: str, folder: Path) -> None:
     """Run a command of tacpipe in a folder."""
-    subprocess.run([sys.executable, "-m", "tacpipe", *command.split()], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "tacpipe", *command.split()], cwd=folder, check=True, stdout=subprocess.DEVNULL
+    )
 
 
 @contextlib.contextmanager
