@@ -8,6 +8,9 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
+INSTALL := $(PIP) install --no-compile -c constraints.txt -e
+# pip compiles on one core, and packages' own tests too; a file that does not compile is one that nothing here imports
+COMPILE := $(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
 MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 BROWSER := chromium fonts-dejavu-core
@@ -174,12 +177,14 @@ $(VENV)/.python:
 
 $(VENV)/.learn: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing tacpipe[learn] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[learn]'
+	@$(INSTALL) '.[learn]'
+	@$(COMPILE)
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing tacpipe[all,dev] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[all,dev]'
+	@$(INSTALL) '.[all,dev]'
+	@$(COMPILE)
 	@if ! $(BIN)/python -c 'import open3d' 2> /dev/null; then \
 	    $(call debian,$(OPEN3D_LIBRARIES)); \
 	    $(BIN)/python -c 'import open3d'; \
@@ -194,10 +199,10 @@ $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 
 $(VENV)/.docs: $(VENV)/.dev
 	@echo "Installing tacpipe[docs] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[docs]'
+	@$(INSTALL) '.[docs]'
 	@touch $@
 
 $(VENV)/.fuzz: $(VENV)/.dev
 	@echo "Installing tacpipe[fuzz] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[fuzz]'
+	@$(INSTALL) '.[fuzz]'
 	@touch $@

@@ -14,13 +14,11 @@ from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import to_parquet
 
 
-@dataclass
-class FakeRecording:
-    """What a stage sees of one recording: tables by stream name."""
+class _Fake:
+    """What a stage sees of one recording."""
 
     tables: Mapping[str, pa.Table]
-    name: str = "trial"
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+    name: str
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -37,19 +35,26 @@ class FakeRecording:
         return digest([self.name, *(table.num_rows for table in self.tables.values())])
 
 
-class FakeShard(FakeRecording):
+@dataclass
+class FakeRecording(_Fake):
+    """A recording of several streams: tables by name."""
+
+    tables: Mapping[str, pa.Table]
+    name: str = "trial"
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class FakeShard(_Fake):
     """A recording of one table, as `synchronize` and what follows it make them."""
 
-    def __init__(self, name: str, content: pa.Table, attributes: Mapping[str, Any] | None = None) -> None:
-        super().__init__({"": content}, name, attributes or {})
+    name: str
+    content: pa.Table
+    attributes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def content(self) -> pa.Table:
-        return self.tables[""]
-
-    def with_table(self, content: pa.Table) -> FakeShard:
-        """Return the same recording with another table."""
-        return FakeShard(self.name, content, self.attributes)
+    def tables(self) -> Mapping[str, pa.Table]:  # type: ignore[override]
+        return {"": self.content}
 
 
 @dataclass
@@ -61,7 +66,7 @@ class FakeDataset:
     manifest: dict[str, Any] = field(default_factory=dict)
 
 
-def dataset(*recordings: FakeRecording, files: Mapping[str, bytes] | None = None) -> Any:
+def dataset(*recordings: FakeRecording | FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
     """Return a dataset of these recordings."""
     return FakeDataset({recording.name: recording for recording in recordings}, files or {})
 

@@ -111,7 +111,7 @@ def test_a_channel_that_never_moves_and_one_recording_without_rows_do_no_harm(tm
     def dead(one: FakeShard) -> FakeShard:
         at = one.content.column_names.index(CHANNELS[4])
         still = pa.array(np.full(one.content.num_rows, 16003.0, np.float32))
-        return one.with_table(one.content.set_column(at, one.content.schema.field(at), still))
+        return dataclasses.replace(one, content=one.content.set_column(at, one.content.schema.field(at), still))
 
     given = dataset(*map(dead, TRAIN))
     files = trained(tmp_path / "dead", given, dataset(dead(VAL[0])), architecture="taxelwise")
@@ -134,7 +134,7 @@ def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
     one = motion(0)
     at = one.content.column_names.index("contact")
     content = one.content.set_column(at, one.content.schema.field(at), pa.array(contact.astype(np.int32)))
-    given = dataset(one.with_table(content))
+    given = dataset(dataclasses.replace(one, content=content))
     windows = {
         chosen: config(trained(tmp_path / chosen, given, given, epochs=1, windows=chosen))["counts"]["train"]["windows"]
         for chosen in ("all", "contact")
@@ -251,7 +251,10 @@ def test_baselines_can_be_left_out(tmp_path: Path) -> None:
 
 
 def test_ground_truth_columns_change_nothing(tmp_path: Path) -> None:
-    given = [one.with_table(one.content.append_column("gt_slip", pa.array(np.arange(80.0)))) for one in TRAIN]
+    given = [
+        dataclasses.replace(one, content=one.content.append_column("gt_slip", pa.array(np.arange(80.0))))
+        for one in TRAIN
+    ]
     files = [trained(tmp_path / name, dataset(*part), epochs=1) for name, part in (("a", given), ("b", TRAIN))]
     assert files[0] == files[1]
 

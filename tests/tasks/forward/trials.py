@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,7 +47,7 @@ def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, rep
     assert stage.fit is not None
     asked = stage.params(components=3, representation=representation)
     files = dict(files or stage.fit(asked, dataset(*shards)).files)
-    latent = [one.with_table(stage(asked, one, files)) for one in shards]
+    latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
     return dataset(*latent, files=files)
 
 
