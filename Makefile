@@ -36,7 +36,7 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -103,6 +103,12 @@ test-exports: $(VENV)/.dev ## have LeRobot's loader, datasets and mlcroissant op
 	    $(BIN)/python -m tests.exports.environment .cache/exports && touch .cache/exports/bin/.made; \
 	fi
 	@TACPIPE_EXPORTS_PYTHON=$(CURDIR)/.cache/exports/bin/python $(PYTEST) tests/exports
+
+test-trackers: $(VENV)/.dev ## have TensorBoard, an MLflow server and W&B read what --track gives them, in an environment of their own (1 GB)
+	@if [ ! -e .cache/trackers/bin/.made ]; then \
+	    $(BIN)/python -m tests.trackers.environment .cache/trackers && touch .cache/trackers/bin/.made; \
+	fi
+	@TACPIPE_TRACKERS_PYTHON=$(CURDIR)/.cache/trackers/bin/python $(PYTEST) tests/trackers
 
 test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
 	@$(BIN)/python -m tests.packaging.environments
