@@ -50,7 +50,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-viewer viewer-pictures test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -130,6 +130,12 @@ viewer-pictures: $(VENV)/.dev ## take the pictures of the viewer in the document
 	fi
 	@if ! command -v Xvfb > /dev/null; then $(call debian,$(SCREEN)); fi
 	@.cache/viewer/bin/python docs/viewer_pictures.py
+
+test-trackers: $(VENV)/.dev ## have TensorBoard, an MLflow server and W&B read what --track gives them, in an environment of their own (1 GB)
+	@if [ ! -e .cache/trackers/bin/.made ]; then \
+	    $(BIN)/python -m tests.trackers.environment .cache/trackers && touch .cache/trackers/bin/.made; \
+	fi
+	@TACPIPE_TRACKERS_PYTHON=$(CURDIR)/.cache/trackers/bin/python $(PYTEST) tests/trackers
 
 test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
 	@$(BIN)/python -m tests.packaging.environments

@@ -154,10 +154,12 @@ class Compared:
         clusters = ", ".join(dict.fromkeys(one.measure.cluster for one in several))
         skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
         points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
+        least = min(row.n for one in several for row in one.rows)
+        few = f" With n below {headline.FEWEST} no interval proves a difference." if least < headline.FEWEST else ""
         pooled = "Runs that differ in seed or fold alone are pooled (--each lists them). " if self.pooled else ""
         return (
             f"n: {clusters}. Units: {measure.unit}. {points if measure.name == 'points' else skill} {pooled}Intervals: "
-            f"bootstrap over {clusters} and over seeds where there are several, method and baseline on the same ones."
+            f"bootstrap over {clusters} and over seeds where there are several, method and baseline on the same ones.{few}"
         )
 
 

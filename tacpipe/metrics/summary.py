@@ -19,15 +19,16 @@ def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> di
     """Return the least gain over the best baseline with its interval and clusters, and an error a part and target.
 
     ``gain``, ``low``, ``high`` and ``n`` are of the headline whose gain is least: a model is better than its baselines only
-    where each of its headlines says so. Errors are of the last column of each. ``names`` are short names of parts and
-    targets. What is not defined is left out.
+    where each of its headlines is. Errors are of the last column of each, and named by the target where there are several.
+    ``names`` are short names of parts and targets. What is not defined is left out.
     """
     if not headlines:
         return {}
     least = min(headlines, key=lambda one: math.inf if math.isnan(one.gain) else one.gain)
     found: dict[str, float | int] = {"gain": least.gain, "low": least.low, "high": least.high, "n": least.clusters}
+    targets = len({one.target for one in headlines}) > 1  # their errors are of one measure, which no name repeats
     for one, place in zip(headlines, _places(headlines, names), strict=True):
-        found["_".join([*place, _short(one.columns[-1])])] = one.model.values[-1]
+        found["_".join(place if targets else [*place, _short(one.columns[-1])])] = one.model.values[-1]
     known = {name: value for name, value in found.items() if math.isfinite(value)}
     return {name: _rounded(value) for name, value in list(known.items())[: MOST - 1]}
 

@@ -19,6 +19,7 @@ from tacpipe.comparison import engine, runs
 from tacpipe.comparison.runs import Question, Run
 from tacpipe.comparison.specification import Task
 from tacpipe.engine import pipeline
+from tacpipe.metrics import headline
 from tests.comparison.comparison_fakes import run
 from tests.conftest import Ran
 from tests.test_older_project import ARCHIVE
@@ -90,6 +91,12 @@ def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interva
     (table,) = found.tables()
     assert all(len(line) <= 80 for line in table.text(80).splitlines())
     assert "95 % interval" in table.text(40).splitlines()[0]
+
+
+def test_too_few_recordings_for_a_verdict_are_stated() -> None:
+    few = compared(weighed(SMALL[:3], "a"))
+    assert f"below {headline.FEWEST}" in few.tables()[0].caption
+    assert "below" not in compared(*WIDTHS).tables()[0].caption
 
 
 def test_json_holds_every_row_with_its_results_and_csv_a_line_for_each() -> None:

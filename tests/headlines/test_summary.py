@@ -29,8 +29,8 @@ def test_the_gain_is_that_of_the_part_where_it_is_least() -> None:
 def test_names_are_those_that_differ_and_may_be_given() -> None:
     several = [of(0.1, "novel objects", target) for target in ("PDC thumb", "electrodes thumb")]
 
-    assert list(summary.of(several))[4:] == ["pdc_thumb_mae_t_1", "electrodes_thumb_mae_t_1"]
-    assert list(summary.of(several, {"PDC thumb": "pdc_th"}))[4:] == ["pdc_th_mae_t_1", "electrodes_thumb_mae_t_1"]
+    assert list(summary.of(several))[4:] == ["pdc_thumb", "electrodes_thumb"]
+    assert list(summary.of(several, {"PDC thumb": "pdc_th"}))[4:] == ["pdc_th", "electrodes_thumb"]
     assert list(summary.of([of(0.1)]))[4:] == ["mae_t_1"]
 
 

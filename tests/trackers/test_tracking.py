@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from tacpipe.errors import StorageError, TacpipeError
+import tacpipe
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.metrics import headline
 from tacpipe.plugins import registry
 from tacpipe.trackers import tracking
@@ -200,6 +201,14 @@ def test_a_training_that_fails_ends_its_run_without_a_model(tracked: Lab, monkey
 
     assert failed.code == 1
     assert calls[0][0] == "start" and calls[-1] == ["end", None, {}]
+
+
+def test_python_tracks_with_an_argument_and_refuses_a_stage_that_trains_nothing(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    with pytest.raises(UsageError, match="track"):
+        tacpipe.run("scale", "data/r", output="data/s", track=["tensorboard"])
+    with pytest.raises(UsageError, match="nobody"):
+        tacpipe.run("evaluate", "data/r", output="x", model="data/r", track=["nobody"])
 
 
 def test_tracking_goes_with_no_run_that_stores_nothing(lab: Lab) -> None:
