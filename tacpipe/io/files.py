@@ -27,17 +27,22 @@ def write_whole(
     """
     try:
         _write_synced(draft, content, mode)
-        try:
-            return _move(draft, path, exclusive)
-        except FileNotFoundError:
-            os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
-            return _move(draft, path, exclusive)
+        return move(draft, path, exclusive=exclusive)
     finally:
         with contextlib.suppress(OSError):  # a draft that stays is swept up later
             os.unlink(draft)  # noqa: PTH108
 
 
-def write_all(handle: int, content: bytes) -> None:
+def move(draft: str, path: str, *, exclusive: bool = False) -> bool:
+    """Give a draft that is whole its name, in a folder that is made if need be; return False if ``exclusive`` lost."""
+    try:
+        return _move(draft, path, exclusive)
+    except FileNotFoundError:
+        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        return _move(draft, path, exclusive)
+
+
+def write_all(handle: int, content: bytes | memoryview) -> None:
     """Write all of ``content``, however little of it the system takes at a time."""
     view = memoryview(content)
     while view:

@@ -8,16 +8,18 @@ import hashlib
 import json
 import os
 import stat
+import sys
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import memory, places, regular
-from tacpipe.io.files import listed, present, readable_errors, sentence, sync_folders, unread, write_whole
+from tacpipe.io import drafts, memory, places, regular
+from tacpipe.io.drafts import Draft
+from tacpipe.io.files import listed, move, present, readable_errors, sentence, sync_folders, unread, write_whole
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.store import layout
 from tacpipe.store.leases import Announcing, Leases
@@ -98,7 +100,15 @@ class Store:
             try:
                 yield
             finally:
+                self._sweep_drafts()
                 self._run = None
+
+    def _sweep_drafts(self) -> None:
+        """Remove what this run left in ``tmp/``."""
+        with contextlib.suppress(TacpipeError, OSError):  # a collection does it later
+            for path in layout.entries(self.root, "tmp"):
+                if path.name.startswith(f"{Path(self.run).stem}."):
+                    path.unlink(missing_ok=True)
 
     @property
     def run(self) -> str:
@@ -146,6 +156,25 @@ class Store:
             self.sync(path)
         return Object(name, len(content))
 
+    def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
+        """Store what ``write`` writes to the file that it is given, and return its digest and size.
+
+        For content that memory need not hold; else as `put`. Where ``write`` raises, nothing of it is kept.
+        """
+        path = self.draft()
+        with drafts.begun(path, self.root, mode=0o444) as draft:
+            write(draft)
+            draft.sync()
+            name = draft.digest
+            self.announce([name])
+            if durable or not self.has(name, draft.bytes):  # a copy that is there may be damaged
+                self._refuse_linked(self.object_path(name))
+                with readable_errors(self.root):
+                    move(path, self.object_path(name))
+        if durable:
+            self.sync(self.object_path(name))
+        return Object(name, draft.bytes)
+
     def take(self, name: str, blocks: Iterable[bytes]) -> None:
         """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
 
@@ -178,12 +207,13 @@ class Store:
             raise self._damaged(name)
         return content
 
-    def blocks(self, name: str, size: int) -> Iterator[bytes]:
+    def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
         """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
         hashed = hashlib.sha256()
         try:
             self.has(name)  # puts back what a collection moved aside
-            for block in regular.blocks(self.object_path(name), _most(size), follow=False):
+            most = sys.maxsize if size is None else _most(size)
+            for block in regular.blocks(self.object_path(name), most, follow=False):
                 hashed.update(block)
                 yield block
         except FileNotFoundError:
@@ -271,13 +301,22 @@ class Store:
 
         Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
         """
+        self._refuse_linked(path)
+        with readable_errors(self.root):
+            return write_whole(str(path), content, self.draft(), mode=mode, exclusive=exclusive)
+
+    def draft(self, name: str = "") -> str:
+        """Return a path in ``tmp/``, of a new name or of this one (32 hex digits), that begins with the run's.
+
+        From that a collection sees whether the run that wrote there is over.
+        """
+        return f"{self._root}/tmp/{Path(self.run).stem}.{name or uuid.uuid4().hex}"
+
+    def _refuse_linked(self, path: Path | str) -> None:
         if layout.is_linked(self._root, path):
             raise StorageError(
                 f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."
             )
-        with readable_errors(self.root):
-            draft = f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
-            return write_whole(str(path), content, draft, mode=mode, exclusive=exclusive)
 
     # ---- records
 
