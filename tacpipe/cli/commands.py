@@ -17,6 +17,8 @@ SUMMARIES = {
     "acquire": "Record every stream of a rig.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
+    "compare": "Compare results: the best first, columns for what differs.",
+    "track": "Give models and results to trackers of experiments.",
     "view": "Show recordings on one time axis, in Rerun's viewer.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
@@ -103,6 +105,53 @@ def _show(program: typer.Typer) -> None:
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
 
 
+def _compare(program: typer.Typer) -> None:
+    @program.command(
+        "compare",
+        help=SUMMARIES["compare"]
+        + "\n\nErrors, and the gain over the best baseline with its interval. Runs that differ in seed or fold alone are "
+        "pooled.\n\nExample: tacpipe compare results/forward results/forward-gru",
+    )
+    def compare(
+        results: Annotated[list[Path], typer.Argument(help="Results of `tacpipe evaluate`.")],
+        each: Annotated[bool, typer.Option("--each", help="A row a result: pool no folds and seeds.")] = False,
+        as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+        as_json: AsJson = False,
+    ) -> None:
+        from tacpipe.cli import compare as comparing
+        from tacpipe.io import tables
+
+        if as_csv and as_json:
+            raise typer.BadParameter("give --csv or --json, not both", param_hint="--csv")
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        found = comparing.run(results, pool=not each)
+        if as_json:
+            terminal.result_json(found.to_json())
+        elif as_csv:
+            terminal.result(found.to_csv())
+        else:
+            for number, table in enumerate(found.tables()):
+                terminal.result("") if number else None
+                tables.show(table, result=True)
+
+
+def _track(program: typer.Typer) -> None:
+    @program.command(
+        "track",
+        help=SUMMARIES["track"]
+        + "\n\nParams, the epochs of the history and the figures of each; a model that was trained with --track is the "
+        "same run again.\n\nExample: tacpipe track models/forward results/forward --to tensorboard",
+    )
+    def track(
+        datasets: Annotated[list[Path], typer.Argument(help="Models and results.")],
+        to: Annotated[list[str], typer.Option("--to", help="Tracker, NAME or NAME:PLACE: tensorboard, mlflow, wandb.")],
+    ) -> None:
+        from tacpipe.cli import track as tracking
+
+        for name in tracking.run(datasets, to):
+            terminal.result(name)
+
+
 def _explain(program: typer.Typer) -> None:
     @program.command("explain", help=SUMMARIES["explain"] + "\n\nExample: tacpipe explain results/forward")
     def explain(dataset: Annotated[Path, typer.Argument(help="A dataset or report.")], as_json: AsJson = False) -> None:
@@ -171,6 +220,8 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _acquire,
     "label": _label,
     "show": _show,
+    "compare": _compare,
+    "track": _track,
     "view": _view,
     "explain": _explain,
     "sensors": _sensors,

@@ -125,7 +125,7 @@ def to_text(value: dict[str, Any], *, full: bool = False) -> str:
     texts = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
     if value["kind"] in texts:
         made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        return printable.lines([*texts[value["kind"]](value), *_files(value), made])
+        return printable.lines([*texts[value["kind"]](value), *model_overview.files_text(value["files"]), made])
     return printable.lines(_recordings_text(value, full))
 
 
