@@ -15,7 +15,7 @@ MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
 OBJECTS, GRASPS = 1, 90  # of each of six families; and as many grasps of each object
 LIVE_S, LIVE_TRIALS = 30, 6  # of the emulated rig
 EMULATED = "emulated"
-LEARNING = ("matplotlib", "safetensors", "scipy", "sklearn", "torch")
+LEARNING = ("jinja2", "matplotlib", "safetensors", "scipy", "sklearn", "torch", "vl_convert")
 LINKS = ("serial", "websockets")
 
 
