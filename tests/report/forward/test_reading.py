@@ -18,8 +18,8 @@ from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison
 from tacpipe.comparison.runs import Method, grouped
 from tacpipe.report.forward import methods, reading
+from tests.fake_recordings import FakeDataset
 from tests.report.forward.result_fakes import WINDOWS, errors, result
-from tests.stages.learning_fakes import FakeDataset
 
 RATIO = {"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}
 

@@ -13,10 +13,10 @@ from tacpipe.comparison.runs import grouped
 from tacpipe.report.blocks import Section
 from tacpipe.report.forward import parts as own
 from tacpipe.report.forward import reading, representations
+from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.forward.result_fakes import codec, errors, result
 from tests.report.forward.test_reading import RATIO
-from tests.stages.learning_fakes import FakeDataset
 
 
 def forward(*results: Any, **how: Any) -> Section:

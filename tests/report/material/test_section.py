@@ -10,10 +10,10 @@ import pytest
 from tacpipe.report.blocks import Section
 from tacpipe.report.material import confusion, curves, grouping, latents, profiles, wording
 from tacpipe.report.material.methods import Method, Run
+from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.material import material_fakes
 from tests.report.material.material_fakes import result
-from tests.stages.learning_fakes import FakeDataset
 
 BOTH = {"biotac": 1, "roboskin": 2}
 PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}

@@ -12,9 +12,9 @@ from tacpipe.report.blocks import Section
 from tacpipe.report.touch import clouds, curves, electrodes, pressure, wording
 from tacpipe.report.touch.methods import Method, Run, grouped, groups
 from tacpipe.report.touch.parts import NO_EVIDENCE
+from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.touch.touch_fakes import NOVEL, recorded, result
-from tests.stages.learning_fakes import FakeDataset
 
 BASELINES = {"object_mean": 0.08, "nearest_in_time": 0.09}
 FULL: dict[str, Any] = {"novel": NOVEL, "baselines": BASELINES}
