@@ -22,7 +22,7 @@ def sentence(results: Sequence[Dataset]) -> str:
             return headline.sentence(found[0])
     counts = [contents.tree(one, "metrics.json").get("counts") for one in results]
     if all(one is not None and not one.get("recordings", one.get("n", True)) for one in counts):
-        return headline.text([])
+        return "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
     return "These results hold no errors by recording, so methods cannot be compared: their numbers are below."
 
 
