@@ -8,10 +8,14 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
+INSTALL := $(PIP) install --no-compile -c constraints.txt -e
+# pip compiles on one core, and packages' own tests too; a file that does not compile is one that nothing here imports
+COMPILE := $(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
 MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 BROWSER := chromium fonts-dejavu-core
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
+SCREEN := xvfb mesa-vulkan-drivers libxkbcommon-x11-0
 BLOCK_REPLAY := user-mode-linux dmsetup e2fsprogs xfsprogs btrfs-progs
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
@@ -19,8 +23,10 @@ DATA := $(TACPIPE_SAMPLE_DATA)
 EVERY := 1
 SLOW := 1/1
 TARGETS :=
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto
-FAULTS := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST) --every $(EVERY)
+FAULTS :=
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --dist worksteal
+COUNTED := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST)
+EXHAUSTIVE := $(COUNTED) --every $(EVERY)
 export PYTHONDONTWRITEBYTECODE := # a command that finds its bytecode starts in a third of the time; tests start hundreds
 PROPERTIES := $(wildcard $(addprefix tests/, test_hashing.py test_keys.py test_dataset.py sensors/test_framing.py \
     sensors/test_every_sensor.py signals/test_clocks.py))
@@ -36,7 +42,15 @@ else \
 fi
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+# Install what makes system calls fail, and begin the file of counts.
+define exhaustive
+if ! command -v strace > /dev/null; then \
+    ($(call debian,strace)) || echo "Until then the tests that make system calls fail are skipped." >&2; \
+fi; \
+mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
+endef
+
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -69,21 +83,21 @@ test-long: $(VENV)/.dev ## run the tests that take long: training, kills and cro
 test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
 	@$(PYTEST) -m "rig and not faults"
 
-test-ci: $(VENV)/.dev ## run the tests of all three in one go, which is faster; SLOW=2/3 runs every third of the slow ones, from the second
-	@$(PYTEST) -m "not faults" --slow $(SLOW)
+test-ci: $(VENV)/.dev ## run the tests of all three in one go; SLOW=2/3 runs every third of the slow ones, FAULTS=2/80 adds a part of test-faults
+	@$(if $(FAULTS),$(exhaustive))
+	@$(COUNTED) --slow $(SLOW) $(if $(FAULTS),--faults $(FAULTS),-m "not faults")
+	@$(if $(FAULTS),$(COUNTED) -n 0 --hypothesis-profile=faults --every $(FAULTS) $(PROPERTIES))
+	@$(if $(FAULTS),$(BIN)/python -m tests.promises.counts $(COUNTS))
 
 test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight other processes keep the computer busy
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20
-	@if ! command -v strace > /dev/null; then \
-	    ($(call debian,strace)) || echo "Until then the tests that make system calls fail are skipped." >&2; \
-	fi
-	@mkdir -p $(dir $(COUNTS)) && : > $(COUNTS)
-	@$(FAULTS) tests/promises
-	@$(FAULTS) --hypothesis-profile=faults $(PROPERTIES)
-	@$(FAULTS) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one
+	@$(exhaustive)
+	@$(EXHAUSTIVE) tests/promises
+	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
+	@$(EXHAUSTIVE) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
 
 test-exits: $(VENV)/.dev ## run 2,000 times `tacpipe show` and other commands that end after reading Parquet, and count exit codes
@@ -103,6 +117,25 @@ test-exports: $(VENV)/.dev ## have LeRobot's loader, datasets and mlcroissant op
 	    $(BIN)/python -m tests.exports.environment .cache/exports && touch .cache/exports/bin/.made; \
 	fi
 	@TACPIPE_EXPORTS_PYTHON=$(CURDIR)/.cache/exports/bin/python $(PYTEST) tests/exports
+
+test-viewer: $(VENV)/.dev ## have Rerun's own reader open what `tacpipe view` writes, in an environment of its own (0.5 GB)
+	@if [ ! -e .cache/viewer/bin/.made ]; then \
+	    $(BIN)/python -m tests.viewer.environment .cache/viewer && touch .cache/viewer/bin/.made; \
+	fi
+	@OMP_NUM_THREADS=1 .cache/viewer/bin/python -m pytest -q tests/viewer
+
+viewer-pictures: $(VENV)/.dev ## take the pictures of the viewer in the documentation, under a virtual screen (Xvfb)
+	@if [ ! -e .cache/viewer/bin/.made ]; then \
+	    $(BIN)/python -m tests.viewer.environment .cache/viewer && touch .cache/viewer/bin/.made; \
+	fi
+	@if ! command -v Xvfb > /dev/null; then $(call debian,$(SCREEN)); fi
+	@.cache/viewer/bin/python docs/viewer_pictures.py
+
+test-trackers: $(VENV)/.dev ## have TensorBoard, an MLflow server and W&B read what --track gives them, in an environment of their own (1 GB)
+	@if [ ! -e .cache/trackers/bin/.made ]; then \
+	    $(BIN)/python -m tests.trackers.environment .cache/trackers && touch .cache/trackers/bin/.made; \
+	fi
+	@TACPIPE_TRACKERS_PYTHON=$(CURDIR)/.cache/trackers/bin/python $(PYTEST) tests/trackers
 
 test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
 	@$(BIN)/python -m tests.packaging.environments
@@ -150,12 +183,14 @@ $(VENV)/.python:
 
 $(VENV)/.learn: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing tacpipe[learn] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[learn]'
+	@$(INSTALL) '.[learn]'
+	@$(COMPILE)
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing tacpipe[all,dev] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[all,dev]'
+	@$(INSTALL) '.[all,dev]'
+	@$(COMPILE)
 	@if ! $(BIN)/python -c 'import open3d' 2> /dev/null; then \
 	    $(call debian,$(OPEN3D_LIBRARIES)); \
 	    $(BIN)/python -c 'import open3d'; \
@@ -170,10 +205,10 @@ $(VENV)/.dev: $(VENV)/.python pyproject.toml constraints.txt
 
 $(VENV)/.docs: $(VENV)/.dev
 	@echo "Installing tacpipe[docs] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[docs]'
+	@$(INSTALL) '.[docs]'
 	@touch $@
 
 $(VENV)/.fuzz: $(VENV)/.dev
 	@echo "Installing tacpipe[fuzz] into $(VENV)"
-	@$(PIP) install -c constraints.txt -e '.[fuzz]'
+	@$(INSTALL) '.[fuzz]'
 	@touch $@

@@ -42,7 +42,7 @@ def _edited_output(tool: Tool, folder: Path) -> Cell:
     if tool.values(lab, "total") == lab.right("total"):
         again = len(lab.computed("scale")) > len(RECORDINGS)
         return Cell(f"{where}the sum is right{', the edited recording was made again' if again else ''}", True)
-    told = f"found (exit code {done.code}), not mended" if done.code else "the edited numbers are summed, exit code 0"
+    told = f"found (exit code {done.code}), not repaired" if done.code else "the edited numbers are summed, exit code 0"
     return Cell(f"{where}{told}", False)
 
 
@@ -62,7 +62,7 @@ def damaged(harm: Callable[[Path], None]) -> Fault:
             told = {0: "the output is right", 1: "found, the recording alone is made again"}
             return Cell(told.get(more, "found, all recordings are made again"), True)
         if done.code:
-            return Cell(f"found (exit code {done.code}), not mended", False)
+            return Cell(f"found (exit code {done.code}), not repaired", False)
         after = "the next stage fails on it" if summed.code else "the next stage sums it"
         return Cell(f"brought back as it is, exit code 0; {after}", False)
 

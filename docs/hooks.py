@@ -63,14 +63,15 @@ def command_line() -> str:
 
 def command_names() -> list[list[str]]:
     """Return the words of every command, those of groups behind their group."""
-    from tacpipe.cli import commands, main
+    from tacpipe.cli import commands
+    from tacpipe.plugins import registry
 
     found: list[list[str]] = []
     groups: dict[str, list[str]] = {}
     for name in stage_names():
         group, _, method = name.partition(".")
         groups.setdefault(group, []).append(method)
-    for group in [name for name in main.ORDER if name in groups]:
+    for group in [name for name in registry.commands() if name in groups]:
         found.append([group])
         found += [[group, method] for method in groups[group] if method]
     for name in commands.NAMES:

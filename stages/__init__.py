@@ -1,1 +1,15 @@
 """The built-in stages: the first plug-in, found through entry points like any other."""
+
+COMMANDS = {  # in the order of `tacpipe --help`; the line of a group, "" for a stage, whose docstring has its own
+    "ingest": "Read recordings of files into a dataset.",
+    "simulate": "Simulate recordings of a rig, with ground truth.",
+    "synchronize": "",
+    "segment": "Mark contacts and slips, or cut out slides and grasps.",
+    "split": "",
+    "compress": "Compress tactile channels to a few latents.",
+    "train": "Train the model of a task.",
+    "evaluate": "",
+    "predict": "",
+    "report": "",
+    "export": "Write recordings in the formats of other tools.",
+}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Unit
+from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed, StoredAs, Unit
 from tacpipe.plugins.stage import RecordingOutput, stage
 
 if TYPE_CHECKING:
@@ -26,7 +26,8 @@ class Params:
 
     # distance from the plane of the table within which points belong to it; larger for a noisy table
     plane_mm: Annotated[PositiveFloat, Unit("mm")] = 6.0
-    plane_share: Fraction = 0.2  # of the scene's points, that the table must hold
+    # fraction of the scene's points that the table must hold
+    plane_fraction: Annotated[Fraction, StoredAs("plane_share")] = 0.2
     plane_trials: PositiveInt = 1000  # random samples by which a plane is looked for
     seed: Seed = 0  # random seed of these samples
     # largest distance between neighbouring points of one object
@@ -74,7 +75,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
         )
     limits = Limits(
         plane_m=params.plane_mm / 1e3,
-        plane_share=params.plane_share,
+        plane_fraction=params.plane_fraction,
         plane_trials=params.plane_trials,
         cluster_m=params.cluster_mm / 1e3,
         cluster_points=params.cluster_points,

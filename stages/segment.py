@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tacpipe.channels.absent import absent, entry
 from tacpipe.channels.pose import METRES
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Unit
+from tacpipe.plugins.constraints import (
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    StoredAs,
+    Unit,
+)
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 
@@ -236,7 +244,8 @@ class SlideParams:
 
     # static pressure whose first crossing starts the slide
     pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
-    moving_share: Fraction = 0.5  # of speed_m_s, from which on the arm slides; only where the arm was recorded
+    # fraction of speed_m_s above which the arm slides; only where the arm was recorded
+    moving_fraction: Annotated[Fraction, StoredAs("moving_share")] = 0.5
     steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
     # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
@@ -322,7 +331,7 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
         trigger = found.trigger_row(pressure, params.pressure_trigger)
         slide = (trigger, len(t_ns))
         if profile:
-            least_m_s = params.moving_share * params.speed_m_s
+            least_m_s = params.moving_fraction * params.speed_m_s
             slide = found.sliding_rows(profile["speed_m_s"], trigger, least_m_s, params.steady_frames) or slide
         first, stop = found.kept_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
     except TacpipeError as error:
@@ -368,7 +377,7 @@ def _slide_by_load(params: SlideParams, name: str, streams: Mapping[str, pa.Tabl
         if profile:
             usual_m_s = float(np.nanquantile(profile["speed_m_s"][slice(*touched)], USUAL_SPEED))
             moving = found.sliding_rows(
-                profile["speed_m_s"][: touched[1]], touched[0], params.moving_share * usual_m_s, params.steady_frames
+                profile["speed_m_s"][: touched[1]], touched[0], params.moving_fraction * usual_m_s, params.steady_frames
             )
             slide = moving or touched
         first, stop = found.kept_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)

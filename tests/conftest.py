@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -76,19 +76,28 @@ def name_signals() -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--every", type=int, default=1, help="Run one of so many of the tests that were chosen.")
+    parser.addoption(
+        "--every", default="1/1", help="K/N: of all chosen tests, run each Nth from the Kth; N: from the first."
+    )
     parser.addoption("--slow", default="1/1", help="K/N: of those marked long or rig, run each Nth from the Kth.")
+    parser.addoption("--faults", default="1/1", help="K/N: of those marked faults, run each Nth from the Kth.")
 
 
 @pytest.hookimpl(trylast=True)  # after markers chose what runs
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    every: int = config.getoption("--every")
-    first, _, share = config.getoption("--slow").partition("/")
-    slow = [item for item in items if item.get_closest_marker("long") or item.get_closest_marker("rig")]
-    left = {id(item) for number, item in enumerate(slow, 1) if (number - int(first)) % int(share)}
-    left |= {id(item) for number, item in enumerate(items) if number % every}
+    faults = {id(item) for item in items if item.get_closest_marker("faults")}
+    slow = {id(item) for item in items if item.get_closest_marker("long") or item.get_closest_marker("rig")} - faults
+    left = left_out([id(item) for item in items if id(item) in slow], config.getoption("--slow"))
+    left |= left_out([id(item) for item in items if id(item) in faults], config.getoption("--faults"))
+    left |= left_out([id(item) for item in items], config.getoption("--every"))
     config.hook.pytest_deselected(items=[item for item in items if id(item) in left])
     items[:] = [item for item in items if id(item) not in left]
+
+
+def left_out(items: Sequence[int], part: str) -> set[int]:
+    """Return those of the items that do not belong to a part ``K/N``, which is each Nth from the Kth; N alone is 1/N."""
+    first, _, every = part.rpartition("/")
+    return {item for number, item in enumerate(items, 1) if (number - int(first or 1)) % int(every)}
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,24 +1,24 @@
-"""A recording without a store, for functions that read recordings."""
+"""Recordings and datasets without a store, for functions that read them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from tacpipe.io.columns import Columns
+from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import to_parquet
-from tacpipe.plugins.stage import Attribute
 
 
-@dataclass
-class FakeRecording:
-    """What a stage sees of one recording: tables by stream name."""
+class _Fake:
+    """What a stage sees of one recording."""
 
     tables: Mapping[str, pa.Table]
-    name: str = "trial"
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    name: str
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -29,3 +29,49 @@ class FakeRecording:
 
     def columns(self, stream: str = "") -> Columns:
         return Columns(to_parquet(self.tables[stream]))
+
+    @property
+    def digest(self) -> str:
+        return digest([self.name, *(table.num_rows for table in self.tables.values())])
+
+
+@dataclass
+class FakeRecording(_Fake):
+    """A recording of several streams: tables by name."""
+
+    tables: Mapping[str, pa.Table]
+    name: str = "trial"
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class FakeShard(_Fake):
+    """A recording of one table, as `synchronize` and what follows it make them."""
+
+    name: str
+    content: pa.Table
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def tables(self) -> Mapping[str, pa.Table]:  # type: ignore[override]
+        return {"": self.content}
+
+
+@dataclass
+class FakeDataset:
+    """What a stage sees of a dataset: recordings by name, and files."""
+
+    recordings: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    manifest: dict[str, Any] = field(default_factory=dict)
+
+
+def dataset(*recordings: FakeRecording | FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
+    """Return a dataset of these recordings."""
+    return FakeDataset({recording.name: recording for recording in recordings}, files or {})
+
+
+def column(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
+    """Return a column (row,) as an array."""
+    values: np.ndarray[Any, Any] = table.column(name).to_numpy()
+    return values

@@ -17,7 +17,7 @@ from types import ModuleType
 import pytest
 import yaml
 
-from tacpipe.cli import commands, main
+from tacpipe.cli import commands
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tests.conftest import Lab, tacpipe
@@ -34,6 +34,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
             "howto/stage",
             "tutorials/own-data",
             "howto/hdf5",
+            "howto/view",
             "howto/export",
             "howto/format",
             "tutorials/ci-and-dvc",
@@ -119,7 +120,7 @@ def test_every_stage_has_a_summary_that_is_a_sentence(name: str) -> None:
 
 
 def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> None:
-    texts = {**main.SUMMARIES, **commands.SUMMARIES}
+    texts = {**registry.commands(), **commands.SUMMARIES}
 
     assert set(commands.NAMES) <= set(commands.SUMMARIES)
     assert {name.partition(".")[0] for name in BUILT_IN if "." in name} <= set(texts)

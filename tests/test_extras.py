@@ -61,6 +61,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "label data/recordings trial-000 --set object=cup",
     "show data/synced",
     "show models/forward",
+    "compare results/forward",
     "explain report.html",
     "acquire --recover",
     "sensors list",
@@ -78,6 +79,10 @@ LACK = {  # and for each that does need one, with that extra
     "compress pca data/segments --codec data/latents -o {o}": "learn",
     "train forward data/segments --split data/split -o {o}": "learn",
     "train material data/slides --split data/slides-split -o {o}": "learn",
+    "track models/forward --to tensorboard:{o}": "tensorboard",
+    "track models/forward --to mlflow:{o}": "mlflow",
+    "track models/forward --to wandb:{o}": "wandb",
+    "train forward data/segments --split data/split -o {o} --track tensorboard": "tensorboard",
     "train touch data/grasps --split data/grasps-split -o {o}": "learn",
     "evaluate models/forward data/latents --rerun -o {o}": "learn",
     "predict models/forward data/latents -o {o}": "learn",
@@ -94,6 +99,9 @@ LACK = {  # and for each that does need one, with that extra
     "export mcap data/recordings -o {o}": "ros",
     "export hdf5 data/recordings -o {o}": "hdf5",
     "export zarr data/synced -o {o}": "zarr",
+    "split data/segments --scheme random --seed 7 -o {o} --executor dask": "dask",
+    "show data/synced trial-000 --plot {o}.png": "learn",
+    "view data/synced --save {o}.rrd": "view",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
@@ -137,7 +145,7 @@ def prepare(folder: Path) -> None:
     xela_files.write_flat(folder / "flat" / "trial_1")
     xela_files.write_psc(folder / "psc" / "trial_1")
     slide_files.write_biotac(folder / "biotac")
-    slide_files.write_roboskin(folder / "roboskin", slide_files.felt())
+    slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
     points_m = shapes.seen(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]

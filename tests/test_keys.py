@@ -80,12 +80,15 @@ def key(params: Any = None, inputs: Mapping[str, Any] | None = None, name: str =
     return digest(keys.identity(name, given.version, params or Params(), inputs or {}))
 
 
-def told(value: Any) -> Any:
+def typed(value: Any) -> Any:
     """Return the value in a form in which two are equal only if they are of the same types throughout."""
     if isinstance(value, list | tuple):
-        return ["list", *map(told, value)]
+        return ["list", *map(typed, value)]
     if isinstance(value, dict):
-        return ["mapping", *sorted(([name, told(inner)] for name, inner in value.items()), key=lambda pair: pair[0])]
+        return [
+            "mapping",
+            *sorted(([name, typed(inner)] for name, inner in value.items()), key=lambda pair: pair[0]),
+        ]
     return [type(value).__name__, repr(value)]
 
 
@@ -100,14 +103,14 @@ def reversed_throughout(value: Any) -> Any:
 
 @given(values)
 def test_canonical_json_tells_the_value_back_so_no_two_values_share_a_digest(value: Any) -> None:
-    assert told(json.loads(canonical(value))) == told(value)
+    assert typed(json.loads(canonical(value))) == typed(value)
 
 
 @given(values, values)
 def test_where_one_value_ends_and_the_next_begins_is_part_of_the_digest(left: Any, right: Any) -> None:
     together = [[left, right], [[left], right], [left, [right]], [[left, right]], {"a": left, "b": right}]
     digests = [digest(value) for value in together]
-    same = {(one, other) for one in range(5) for other in range(one) if told(together[one]) == told(together[other])}
+    same = {(one, other) for one in range(5) for other in range(one) if typed(together[one]) == typed(together[other])}
     assert {(one, other) for one in range(5) for other in range(one) if digests[one] == digests[other]} == same
 
 
@@ -276,7 +279,7 @@ def test_a_recordings_key_rests_on_its_streams_and_on_the_attributes_that_are_de
     changed = data.draw(attributes)
     before, after = keys.of_recording(entry, reads), keys.of_recording({**entry, "attributes": changed}, reads)
     known = [{name: found[name] for name in reads if name in found} for found in (entry["attributes"], changed)]
-    assert (digest(before) == digest(after)) == (told(known[0]) == told(known[1]))
+    assert (digest(before) == digest(after)) == (typed(known[0]) == typed(known[1]))
 
 
 @given(entries, entries)
@@ -304,7 +307,7 @@ def test_a_key_over_a_dataset_rests_on_names_attributes_and_streams_in_any_order
         }
 
     assert described(dict(reversed(one.items()))) == described(one)
-    assert (described(one) == described(other)) == (told(content(one)) == told(content(other)))
+    assert (described(one) == described(other)) == (typed(content(one)) == typed(content(other)))
     bare = {name: {**entry, "attributes": {}} for name, entry in one.items()}
     assert described(one, ()) == described(bare, ())
 

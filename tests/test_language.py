@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tests.conftest import Lab
-from tests.test_docs import COMMANDS, PAGES, hooks
+from tests.test_docs import BUILT_IN, COMMANDS, PAGES, hooks
 
 ROOT = Path(__file__).parents[1]
 WORDS = re.compile(
@@ -124,6 +126,31 @@ def test_no_function_class_or_variable_has_a_name_that_is_not_used(package: str)
         if NAMES.search(name)
     }
     assert sorted(wrong) == []
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_no_param_has_a_name_that_is_not_used(name: str) -> None:
+    params = params_of.fields(registry.load(name))
+    assert [
+        param for param in params if NAMES.search(param) or set(param.split("_")) & {"share", "shares", "ratio"}
+    ] == []
+
+
+def test_no_test_module_or_helper_has_a_name_that_is_not_used() -> None:
+    wrong = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+        for name in (path.stem, *helpers(ast.parse(path.read_text(encoding="utf-8"))))
+        if NAMES.search(name) and "report" not in path.parts
+    }
+    assert sorted(wrong) == []
+
+
+def helpers(tree: ast.AST) -> Iterator[str]:
+    """Yield the names of functions that are not tests, whose names are sentences, and of classes."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("test_"):
+            yield node.name
 
 
 def test_help_of_a_command_that_a_test_runs_is_the_page_s(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,7 +66,7 @@ def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
     import json
 
     from tacpipe.report import page
-    from tests.stages.learning_fakes import FakeDataset
+    from tests.fake_recordings import FakeDataset
 
     (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
     (tmp_path / "own/own.egg-info/entry_points.txt").write_text("[tacpipe.reports]\nweighing = own_report\n")
@@ -84,21 +84,61 @@ def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
 
 
 def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
-    names = "|".join(registry.entry_points()[registry.TASKS])
+    names = "|".join(registry.tasks())
     # words of data, as the label material, are no names of tasks where they stand alone
     literal = re.compile(rf"forward|(?:.*[./])?(?:tasks|report|train|simulate|models|results)[./](?:{names})(?:\..*)?")
+    assert _modules_with(literal) == set()
+
+
+def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
+    data = {"split", "train", "report"}  # words of data too: a role, a kind of input, a message of HID
+    known = {*registry.stages(), *registry.commands()} - data
+    needed = {"exports/frames.py"}  # an export of frames runs synchronize before it
+
+    assert _modules_with(re.compile("|".join(map(re.escape, known)))) == needed
+
+
+def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab: Lab) -> None:
+    from tacpipe.plugins.registry import demos
+    from tacpipe.simulation import demo
+
+    *commands, last = demo.commands(Path("out"))
+    assert list(demos()) == registry.tasks()
+    assert {words[1] for words in commands if words[0] == "train"} == set(registry.tasks())
+    evaluated = [words[-1] for words in commands if words[0] == "evaluate"]
+    assert last[: len(evaluated) + 1] == ["report", *evaluated]
+    assert lab.run("--help").out.index("  simulate ") < lab.run("--help").out.index("  export ")
+
+
+def test_a_plug_in_states_the_order_and_the_lines_of_its_commands(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
+    (tmp_path / "own/own.egg-info/entry_points.txt").write_text(
+        "[tacpipe.commands]\nown = own_stages:COMMANDS\nlost = nowhere:COMMANDS\n\n"
+        "[tacpipe.stages]\nweigh.twice = own_stages:f\n"
+    )
+    (tmp_path / "own/own_stages.py").write_text('"""Weigh."""\n\nCOMMANDS = {"weigh": "Weigh objects.", "gone": ""}\n')
+    monkeypatch.syspath_prepend(tmp_path / "own")
+    forget()
+    assert registry.commands()["weigh"] == "Weigh objects."
+    order = list(registry.commands())
+    assert order[0] == "ingest" and "gone" not in order
+    assert order.index("export") < order.index("weigh") < order.index("centre") < order.index("scale")
+    assert "Weigh objects." in lab.run("--help").out
+    assert "Weigh objects." in lab.run("weigh --help").out
+    lab.run("simulate toy -o data/r")
+
+
+def _modules_with(literal: re.Pattern[str]) -> set[str]:
+    """Return the modules outside of plug-ins' own packages that have such a text in their code."""
     root = Path(registry.__file__).parents[1]
-    own = {root / part / name for part in ("tasks", "report") for name in names.split("|")}
-    found = {
+    own = {root / part for part in ("tasks", "report", "formats", "simulation")}
+    return {
         str(file.relative_to(root))
         for file in root.rglob("*.py")
         if not own & set(file.parents) and any(literal.fullmatch(text) for text in _texts(file))
     }
-    assert found <= {
-        "cli/candidates.py",
-        "cli/demo.py",
-        "cli/stages.py",
-    }  # examples, and the demonstration of all tasks
 
 
 def _texts(file: Path) -> set[str]:

@@ -17,7 +17,7 @@ from tacpipe.tasks.forward.requirements import REQUIREMENTS as FORWARD
 from tacpipe.tasks.material import slides as material_slides
 from tacpipe.tasks.material.requirements import REQUIREMENTS as MATERIAL
 from tests.conftest import Lab
-from tests.stages.learning_fakes import FakeShard
+from tests.fake_recordings import FakeShard
 from tests.tasks.material.textures import dataset as slides_of
 from tests.tasks.material.textures import slide
 

@@ -43,7 +43,7 @@ def test_what_people_write_is_shown_as_it_is(text: str) -> None:
 
 @pytest.fixture
 def hostile(lab: Lab) -> Lab:
-    """A dataset whose labels, names, exclusions and params a stranger wrote."""
+    """A dataset whose labels, names, exclusions and params are untrusted text."""
     lab.run("simulate toy -o data/r --trials 2")
     made = lab.manifest("data/r")
     first, second = made.recordings

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +20,7 @@ from tacpipe.printable import plain
 if TYPE_CHECKING:
     from tacpipe.clouds.candidates import Candidate
     from tacpipe.clouds.cloud import Cloud
+    from tacpipe.clouds.grasp import Grasp
 
 EXAMPLE = "\n\nExample: tacpipe candidates data/grasps --recording bleach-1561629162 --model models/touch"
 HEADER = "rank,score,off_deg,"  # how the CSV begins
@@ -36,9 +39,7 @@ def candidates(
         Path, typer.Argument(help="File (.ply, .pcd …) with the object's points, or a dataset of grasps.")
     ],
     recording: Annotated[str | None, typer.Option("--recording", help="Name of the recording in a dataset.")] = None,
-    model: Annotated[
-        Path | None, typer.Option("--model", help="Model of task touch, which predicts the touch of each grasp.")
-    ] = None,
+    model: Annotated[Path | None, typer.Option("--model", help="Model that predicts the touch of a grasp.")] = None,
     count: Annotated[int, typer.Option("--count", help="Maximum number of grasps, spread along the object.")] = 10,
     seed: Annotated[int, typer.Option("--seed", help="Random seed of the cuts through the object.")] = 0,
     shift: Annotated[
@@ -61,14 +62,14 @@ def candidates(
 ) -> None:
     """Print possible grasps, best first."""
     _require_names(output, picture)
-    predictor = None if model is None else _touch_model(model)
+    predict = None if model is None else _predict_grasp(model)
     from tacpipe.clouds.candidates import candidates as find
 
     seen = _cloud(cloud, recording)
     found = find(seen, count, seed, shift, (opening_mm[0] / 1e3, opening_mm[1] / 1e3), camera_m)
     rows = [_row(rank, candidate) for rank, candidate in enumerate(found, 1)]
-    if predictor is not None:
-        rows = [row | _touch(predictor.predict(seen, each.grasp)) for row, each in zip(rows, found, strict=True)]
+    if predict is not None:
+        rows = [row | predict(seen, each.grasp) for row, each in zip(rows, found, strict=True)]
     if picture is not None:
         from tacpipe.clouds.picture import draw
 
@@ -118,19 +119,23 @@ def _some(names: list[str]) -> str:
     return f"{shown} … (`tacpipe show --full` lists all {len(names)})" if len(names) > 5 else shown or "none"
 
 
-def _touch_model(path: Path) -> Any:
-    """Return the model of touch at ``path``. Raises `UsageError` if it is one of another task."""
+def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
+    """Return the function by which the model at ``path`` predicts a grasp. Raises `UsageError` if its task has none."""
     import tacpipe
     from tacpipe.datasets import model_files
+    from tacpipe.plugins import registry
 
     files = tacpipe.open(path).files
     task = model_files.tree(files, model_files.CONFIG).get("task") if model_files.CONFIG in files else None
-    if task is not None and task != "touch":
+    predict: Any = None if task is None else getattr(registry.load_task(str(task)), "predict_grasp", None)
+    if task is not None and predict is None:
+        able = [name for name in registry.tasks() if hasattr(registry.load_task(name), "predict_grasp")]
         raise UsageError(
-            f"{path} is a model of task {plain(str(task))}; what a grasp would measure is predicted by one of task touch. "
-            f"`tacpipe train touch` makes one."
+            f"{path} is a model of task {plain(str(task))}, which predicts recordings and not single grasps. Give a model "
+            f"of task {' or '.join(able)}: {' or '.join(f'`tacpipe train {name}`' for name in able)} makes one."
         )
-    return tacpipe.load(path)
+    model = tacpipe.load(path)  # refuses what is not a model
+    return partial(predict, model)
 
 
 def _row(rank: int, candidate: Candidate) -> Row:
@@ -149,16 +154,6 @@ def _row(rank: int, candidate: Candidate) -> Row:
     values |= {name: round(float(value), 6) for name, value in zip(POINTS, points, strict=True)}
     if grasp.wrist is not None:
         values |= {name: round(float(value), 6) for name, value in zip(WRIST, grasp.wrist.T.ravel(), strict=True)}
-    return values
-
-
-def _touch(touch: Any) -> Row:
-    """Return the 50 values that a model predicts, device counts by column."""
-    values: Row = {}
-    for finger in ("th", "mf"):
-        values[f"pdc_{finger}_counts"] = round(float(getattr(touch, f"pdc_{finger}")), 1)
-        electrodes = enumerate(getattr(touch, f"e_{finger}"), 1)
-        values |= {f"e_{finger}_{n:02d}_counts": round(float(value), 1) for n, value in electrodes}
     return values
 
 

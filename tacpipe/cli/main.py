@@ -26,14 +26,6 @@ Stages read and write datasets: `tacpipe STAGE INPUT... -o OUTPUT`. Stored resul
 Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data, 5 device missing or lost,
 6 lock wait timed out, 130 interrupted.
 """
-SUMMARIES = {
-    "ingest": "Read recordings of files into a dataset.",
-    "segment": "Mark contacts and slips, or cut out slides and grasps.",
-    "compress": "Compress tactile channels to a few latents.",
-    "train": "Train the model of a task.",
-    "simulate": "Simulate recordings of a rig, with ground truth.",
-    "export": "Write recordings in the formats of other tools.",
-}
 
 
 def app(arguments: Sequence[str]) -> typer.Typer:
@@ -69,7 +61,7 @@ def app(arguments: Sequence[str]) -> typer.Typer:
     elif first in groups:
         _add_stages(program, first, [name for name in names if name.partition(".")[0] == first], arguments)
     else:
-        _add_summaries(program, names, groups)
+        _add_summaries(program)
     return program
 
 
@@ -178,7 +170,7 @@ def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: S
     if names == [group]:
         stages.add(program, group, group)
         return
-    methods = typer.Typer(help=SUMMARIES.get(group), no_args_is_help=True, rich_markup_mode=None)
+    methods = typer.Typer(help=registry.commands()[group], no_args_is_help=True, rich_markup_mode=None)
     by_method = {name.partition(".")[2]: name for name in names}
     asked = [method for method in by_method if method in arguments]
     for method in asked:  # and no other: a broken method spoils itself alone
@@ -188,28 +180,14 @@ def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: S
     program.add_typer(methods, name=group)
 
 
-def _add_summaries(program: typer.Typer, names: dict[str, str], groups: set[str]) -> None:
+def _add_summaries(program: typer.Typer) -> None:
     """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
     from tacpipe.cli import commands
     from tacpipe.plugins import registry
 
-    lines = {
-        group: SUMMARIES.get(group) or registry.summary(group if group in names else _first(names, group))
-        for group in groups
-    }
-    for name in (*ORDER, *sorted(groups - set(ORDER)), *commands.NAMES):
-        if name in lines or name in commands.NAMES:
-            program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
-
-
-ORDER = (
-    *("ingest", "simulate", "synchronize", "segment", "split", "compress"),
-    *("train", "evaluate", "predict", "report", "export"),
-)
-
-
-def _first(names: dict[str, str], group: str) -> str:
-    return next(name for name in names if name.startswith(f"{group}."))
+    lines = registry.commands()
+    for name in (*lines, *commands.NAMES):
+        program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
 
 
 def _nothing() -> None:

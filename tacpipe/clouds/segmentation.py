@@ -30,7 +30,7 @@ class Limits:
     """What counts as table, as one thing, and as the thing that was grasped."""
 
     plane_m: float  # from a plane, within which points belong to it; more where they spread more
-    plane_share: float  # of all points, that the table must hold
+    plane_fraction: float  # of all points, that the table must hold
     plane_trials: int  # random samples for each plane
     cluster_m: float  # between neighbours in one thing
     cluster_points: int  # that a point must have so near, itself included, to be inside of a thing
@@ -80,17 +80,17 @@ def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -
 
     The normal has length 1 and points to the camera's side, where the grasp lies. Sides of the object are not a table: the
     grasp lies within it, behind what the camera sees. Raises `TacpipeError` if there is no such plane that holds
-    ``plane_share`` of the points (point, xyz).
+    ``plane_fraction`` of the points (point, xyz).
     """
     left = np.arange(len(points_m))
     found: list[tuple[float, Floats]] = []
     fractions: list[float] = []
-    while len(fractions) < PLANES and len(left) >= max(3.0, limits.plane_share * len(points_m)):
+    while len(fractions) < PLANES and len(left) >= max(3.0, limits.plane_fraction * len(points_m)):
         plane = _largest_plane(points_m[left], limits, seed)
         within = np.abs(heights_m(points_m[left], plane)) <= limits.plane_m
         fractions.append(np.count_nonzero(within) / len(points_m))
         height_m = float(heights_m(grasp.middle_m[None], plane)[0])
-        if fractions[-1] >= limits.plane_share and height_m > limits.plane_m:
+        if fractions[-1] >= limits.plane_fraction and height_m > limits.plane_m:
             found.append((height_m, plane))
         left = left[~within]
     if found:
@@ -98,7 +98,7 @@ def table_plane(points_m: Floats, grasp: Grasp, limits: Limits, seed: int = 0) -
     percentages = ", ".join(f"{100 * fraction:.0f}" for fraction in fractions) or "0"
     raise TacpipeError(
         f"No table is found: the largest planes hold {percentages} % of {len(points_m)} points, and one with the grasp in "
-        f"front of it must hold {100 * limits.plane_share:g} %. Give the view with its table, or the object's points as "
+        f"front of it must hold {100 * limits.plane_fraction:g} %. Give the view with its table, or the object's points as "
         f"the stream `cloud`."
     )
 

@@ -26,6 +26,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Object, Store
+from tacpipe.training import display, following
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str,
     """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
     stage, stage_name = stage_of(task.name), registry.whole(task.name)
     params = params_of.from_json(stage, task.identity["params"])
-    with _arguments(stage, task, store) as arguments:
+    with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments):
         try:
             with memory.raising_shortage(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
                 returned = _result(task.name, stage, stage(params, **arguments))
@@ -178,7 +179,13 @@ class _Reader:
         try:
             return self._store.read(name, size)
         except MissingError as error:
-            content = _adopt(self._store, name, path, self._beside, size)
+            try:
+                content = _adopt(self._store, name, path, self._beside, size)
+            except StorageError as unread:  # a copy may be there: the stage that made it is the other way to have it
+                try:
+                    return _remake(self._store, name, path, str(error), size)
+                except DamagedError:
+                    raise unread from error
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -301,6 +308,17 @@ def _workspace(store: Store, identity: Mapping[str, Any]) -> Path:
         raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
     folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+@contextmanager
+def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Iterator[None]:
+    """Have what the stage trains, if it has a workspace to train in, followed by whoever looks."""
+    workspace = arguments.get(stage.argument("Workspace") or "")
+    if workspace is None:
+        yield
+        return
+    with display.on_stderr(registry.whole(name), workspace) as shown, following.in_workspace(workspace, *shown):
+        yield
 
 
 def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:

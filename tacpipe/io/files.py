@@ -149,14 +149,17 @@ def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | No
 
 
 @contextlib.contextmanager
-def readable_errors(root: Path) -> Iterator[None]:
-    """Turn what the file system states into a sentence; what is looked for and not there stays what it is."""
+def readable_errors(root: Path, *, reading: bool = False) -> Iterator[None]:
+    """Turn what the file system states into a sentence; what is looked for and not there stays what it is.
+
+    With ``reading`` nothing is written in the block, and the sentence is that of `unread`.
+    """
     try:
         yield
     except (FileNotFoundError, FileExistsError):
         raise
     except OSError as error:
-        raise sentence(root, error) from error
+        raise (unread(error.filename or root, error) if reading else sentence(root, error)) from error
 
 
 def may_not_write(error: StorageError) -> bool:
@@ -179,6 +182,16 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
     return StorageError(
         f"The store {root} cannot be used: {error.filename or 'a file'}: {error.strerror or error}. "
         f"Check the disk, then run the same command again."
+    )
+
+
+def unread(path: Path | str, error: OSError) -> StorageError:
+    """Return in words that the system fails to read a file, which states nothing of what the file holds."""
+    hint = "check the disk and its permissions"
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        hint = "allow more open files (`ulimit -n`)"
+    return StorageError(
+        f"{path} cannot be read: {error.strerror or error}. It may be sound: {hint}, then run the same command again."
     )
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.io import memory
 from tacpipe.io.parquet_claims import claimed
 from tacpipe.printable import plain
@@ -152,8 +152,8 @@ class _Rows:
 def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
     """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
 
-    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there or more than
-    the memory that is left.
+    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there, and
+    `ShortageError` where it is more than the memory that is left, which a sound file may hold too.
     """
     return ParquetTable(content).read(columns)
 
@@ -182,7 +182,7 @@ class ParquetTable:
             needed = claimed(self._file.schema, memoryview(self._content).cast("B"), columns)
         except BROKEN as error:
             raise _unread(self._content.size, error) from error
-        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=DamagedError)
+        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=ShortageError)
         try:
             table = self._file.read(columns=list(columns) if columns is not None else None)
             return table if self._fields is None else table.cast(self._with_fields(table.schema))

@@ -1,8 +1,9 @@
-"""Names of stages, formats, exports, tasks, reports and sensors, found through entry points and loaded when asked for."""
+"""Names of what plug-ins bring (stages, formats, sensors and so on): found through entry points, loaded when asked for."""
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import importlib
 import importlib.util
@@ -21,7 +22,12 @@ from tacpipe.printable import plain
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
 EXPORTS = "tacpipe.exports"
 REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, SENSORS)
+EXECUTORS = "tacpipe.executors"
+DEMOS = "tacpipe.demos"  # by the name of a task: what `tacpipe demo` runs of it
+COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
+OWN = "tacpipe"  # the name of its own entry point there
+TRACKERS = "tacpipe.trackers"
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
@@ -69,6 +75,23 @@ def stages() -> dict[str, str]:
     return dict(sorted({**found[STAGES], **formats, **exports}.items()))
 
 
+def commands() -> dict[str, str]:
+    """Return the summary of each command that is a stage or a group of stages, in the order of help.
+
+    A plug-in's entry point in the group ``tacpipe.commands`` is a dict of names in their order, each with the line of a
+    group, or "" where the stage has its own. tacpipe's own come first, names that are in none last, in alphabetical order.
+    """
+    first: dict[str, str] = {}
+    for name in reversed(stages()):
+        first[name.partition(".")[0]] = name
+    lines: dict[str, str] = {}
+    for name, target in sorted(entry_points()[COMMANDS].items(), key=lambda item: (item[0] != OWN, item[0])):
+        with contextlib.suppress(TacpipeError):  # one that cannot be loaded spoils its own order alone
+            lines = {**lines, **_import(name, target)}
+    names = [*(name for name in lines if name in first), *sorted(set(first) - set(lines))]
+    return {name: lines.get(name) or summary(first[name]) for name in names}
+
+
 def whole(name: str) -> str:
     """Return the name of the stage that a fit or a part belongs to, or the name of a stage itself.
 
@@ -92,11 +115,16 @@ def load(name: str) -> AnyStage:
     return found
 
 
+def tasks() -> list[str]:
+    """Return the names of all tasks."""
+    return sorted(entry_points()[TASKS])
+
+
 def load_task(name: str) -> Any:
     """Return the module of the task of this name."""
     target = entry_points()[TASKS].get(str(name))
     if target is None:
-        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(sorted(entry_points()[TASKS]))}.")
+        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(tasks())}.")
     return _import(name, target)
 
 
@@ -108,6 +136,14 @@ def load_report(task: str) -> Any:
     """
     target = entry_points()[REPORTS].get(task)
     return None if target is None else _import(task, target)
+
+
+def demos() -> dict[str, Any]:
+    """Return of each task that brings one the function that describes its part of `tacpipe demo`, by name.
+
+    Called with the folder to write to, it returns a `tacpipe.tasks.demonstration.Demo`.
+    """
+    return {name: _import(name, target) for name, target in sorted(entry_points()[DEMOS].items())}
 
 
 def sensors() -> dict[str, str]:
@@ -123,6 +159,34 @@ def load_sensor(name: str) -> Any:
     target = sensors().get(name)
     if target is None:
         raise UsageError(f"There is no sensor {plain(name)}; there are {', '.join(sensors())}.")
+    return _import(name, target)
+
+
+def load_executor(name: str) -> Any:
+    """Return the function that connects to the executor of this name (`tacpipe.engine.executors.executor.Executor`).
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = entry_points()[EXECUTORS].get(name)
+    if target is None:
+        names = ", ".join(sorted(entry_points()[EXECUTORS]))
+        raise UsageError(f"There is no executor {plain(name)}; there are {names}.")
+    return _import(name, target)
+
+
+def trackers() -> dict[str, str]:
+    """Return the target of every tracker by name."""
+    return dict(sorted(entry_points()[TRACKERS].items()))
+
+
+def load_tracker(name: str) -> Any:
+    """Return what makes the tracker of this name, a `tacpipe.trackers.tracker.Tracker`, from the place to write to.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = trackers().get(name)
+    if target is None:
+        raise UsageError(f"There is no tracker {plain(name)}; there are {', '.join(trackers())}.")
     return _import(name, target)
 
 
@@ -154,8 +218,13 @@ def _package(target: str) -> str | None:
     """Return the name of the installed package whose entry point ``target`` is, if it is known."""
     from importlib.metadata import entry_points as every
 
-    found = (point for group in GROUPS for point in every(group=group))
-    return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
+    found = (point.dist for group in GROUPS for point in every(group=group) if point.value == target)
+    try:
+        return next((one.name for one in found if one is not None), None)
+    except (
+        FileNotFoundError
+    ):  # `importlib_metadata`, which takes over where it was imported, wants metadata to be there
+        return None
 
 
 def summary(name: str) -> str:

@@ -185,6 +185,12 @@ class Stage(Generic[P, R]):
         """Whether the stage distinguishes training recordings from others."""
         return self.fit is not None or any(name in ROLES for name in self.arguments)
 
+    @property
+    def tracked(self) -> bool:
+        """Whether trackers can follow the stage: it trains in a workspace, or its result has headlines."""
+        trains = any(one is not None and one.argument("Workspace") is not None for one in (self, self.fit))
+        return trains or self.headline is not None
+
 
 AnyStage: TypeAlias = Stage[..., Any]
 

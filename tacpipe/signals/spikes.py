@@ -21,8 +21,8 @@ def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tupl
     ``rows`` (odd) around it, which takes its place; with one row there are none. Signals are
     mirrored at their ends. Types stay as they are.
 
-    >>> found, mended = hampel(np.array([[3], [4], [900], [4], [5]]), rows=5, deviations=5.0, floor=100.0)
-    >>> found.ravel().tolist(), mended.ravel().tolist()
+    >>> found, repaired = hampel(np.array([[3], [4], [900], [4], [5]]), rows=5, deviations=5.0, floor=100.0)
+    >>> found.ravel().tolist(), repaired.ravel().tolist()
     ([False, False, True, False, False], [3, 4, 4, 4, 5])
     """
     found = np.zeros(values.shape, dtype=bool)

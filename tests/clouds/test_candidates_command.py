@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import open3d
@@ -17,12 +19,13 @@ from tacpipe.cli import candidates as candidates_command
 from tacpipe.clouds.candidates import candidates
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.tasks.touch.task import predict_grasp
 from tests.clouds import shapes
 from tests.conftest import Lab
 
 
 class Model:
-    """Foretells what can be told from the opening by hand."""
+    """Predicts what follows from the opening by hand."""
 
     def predict(self, cloud: Cloud, grasp: Grasp) -> SimpleNamespace:
         """Return a touch whose pressure is the opening in millimetres, and whose electrodes are numbered."""
@@ -68,11 +71,11 @@ def test_with_a_model_each_row_has_the_fifty_values_with_their_units(
 ) -> None:
     asked: list[Path] = []
 
-    def load(path: Path) -> Model:
+    def load(path: Path) -> Any:
         asked.append(path)
-        return Model()
+        return partial(predict_grasp, cast(Any, Model()))
 
-    monkeypatch.setattr(candidates_command, "_touch_model", load)
+    monkeypatch.setattr(candidates_command, "_predict_grasp", load)
     value = json.loads(lab.run("candidates bottle.ply --model models/touch --count 3 --json").out)
     assert asked == [Path("models/touch")]
     counts = [name for name, unit in value["units"].items() if unit == "count"]
@@ -86,7 +89,7 @@ def test_with_a_model_each_row_has_the_fifty_values_with_their_units(
 def test_a_terminal_gets_a_table_with_the_mean_of_the_electrodes(
     lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(candidates_command, "_touch_model", lambda path: Model())
+    monkeypatch.setattr(candidates_command, "_predict_grasp", lambda path: partial(predict_grasp, cast(Any, Model())))
     monkeypatch.setattr(candidates_command, "_on_terminal", lambda: True)
     monkeypatch.setenv("COLUMNS", "160")
     printed = lab.run("candidates bottle.ply --model models/touch --count 2").out.splitlines()

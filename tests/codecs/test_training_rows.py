@@ -7,7 +7,8 @@ import pytest
 
 from tacpipe.codecs import training_rows
 from tacpipe.codecs.training_rows import TrainingRows
-from tests.stages.learning_fakes import CHANNELS, FakeShard, motion, table
+from tests.fake_recordings import FakeShard
+from tests.stages.learning_fakes import CHANNELS, motion, table
 
 
 def read(*shards: FakeShard, representation: str = "levels", frames: int = 1) -> TrainingRows:

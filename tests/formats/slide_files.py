@@ -43,7 +43,7 @@ def write_biotac(folder: Path, material: int = 3, trial: int = 7, rows: int = 6,
     return path
 
 
-def felt(slides: int = 3, frames: int = 75, seed: int = 0) -> np.ndarray:
+def touched(slides: int = 3, frames: int = 75, seed: int = 0) -> np.ndarray:
     """Return slides that touch some taxels of some triangles, (slide, triangle, taxel, time), from 0 to 200."""
     rng = np.random.default_rng(seed)
     level = rng.uniform(0, 160, (slides, 6, 10, 1)) * (rng.random((slides, 6, 10, 1)) < 0.5)

@@ -225,7 +225,7 @@ FORMATS = {  # format: file of each kind that it reads, and how it is made
 def published(name: str, folder: Path) -> None:
     """Write recordings of a format, all of them good."""
     if name == "roboskin":
-        slide_files.write_roboskin(folder, slide_files.felt(2))
+        slide_files.write_roboskin(folder, slide_files.touched(2))
     elif name == "biotac-slide":
         slide_files.write_biotac(folder)
         slide_files.write_biotac(folder, trial=8)

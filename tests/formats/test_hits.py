@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.formats.slide_files import felt, write_roboskin
+from tests.formats.slide_files import touched, write_roboskin
 from tests.test_imports import HEAVY, imported
 
 
@@ -15,7 +15,7 @@ def test_a_hit_of_an_ingest_imports_nothing_heavy(tmp_path: Path, flat_trial: Ca
 
 
 def test_a_hit_of_many_slides_in_one_file_imports_nothing_heavy_either(tmp_path: Path) -> None:
-    write_roboskin(tmp_path / "published", felt(2))
+    write_roboskin(tmp_path / "published", touched(2))
     words = "ingest roboskin published -o data/recordings"
     assert "pyarrow" in imported(tmp_path, words)
     assert imported(tmp_path, words) & HEAVY == set()

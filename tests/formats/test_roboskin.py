@@ -13,7 +13,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats.roboskin import Params, discover, roboskin
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.signals.scrambling import scramble, unscramble
-from tests.formats.slide_files import felt, write_roboskin
+from tests.formats.slide_files import touched, write_roboskin
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
@@ -30,7 +30,7 @@ def values(recording: RecordingOutput) -> np.ndarray:
 
 
 def test_slides_come_out_as_they_were_felt_though_they_are_published_scrambled(tmp_path: Path) -> None:
-    slides = felt()
+    slides = touched()
     write_roboskin(tmp_path, slides)
     found = read(tmp_path)
     assert list(found) == ["roboskin-fold0-000", "roboskin-fold0-001", "roboskin-fold0-002"]
@@ -44,14 +44,14 @@ def test_slides_come_out_as_they_were_felt_though_they_are_published_scrambled(t
 
 
 def test_a_block_that_is_right_already_is_taken_as_it_is(tmp_path: Path) -> None:
-    slides = felt()
+    slides = touched()
     np.save(write_roboskin(tmp_path, slides), slides)
     for recording, slide in zip(read(tmp_path).values(), slides, strict=True):
         np.testing.assert_array_equal(values(recording), slide)
 
 
 def test_the_authors_layout_is_the_published_one_whichever_way_the_block_lies(tmp_path: Path) -> None:
-    slides = felt()
+    slides = touched()
     path = write_roboskin(tmp_path, slides)
     for given in (scramble(slides), slides):
         np.save(path, given)
@@ -61,7 +61,7 @@ def test_the_authors_layout_is_the_published_one_whichever_way_the_block_lies(tm
 
 
 def test_a_slide_that_touched_nothing_is_arranged_as_its_block(tmp_path: Path) -> None:
-    slides = felt()
+    slides = touched()
     slides[1] = 0
     slides[1, 3, 4, 40] = 9.0  # one reading says nothing about axes
     write_roboskin(tmp_path, slides)
@@ -76,7 +76,7 @@ def test_an_array_without_a_time_axis_is_refused(tmp_path: Path) -> None:
 
 
 def test_stamps_are_made_from_the_nominal_rate_and_say_so(tmp_path: Path) -> None:
-    write_roboskin(tmp_path, felt(1))
+    write_roboskin(tmp_path, touched(1))
     table = read(tmp_path, Params(rate_hz=25.0))["roboskin-fold0-000"].streams["roboskin"]
     assert table.column("t_ns").to_pylist() == [40_000_000 * frame for frame in range(75)]
     assert table.schema.field("t_ns").metadata[b"made"] == b"from nominal rate"
@@ -91,7 +91,7 @@ def test_stamps_are_made_from_the_nominal_rate_and_say_so(tmp_path: Path) -> Non
     ],
 )
 def test_the_block_tells_the_authors_part(tmp_path: Path, name: str, recording: str, part: dict[str, object]) -> None:
-    write_roboskin(tmp_path, felt(1), name, np.array([[6]]))
+    write_roboskin(tmp_path, touched(1), name, np.array([[6]]))
     assert read(tmp_path)[recording].attributes == {
         "sensor": "roboskin",
         "material": 7,
@@ -121,7 +121,7 @@ def test_the_block_tells_the_authors_part(tmp_path: Path, name: str, recording: 
 )
 def test_a_block_that_holds_no_slides_is_refused(tmp_path: Path, change: object, message: str) -> None:
     assert callable(change)
-    path = write_roboskin(tmp_path, felt(1))
+    path = write_roboskin(tmp_path, touched(1))
     np.save(path, change(np.load(path)))
     with pytest.raises(TacpipeError, match=message):
         read(tmp_path)
@@ -139,7 +139,7 @@ def test_a_block_that_holds_no_slides_is_refused(tmp_path: Path, change: object,
     ],
 )
 def test_labels_that_are_none_are_refused(tmp_path: Path, labels: np.ndarray, message: str) -> None:
-    write_roboskin(tmp_path, felt(1), labels=labels)
+    write_roboskin(tmp_path, touched(1), labels=labels)
     with pytest.raises(TacpipeError, match=message):
         read(tmp_path)
 
@@ -147,10 +147,10 @@ def test_labels_that_are_none_are_refused(tmp_path: Path, labels: np.ndarray, me
 def test_files_that_are_missing_doubled_or_damaged_are_told(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="holds no block of slides"):
         discover(Params(), tmp_path)
-    path = write_roboskin(tmp_path, felt(1))
+    path = write_roboskin(tmp_path, touched(1))
     with pytest.raises(TacpipeError, match="is not a folder"):
         discover(Params(), path)
-    np.save(tmp_path / "icub_val_0.npy", felt(1))
+    np.save(tmp_path / "icub_val_0.npy", touched(1))
     with pytest.raises(TacpipeError, match="are the same block"):
         discover(Params(), tmp_path)
     (tmp_path / "icub_val_0.npy").unlink()
@@ -158,7 +158,7 @@ def test_files_that_are_missing_doubled_or_damaged_are_told(tmp_path: Path) -> N
     with pytest.raises(TacpipeError, match=r"labels_fold_0\.npy"):
         discover(Params(), tmp_path)
     whole = path.read_bytes()
-    write_roboskin(tmp_path, felt(1))
+    write_roboskin(tmp_path, touched(1))
     path.write_bytes(whole[:2000])
     with pytest.raises(TacpipeError, match="cannot be read as an array of numbers"):
         read(tmp_path)
@@ -168,9 +168,9 @@ def test_files_that_are_missing_doubled_or_damaged_are_told(tmp_path: Path) -> N
 
 
 def test_blocks_are_found_at_any_depth_and_copies_below_them_are_passed_over(tmp_path: Path) -> None:
-    path = write_roboskin(tmp_path / "set" / "arrays", felt(1))
-    write_roboskin(tmp_path / "set" / "arrays" / "copies", felt(2))
-    np.save(path.with_name("icub_test_4.npy"), felt(1))
+    path = write_roboskin(tmp_path / "set" / "arrays", touched(1))
+    write_roboskin(tmp_path / "set" / "arrays" / "copies", touched(2))
+    np.save(path.with_name("icub_test_4.npy"), touched(1))
     found = discover(Params(), tmp_path)
     assert {name: dict(files) for name, files in found.items()} == {
         "roboskin-fold0-000": {"icub_fold_0.npy[0]": path, "labels_fold_0.npy[0]": path.with_name("labels_fold_0.npy")}

@@ -75,7 +75,7 @@ def test_an_image_carries_depth_colours_and_how_its_rays_run(place: str) -> None
 def test_a_camera_that_is_unplugged_is_lost() -> None:
     RealSense.images = [RuntimeError("device disconnected")]
     link = made("camera:0", Quiet())
-    with pytest.raises(LinkLostError, match="it was unplugged"):
+    with pytest.raises(LinkLostError):
         link.read(1)
     link.close()
 
@@ -89,7 +89,7 @@ def test_a_camera_that_is_gone_can_still_be_closed(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(RealSense, "stop_capture", gone)
     link.close()
-    with pytest.raises(LinkLostError, match="was closed"):
+    with pytest.raises(LinkLostError):
         link.read(0)
 
 

@@ -91,7 +91,7 @@ def test_the_trend_is_that_of_the_phi_and_lag_that_err_least_of_all_in_the_grid(
     np.testing.assert_allclose(fitted.predict(*windows[:2])["damped_trend"], trend(phi, lag), atol=0.01)
 
 
-def test_a_trend_that_is_damped_by_0_6_a_step_is_foretold_exactly() -> None:
+def test_a_trend_that_is_damped_by_0_6_a_step_is_predicted_exactly() -> None:
     steps = np.outer(0.6 ** np.arange(CONTEXT + HORIZON), [200.0, -100.0, 50.0])
     values = 1000 + np.cumsum(np.stack([steps, -2 * steps, 3 * steps]), axis=1)
     windows = values[:, :CONTEXT], np.zeros((3, CONTEXT + HORIZON, STATES)), values[:, CONTEXT:]
@@ -120,13 +120,13 @@ def test_the_last_value_map_is_least_squares_over_the_windows_of_all_channels(fi
         np.testing.assert_allclose(fitted.predict(*other[:2])["last_value_linear"][:, :, channel], expected, atol=0.01)
 
 
-def test_the_mean_is_that_of_what_was_to_be_foretold_in_training(fitted: Baselines) -> None:
+def test_the_mean_is_that_of_what_was_to_be_predicted_in_training(fitted: Baselines) -> None:
     found = fitted.predict(*walk(2)[:2])["train_mean"]
     np.testing.assert_allclose(found[7, 3], walk(1)[2].astype(np.float64).mean(axis=(0, 1)), rtol=1e-6)
     assert (found == found[0, 0]).all()
 
 
-def test_a_load_that_the_plan_decides_is_foretold_only_with_the_plan() -> None:
+def test_a_load_that_the_plan_decides_is_predicted_only_with_the_plan() -> None:
     def held_mass(seed: int) -> Windows:
         """A mass of 2 kg at 300 counts a newton, whose acceleration is white: its past says nothing of its future."""
         acceleration = np.random.default_rng(seed).normal(size=(600, 1))

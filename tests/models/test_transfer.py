@@ -14,7 +14,7 @@ WIDE, CLASSES = 5, 10
 MEANS = 2 * np.random.default_rng(0).normal(size=(CLASSES, WIDE))
 
 
-def told(
+def sided(
     classes: object, each: int, gain: float = 1.0, offset: float = 0.0, noise: float = 0.3, seed: int = 1
 ) -> Labelled:
     """Slides of some classes, as a sensor with this gain and offset in every feature feels them."""
@@ -29,15 +29,15 @@ def named(of: Transfer, gaussians: Gaussians, slides: Labelled) -> float:
 
 
 def test_classes_that_only_another_sensor_was_told_are_named() -> None:
-    found = Transfer.fit(told(range(6), 8, 0.5, 3.0), [told(range(CLASSES), 8, seed=2)])
-    new = told(range(6, CLASSES), 30, 0.5, 3.0, seed=3)
+    found = Transfer.fit(sided(range(6), 8, 0.5, 3.0), [sided(range(CLASSES), 8, seed=2)])
+    new = sided(range(6, CLASSES), 30, 0.5, 3.0, seed=3)
     assert named(found, found.known, new) > 0.9
     assert named(found, found.expected, new) > 0.9
-    assert named(found, found.known, told(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
+    assert named(found, found.known, sided(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
 
 
 def test_what_is_expected_is_the_other_sensors_mean_by_gain_and_offset() -> None:
-    own, other = told(range(6), 400, -0.5, 3.0, 0.05), told(range(CLASSES), 400, noise=0.05, seed=2)
+    own, other = sided(range(6), 400, -0.5, 3.0, 0.05), sided(range(CLASSES), 400, noise=0.05, seed=2)
     found = Transfer.fit(own, [other])
     np.testing.assert_allclose(found.known.mean[6:], 3 - 0.5 * MEANS[6:], atol=0.05)
     np.testing.assert_allclose(found.expected.mean, 3 - 0.5 * MEANS, atol=0.05)
@@ -45,7 +45,7 @@ def test_what_is_expected_is_the_other_sensors_mean_by_gain_and_offset() -> None
 
 def test_sensors_that_have_nothing_in_common_expect_nothing_of_one_another() -> None:
     strange = np.random.default_rng(7).normal(size=(CLASSES, WIDE))
-    other = told(range(CLASSES), 8, seed=2)
+    other = sided(range(CLASSES), 8, seed=2)
     right = []
     for seed in range(20):
         shuffled = np.random.default_rng(seed).permutation(strange)
@@ -57,7 +57,7 @@ def test_sensors_that_have_nothing_in_common_expect_nothing_of_one_another() -> 
 
 
 def test_a_few_slides_correct_what_is_expected_by_the_rule_of_bayes() -> None:
-    own, other = told(np.r_[np.repeat(range(5), 6), 5, 5], 1, 0.5, 1.0), told(range(CLASSES), 8, seed=2)
+    own, other = sided(np.r_[np.repeat(range(5), 6), 5, 5], 1, 0.5, 1.0), sided(range(CLASSES), 8, seed=2)
     found = Transfer.fit(own, [other])
     number = 4  # a class of six slides
     left = own.features - np.stack([own.features[own.labels == one].mean(axis=0) for one in own.labels])
@@ -75,20 +75,20 @@ def test_a_few_slides_correct_what_is_expected_by_the_rule_of_bayes() -> None:
 
 
 def test_many_slides_of_its_own_outweigh_what_others_expect() -> None:
-    wrong = told(range(CLASSES), 8, seed=2)
+    wrong = sided(range(CLASSES), 8, seed=2)
     wrong = Labelled(np.random.default_rng(3).permutation(wrong.features), wrong.labels)
-    own = told(range(CLASSES), 500)
+    own = sided(range(CLASSES), 500)
     found = Transfer.fit(own, [wrong])
     means = np.stack([own.features[own.labels == one].mean(axis=0) for one in range(CLASSES)])
     np.testing.assert_allclose(found.known.mean, means, atol=0.01)
 
 
 def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
-    new = told(range(CLASSES), 40, 0.5, 3.0, 1.0, seed=3)
+    new = sided(range(CLASSES), 40, 0.5, 3.0, 1.0, seed=3)
     with_other, alone = [], []
     for seed in range(5):
-        own = told(range(CLASSES), 2, 0.5, 3.0, 1.0, seed=10 + seed)
-        found = Transfer.fit(own, [told(range(CLASSES), 50, noise=0.3, seed=2)])
+        own = sided(range(CLASSES), 2, 0.5, 3.0, 1.0, seed=10 + seed)
+        found = Transfer.fit(own, [sided(range(CLASSES), 50, noise=0.3, seed=2)])
         with_other.append(named(found, found.known, new))
         found = Transfer.fit(own)
         alone.append(named(found, found.known, new))
@@ -96,10 +96,10 @@ def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
 
 
 def test_the_more_exact_of_two_sensors_counts_more() -> None:
-    exact, vague = told(range(CLASSES), 20, noise=0.01, seed=2), told(range(CLASSES), 20, seed=3)
+    exact, vague = sided(range(CLASSES), 20, noise=0.01, seed=2), sided(range(CLASSES), 20, seed=3)
     rng = np.random.default_rng(4)
     vague = Labelled(vague.features + rng.normal(size=(CLASSES, WIDE))[vague.labels], vague.labels)
-    own = told(range(6), 20, noise=0.01)
+    own = sided(range(6), 20, noise=0.01)
     errors = {
         name: np.abs(Transfer.fit(own, others).known.mean[6:] - MEANS[6:]).mean()
         for name, others in {"exact": [exact], "vague": [vague], "both": [vague, exact]}.items()
@@ -109,7 +109,10 @@ def test_the_more_exact_of_two_sensors_counts_more() -> None:
 
 
 def test_scores_are_logarithms_of_normal_densities() -> None:
-    found, new = Transfer.fit(told(range(6), 8), [told(range(CLASSES), 8, seed=2)]), told(range(CLASSES), 3, seed=5)
+    found, new = (
+        Transfer.fit(sided(range(6), 8), [sided(range(CLASSES), 8, seed=2)]),
+        sided(range(CLASSES), 3, seed=5),
+    )
     expected = np.array(
         [
             multivariate_normal(mean, cov + STEADY * np.trace(cov) / WIDE * np.eye(WIDE)).logpdf(new.features)
@@ -120,15 +123,15 @@ def test_scores_are_logarithms_of_normal_densities() -> None:
 
 
 def test_nothing_is_expected_of_classes_that_no_other_sensor_knows() -> None:
-    found = Transfer.fit(told(range(CLASSES), 8), [told(range(7), 8, seed=2)])
+    found = Transfer.fit(sided(range(CLASSES), 8), [sided(range(7), 8, seed=2)])
     scores = found.expected.scores(MEANS)
     assert np.isfinite(scores[:, :7]).all()
     assert np.isneginf(scores[:, 7:]).all()
-    assert named(found, found.known, told(range(CLASSES), 20, seed=3)) > 0.95
+    assert named(found, found.known, sided(range(CLASSES), 20, seed=3)) > 0.95
 
 
 def test_tensors_hold_everything() -> None:
-    found = Transfer.fit(told(range(6), 8), [told(range(CLASSES), 8, seed=2)])
+    found = Transfer.fit(sided(range(6), 8), [sided(range(CLASSES), 8, seed=2)])
     again = Transfer.from_tensors(found.to_tensors())
     for one, other in ((found.known, again.known), (found.expected, again.expected)):
         assert np.array_equal(one.scores(MEANS), other.scores(MEANS))
@@ -137,12 +140,12 @@ def test_tensors_hold_everything() -> None:
 
 def test_slides_that_teach_nothing_are_refused() -> None:
     with pytest.raises(TacpipeError, match=" 2 classes in common; 3 "):
-        Transfer.fit(told(range(4), 4), [told(range(2, 8), 4)])
+        Transfer.fit(sided(range(4), 4), [sided(range(2, 8), 4)])
     with pytest.raises(TacpipeError, match="8 slides of 1 classes do not show"):
-        Transfer.fit(told([3], 8))
+        Transfer.fit(sided([3], 8))
     with pytest.raises(TacpipeError, match="4 slides of 4 classes do not show"):
-        Transfer.fit(told(range(4), 1))
+        Transfer.fit(sided(range(4), 1))
     with pytest.raises(TacpipeError, match=r"must be \(slide, 5\) and \(slide,\)"):
-        Transfer.fit(told(range(4), 4), [Labelled(np.zeros((4, 3)), np.arange(4))])
+        Transfer.fit(sided(range(4), 4), [Labelled(np.zeros((4, 3)), np.arange(4))])
     with pytest.raises(TacpipeError, match="not finite"):
         Transfer.fit(Labelled(np.full((8, WIDE), np.nan), np.arange(8) % 4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,13 @@ def test_every_folder_with_modules_is_a_package() -> None:
     folders = {path.parent for top in ("tacpipe", "stages") for path in (ROOT / top).rglob("*.py")}
 
     assert [folder for folder in folders if not (folder / "__init__.py").is_file()] == []
+
+
+def test_the_page_on_installation_has_a_row_for_every_extra(settings: dict[str, Any]) -> None:
+    page = (ROOT / "docs/install.md").read_text()
+    rows = set(re.findall(r"^\| `pip install '\.\[(\w+)\]'` \|", page, re.MULTILINE))
+
+    assert rows == set(settings["project"]["optional-dependencies"]) - set(environments.NOT_FOR_USERS)
 
 
 def test_every_extra_for_users_is_tried_in_an_environment_of_its_own(settings: dict[str, Any]) -> None:

@@ -207,7 +207,7 @@ def _publish(name: str, place: Path) -> None:
     if name == "biotac-slide":
         slide_files.write_biotac(place, arm=False)
     elif name == "roboskin":
-        slide_files.write_roboskin(place, slide_files.felt(2))
+        slide_files.write_roboskin(place, slide_files.touched(2))
     elif name == "vision2tactile":
         grasp_files.write_grasp(place)
     elif name == "table":

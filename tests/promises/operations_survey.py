@@ -39,15 +39,15 @@ class Survey:
         self._number += 1
         if call.changes and (self._number - 1) % self._every == 0:
             self.kills[self._number] = self.disk.killed()
-            self.left.append(Left(self.kills[self._number], f"a kill before {self._told(call)}", "killed"))
-            self._lose(f"before {self._told(call)}", "dark")
+            self.left.append(Left(self.kills[self._number], f"a kill before {self._described(call)}", "killed"))
+            self._lose(f"before {self._described(call)}", "dark")
 
     def after(self, call: Call) -> None:
         self.disk.made(call.name, call.path, call.source)
         if call.name == "write" and (self._number - 1) % self._every == 0:
             torn = self.disk.torn(call.path)
             if torn is not None:
-                self.left.append(Left(torn, f"a kill amid {self._told(call)}", "killed"))
+                self.left.append(Left(torn, f"a kill amid {self._described(call)}", "killed"))
 
     def end(self) -> None:
         """Note what a loss of power leaves of a command that has ended."""
@@ -57,7 +57,7 @@ class Survey:
         for seed in range(POWERS):
             self.left.append(Left(self.disk.lost(seed), f"loss of power ({seed}) {when}", ended))
 
-    def _told(self, call: Call) -> str:
+    def _described(self, call: Call) -> str:
         return f"call {self._number}, {call.name} {call.path.removeprefix(f'{self.disk.root}/')}"
 
 

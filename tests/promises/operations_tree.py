@@ -35,7 +35,7 @@ class State:
     files: Mapping[str, File]
     folders: frozenset[str]
 
-    def told(self, before: State) -> str:
+    def described(self, before: State) -> str:
         """Return a digest of how this differs from ``before``, apart from what differs between any two runs."""
         told: list[list[str]] = [["folder", path] for path in self.folders ^ before.folders]
         for path in {*self.files, *before.files}:

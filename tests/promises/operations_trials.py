@@ -112,7 +112,7 @@ class Trials:
         self.tried.calls = len(shim.calls)
         self._die(survey)
         for left in survey.left:
-            self._judge(left, [])
+            self._evaluate(left, [])
         for number in range(1, len(shim.calls) + 1, every):
             for fault in shim.calls[number - 1].errors:
                 self._fail(number, shim.calls[number - 1], fault)
@@ -127,7 +127,7 @@ class Trials:
         met = shim.calls[number - 1] if len(shim.calls) >= number else Call("none", "")
         assert met.name == wanted.name, f"call {number} is {met} now, and was {wanted}"
         told = f"{fault} at call {number}, {met.name} {met.path.removeprefix(f'{self.lab}/')}"
-        self._judge(Left(self.place.look(), told, "failed" if ran.code else "done"), _wrong(ran))
+        self._evaluate(Left(self.place.look(), told, "failed" if ran.code else "done"), _wrong(ran))
 
     def _die(self, survey: Survey) -> None:
         """Kill the command in earnest at some calls, and see that this leaves what the survey says."""
@@ -141,12 +141,12 @@ class Trials:
                 os._exit(0)
             _, status = os.waitpid(child, 0)
             assert os.WIFSIGNALED(status), f"call {number} was not reached"
-            told = [state.told(self.place.before) for state in (self.place.look(), survey.kills[number])]
+            told = [state.described(self.place.before) for state in (self.place.look(), survey.kills[number])]
             assert told[0] == told[1], f"a kill at call {number} leaves something else than the calls before it made"
 
-    def _judge(self, left: Left, problems: list[str]) -> None:
+    def _evaluate(self, left: Left, problems: list[str]) -> None:
         self.tried.failed += 1
-        key = left.state.told(self.place.before), left.ended
+        key = left.state.described(self.place.before), left.ended
         if key not in self._proven:
             self._proven[key] = self._disproved(left)
         self.tried.problems += [f"{left.fault}: {problem}" for problem in [*problems, *self._proven[key]]]

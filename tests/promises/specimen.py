@@ -89,7 +89,7 @@ class Specimen:
     def expected(self, dataset: str) -> Contents:
         """Return what a dataset held."""
         paths = [path for path, _ in self.manifests[dataset].objects()]
-        return {path: told(self.sound[f"{dataset}/{path}"], path) for path in paths}
+        return {path: stated(self.sound[f"{dataset}/{path}"], path) for path in paths}
 
     def rerun(self) -> list[Ran]:
         """Run the chain again, whatever its commands say."""
@@ -129,7 +129,7 @@ def held(path: Path) -> Contents:
     return {**found, **dict(dataset.files)}
 
 
-def told(content: bytes, path: str) -> Any:
+def stated(content: bytes, path: str) -> Any:
     """Return what a file of a dataset says, read by other means."""
     return bits(pq.read_table(pa.BufferReader(owned(content)))) if path.endswith(".parquet") else content
 

@@ -244,7 +244,7 @@ def _biotac(folder: Path) -> None:
 
 
 def _roboskin(folder: Path) -> None:
-    slide_files.write_roboskin(folder, slide_files.felt(1, 20))
+    slide_files.write_roboskin(folder, slide_files.touched(1, 20))
 
 
 def _grasps(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""A dataset from a stranger: whatever its manifest names, nothing outside of it is read, made, changed or removed."""
+"""A dataset from an untrusted source: whatever its manifest names, nothing outside of it is read, changed or removed."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_very_many_recordings_are_read_or_refused_within_bounds() -> None:
 
 
 class Place:
-    """A project with a stranger's dataset in it, and a victim outside of both."""
+    """A project with an untrusted dataset in it, and a victim outside of both."""
 
     def __init__(self, lab: Lab) -> None:
         self.lab, self.victim = lab, lab.folder / "victim"

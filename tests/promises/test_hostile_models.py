@@ -1,4 +1,4 @@
-"""A model or codec from a stranger: JSON and safetensors are looked at first, and nothing else is opened."""
+"""A model or codec from an untrusted source: JSON and safetensors are looked at first, and nothing else is opened."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from tacpipe.tasks.material import task as material
 from tacpipe.tasks.touch import task as touch
 from tests import chain
 from tests.conftest import tacpipe as ran
+from tests.fake_recordings import FakeDataset
 from tests.promises.counts import count
 from tests.promises.limits import GIB, bounded, is_sentence, some
 from tests.promises.mutations import mutated
-from tests.stages.learning_fakes import FakeDataset
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade
@@ -70,7 +70,7 @@ def loaded(kind: str, files: Mapping[str, bytes]) -> Any:
     return TASKS[kind.partition(" ")[0]].load(files)
 
 
-def judged(kind: str, files: Mapping[str, bytes]) -> Any:
+def evaluated(kind: str, files: Mapping[str, bytes]) -> Any:
     """Evaluate a model on a recording that fits it."""
     task = kind.partition(" ")[0]
     if task == "forward":
@@ -147,7 +147,7 @@ VALUES: tuple[Any, ...] = (
 def test_a_model_that_nobody_changed_is_loaded_and_judged(kind: str) -> None:
     with bounded(2 * SMALL):
         assert loaded(kind, made(kind)) is not None
-        assert "metrics.json" in judged(kind, made(kind)).files
+        assert "metrics.json" in evaluated(kind, made(kind)).files
 
 
 def try_config(kind: str, name: str, share: float) -> None:
@@ -164,7 +164,7 @@ def try_config(kind: str, name: str, share: float) -> None:
                 tried += 1
                 try:
                     with np.errstate(all="ignore"):
-                        judged(kind, files)
+                        evaluated(kind, files)
                 except TacpipeError as error:
                     assert is_sentence(str(error)), str(error)
     count("hostile inputs refused", tried)
@@ -247,7 +247,7 @@ def test_weights_of_other_shapes_are_refused(kind: str, how: str) -> None:
                 else one[..., :-1],
             }[how].contiguous()
 
-    refused(lambda: judged(kind, weights(made(kind), spoil)))
+    refused(lambda: evaluated(kind, weights(made(kind), spoil)))
 
 
 def safetensors(header: Any, body: bytes = b"", length: int | None = None) -> bytes:
@@ -298,7 +298,7 @@ def test_files_of_a_model_changed_in_hundreds_of_ways_give_a_sentence_or_a_resul
             name = random.choice(list(files))
             try:
                 with np.errstate(all="ignore"):
-                    judged(kind, files | {name: mutated(files[name], list(files.values()), random)})
+                    evaluated(kind, files | {name: mutated(files[name], list(files.values()), random)})
             except TacpipeError as error:
                 assert is_sentence(str(error)), str(error)
     count("inputs fuzzed", 150)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.report import drawing, page
-from tests.fake_recordings import FakeRecording
+from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 from tests.promises.counts import count
 from tests.promises.limits import some
 from tests.report import elements
@@ -22,7 +22,6 @@ from tests.report.forward import result_fakes
 from tests.report.material import material_fakes
 from tests.report.test_page import other
 from tests.report.touch import touch_fakes
-from tests.stages.learning_fakes import FakeDataset, FakeShard
 
 HOSTILE = "\"'><script>alert('x')</script><img src=x onerror=alert(1)>&lt;svg onload=alert(2)> $\\frac{$ </style></svg>"
 Words = Mapping[str, str]

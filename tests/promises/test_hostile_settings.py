@@ -231,7 +231,7 @@ def test_what_aliases_stand_for_is_counted_by_what_they_name() -> None:
         yaml_text.load(few + "b: [" + ", ".join(["*a"] * 110) + "]")
 
 
-def test_a_sentence_stays_one_line_whatever_a_stranger_wrote_in_it() -> None:
+def test_a_sentence_stays_one_line_whatever_untrusted_text_is_in_it() -> None:
     assert str(UsageError("There is no sensor xela; there are a, b.")) == "There is no sensor xela; there are a, b."
     told = str(UsageError(f"The sensor {'x' * 10_000} says \x1b[2J and \udcff."))
     assert is_sentence(told) and told.endswith(r"says \x1b[2J and \udcff.") and len(told) < 300

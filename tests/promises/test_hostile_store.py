@@ -1,4 +1,4 @@
-"""A store that a stranger filled: no command waits for what lies in it, runs out of memory, or reads a file elsewhere."""
+"""A store of untrusted content: no command waits for what lies in it, runs out of memory, or reads a file elsewhere."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_push_replaces_what_lies_in_the_place_of_an_object(lab: Lab, remote: S
     with bounded(GIB):
         lab.run(f"store push {remote.root} data/r")
     assert file.is_file() and not file.is_symlink() and file.read_bytes() == content
-    assert b"A store that a stranger filled" in Path(__file__).read_bytes()
+    assert b"A store of untrusted content" in Path(__file__).read_bytes()
     count("hostile inputs refused")
 
 
@@ -99,13 +99,13 @@ def test_a_shard_beside_a_manifest_is_adopted_only_where_it_is_a_file_of_its_siz
 ) -> None:
     lab.run("simulate toy -o data/q --trials 1 --rows 3")
     lab.run("scale data/q -o data/r")
-    stranger = lab.folder / "stranger"
-    shutil.copytree(lab.folder / "data/r", stranger)
-    (stranger / "trial-000.parquet").unlink()
-    ATTACKS[attack](stranger / "trial-000.parquet")
+    untrusted = lab.folder / "untrusted"
+    shutil.copytree(lab.folder / "data/r", untrusted)
+    (untrusted / "trial-000.parquet").unlink()
+    ATTACKS[attack](untrusted / "trial-000.parquet")
     monkeypatch.setenv("TACPIPE_STORE", str(lab.folder / "empty"))
     with bounded(GIB), pytest.raises(DamagedError) as error:
-        tacpipe.open(stranger).to_numpy()
+        tacpipe.open(untrusted).to_numpy()
     assert is_sentence(str(error.value))
     count("hostile inputs refused")
 

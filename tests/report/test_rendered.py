@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from tacpipe.report import page
+from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import browser
 from tests.report.browser import Browser
 from tests.report.forward import result_fakes
 from tests.report.material import material_fakes
 from tests.report.test_page import other
 from tests.report.touch import touch_fakes
-from tests.stages.learning_fakes import FakeDataset, FakeShard
 
 INSPECTION = (Path(__file__).parent / "inspection.js").read_text()
 WIDTHS = (1280, 400)

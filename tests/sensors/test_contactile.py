@@ -14,7 +14,7 @@ from tacpipe.sensors import pts
 from tacpipe.sensors.contactile import Contactile
 from tacpipe.sensors.framing import Chunks, Run
 from tacpipe.sensors.sensor import Samples
-from tests.sensors import made, told
+from tests.sensors import described, made
 
 ONE = Contactile(sensors=1, pillars=1)
 BY_HAND = bytes.fromhex(
@@ -220,10 +220,10 @@ def test_a_short_recording_is_given_out_at_its_end() -> None:
 
 def test_the_device_takes_the_rate_of_the_opening() -> None:
     device = Contactile(rate_hz=250).device()
-    assert told.hold(Contactile(rate_hz=250).opening({}), device) == [b"f250\n", b"s\n"]
+    assert described.hold(Contactile(rate_hz=250).opening({}), device) == [b"f250\n", b"s\n"]
     assert device.rate_hz == 250 and device.streaming
-    assert told.hold(Contactile(slip=True).opening({}), device)[1] == b"S\n"
-    assert told.hold(Contactile().taring(), device) == [b"z\n"]
+    assert described.hold(Contactile(slip=True).opening({}), device)[1] == b"S\n"
+    assert described.hold(Contactile().taring(), device) == [b"z\n"]
 
 
 def test_a_rate_that_the_controller_does_not_know_is_refused() -> None:

@@ -16,7 +16,7 @@ from tacpipe.sensors.framing import Run
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.sensors.spacemouse import StateFramer
 from tacpipe.sensors.text_framer import LineFramer, TextFramer
-from tests.sensors import harm, made, told
+from tests.sensors import described, harm, made
 
 KINDS = list(registry.sensors())
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # settings that change a sensor's frames
@@ -222,9 +222,9 @@ def test_the_device_answers_what_the_host_says_and_then_gives_frames(case: str) 
     sensor = rig.make(*CASES[case], case)
     device = sensor.device()
 
-    told.hold(sensor.opening({"port": 50_000}), device)
+    described.hold(sensor.opening({"port": 50_000}), device)
     device.hear(sensor.request())
 
     assert device.streaming or device.polled() > 0
-    told.hold(sensor.taring(), device)
+    described.hold(sensor.taring(), device)
     device.hear(sensor.closing())

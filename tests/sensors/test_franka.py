@@ -109,10 +109,10 @@ def test_the_arms_reply_is_that_of_the_interface_however_the_request_is_cut() ->
 @pytest.mark.parametrize(
     ("reply", "sentence"),
     [
-        (struct.pack("<IIIHHI", 0, 1, 20, 1, 5, 0), "speaks FCI version 5"),
-        (struct.pack("<IIIHHI", 0, 1, 20, 7, 10, 0), "refused the connection with status 7"),
-        (struct.pack("<III", 0, 1, 12), "has 12 bytes"),
-        (b"HTTP/1.1 400 Bad", "Is this the arm's address"),
+        (struct.pack("<IIIHHI", 0, 1, 20, 1, 5, 0), r"FCI.*\b5\b"),
+        (struct.pack("<IIIHHI", 0, 1, 20, 7, 10, 0), r"\b7\b"),
+        (struct.pack("<III", 0, 1, 12), r"\b12\b"),
+        (b"HTTP/1.1 400 Bad", "bytes"),
     ],
 )
 def test_a_robot_that_refuses_or_is_none_is_told_in_a_sentence(reply: bytes, sentence: str) -> None:

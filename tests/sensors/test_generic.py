@@ -284,31 +284,31 @@ N = {"name": "n", "type": "u8"}
         ),
         (
             {"numbers": [V, N], "clock": {"number": "n", "unit": "s"}, "sequence": {"number": "n"}},
-            "the number n has two roles",
+            r"\bn\b",
         ),
         (
             {"numbers": [V, N], "sum": {"kind": "md5", "number": "n"}},
-            "rig, sum: kind is 'md5'; it must be one of sum8, lrc",
+            "sum.*'md5'.*sum8, lrc",
         ),
         (
             {"numbers": [V, N], "sum": {"kind": "sum16", "number": "n"}},
-            "takes 16 bits, and its number n is u8; take u16",
+            r"\b16\b.*\bn\b.*u8.*u16",
         ),
         (
             {"numbers": [N, V], "sum": {"kind": "sum8", "number": "n", "begin": 0, "end": 4}},
-            "among which it stands itself, at byte 1",
+            r"byte 1\b",
         ),
         (
             {"numbers": [N, V], "sum": {"kind": "sum8", "number": "n", "begin": 2, "end": 9}},
-            "2 to 9 .* of a frame of 4; begin must",
+            r"\b2\b.*\b9\b.*\b4\b",
         ),
         (
             {"numbers": [N, V], "length": {"number": "n", "plus": 9}},
-            "length would be -5 for a frame of 4 bytes, of which it",
+            r"length.*-5.*\b4\b",
         ),
-        ({"numbers": [{**V, "count": 4000}]}, "a frame has 8001 bytes; it must be 4096 at most"),
-        ({"numbers": [V], "rate_hz": 0}, "rate_hz is 0; it must be above 0"),
-        ({"numbers": [V], "rate": 1}, "rig: there is no option rate; there are rate_hz, numbers"),
+        ({"numbers": [{**V, "count": 4000}]}, r"\b8001\b.*\b4096\b"),
+        ({"numbers": [V], "rate_hz": 0}, r"rate_hz.*\b0\b"),
+        ({"numbers": [V], "rate": 1}, r"\brate\b.*rate_hz, numbers"),
     ],
 )
 def test_what_cannot_be_is_refused_with_a_sentence(options: Mapping[str, object], sentence: str) -> None:

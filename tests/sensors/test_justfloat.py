@@ -102,12 +102,12 @@ def test_any_other_board_is_told_nothing() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({}, "channels is 0; it must be between 1 and 1000"),
-        ({"names": ("a", "a")}, "'a' cannot name a channel"),
-        ({"names": ("A b",)}, "'A b' cannot name a channel; take small letters"),
-        ({"names": ("a", "b"), "channels": 3}, "2 names for 3 channels; give one a channel"),
-        ({"model": "fulai-3.0", "channels": 3}, "channels of a fulai-3.0 are known"),
-        ({"model": "fulai-9"}, "model is 'fulai-9'; it must be one of any, fulai-3.0"),
+        ({}, r"channels.*\b0\b.*\b1\b.*\b1000\b"),
+        ({"names": ("a", "a")}, "'a'"),
+        ({"names": ("A b",)}, "'A b'"),
+        ({"names": ("a", "b"), "channels": 3}, r"\b2\b.*\b3\b"),
+        ({"model": "fulai-3.0", "channels": 3}, r"channels.*fulai-3\.0"),
+        ({"model": "fulai-9"}, r"model.*'fulai-9'.*any.*fulai-3\.0"),
     ],
 )
 def test_what_cannot_be_is_refused_with_a_sentence(options: dict[str, object], sentence: str) -> None:

@@ -186,11 +186,11 @@ def test_what_is_encoded_is_decoded_to_the_four_digits_of_a_controller(seed: int
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"rate_hz": 100.0}, "rate_hz is 100"),
-        ({"rate_hz": 0.0}, "rate_hz is 0"),
-        ({"outputs": ()}, "outputs are none"),
-        ({"outputs": ("IPOC",)}, "IPOC comes by itself"),
-        ({"outputs": ("Tech.C11.x",)}, "name each element"),
+        ({"rate_hz": 100.0}, r"rate_hz.*\b100\b"),
+        ({"rate_hz": 0.0}, r"rate_hz.*\b0\b"),
+        ({"outputs": ()}, "outputs"),
+        ({"outputs": ("IPOC",)}, "IPOC"),
+        ({"outputs": ("Tech.C11.x",)}, r"Tech\.C11"),
         ({"sen_type": '"'}, "SENTYPE"),
     ],
 )

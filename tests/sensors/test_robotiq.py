@@ -147,11 +147,11 @@ def test_the_device_is_opened_and_asked() -> None:
     [
         (
             {"rate_hz": 400.0},
-            r"rate_hz is 400, a period of 2\.5 ms; it must be one of whole milliseconds, such as 500 Hz",
+            r"rate_hz.*\b400\b.*2\.5 ms.*\b500 Hz",
         ),
-        ({"parts": ("static", "taste")}, f"parts is 'taste'; it must be one of {', '.join(KINDS)}"),
-        ({"parts": ()}, r"parts are \(\); name one or more"),
-        ({"fingers": 3}, "fingers is 3; it must be between 1 and 2"),
+        ({"parts": ("static", "taste")}, f"parts.*'taste'.*{'.*'.join(KINDS)}"),
+        ({"parts": ()}, r"parts.*\(\)"),
+        ({"fingers": 3}, r"fingers.*\b3\b.*\b1\b.*\b2\b"),
     ],
 )
 def test_what_cannot_be_is_refused_with_a_sentence(options: dict[str, object], sentence: str) -> None:

@@ -174,10 +174,10 @@ def test_grasps_that_are_encoded_are_decoded(seed: int, kind: Any) -> None:
 
 @pytest.mark.parametrize("numbers", [("seq",), ("a", "a:m"), ("a.b", "a_b"), ("a:",), ("",), ("0",), ("json",)])
 def test_a_key_that_makes_no_column_is_refused(numbers: tuple[str, ...]) -> None:
-    with pytest.raises(UsageError, match="makes no column"):
+    with pytest.raises(UsageError, match="numbers"):
         Tap(numbers=numbers)
 
 
 def test_a_stream_of_grasps_has_no_other_columns() -> None:
-    with pytest.raises(UsageError, match="leave numbers"):
+    with pytest.raises(UsageError, match="numbers"):
         Tap(numbers=("a",), grasp="points")

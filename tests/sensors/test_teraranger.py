@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tacpipe.errors import UsageError
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.teraranger import BINARY, START, STOP, TeraRanger
-from tests.sensors import made, told
+from tests.sensors import described, made
 
 
 def crc8(data: bytes) -> int:
@@ -53,7 +53,7 @@ def test_the_device_streams_after_the_opening_and_stops_after_the_closing() -> N
     device = sensor.device()
     streaming = [device.streaming]
 
-    told.hold(sensor.opening({}), device)
+    described.hold(sensor.opening({}), device)
     streaming.append(device.streaming)
     device.hear(sensor.closing())
     streaming.append(device.streaming)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.tfmini import TfMini, command
-from tests.sensors import made, told
+from tests.sensors import described, made
 
 # 59 59, 300 cm, strength 1000, temperature 2288 / 8 - 256 = 30 °C; the sum of 59 59 2C 01 E8 03 F0 08 is 2C2
 PLUS = bytes.fromhex("59 59 2C 01 E8 03 F0 08 C2")
@@ -66,7 +66,7 @@ def test_the_device_answers_the_opening_and_takes_the_rate() -> None:
     sensor = TfMini(rate_hz=500, unit="mm")
     device = sensor.device()
 
-    written = told.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
+    written = described.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
 
     assert written == [command(5, b"\x06"), command(3, b"\xf4\x01"), command(0x11), command(7, b"\x01")]
     assert device.rate_hz == 500 and device.streaming
@@ -76,7 +76,7 @@ def test_a_save_that_failed_is_an_error() -> None:
     ask = next(ask for ask in TfMini().opening({}) if ask.send == command(0x11))
     assert ask.found(PLUS + bytes.fromhex("5A 05 11 00 70") + PLUS) == (9, 14)
     assert ask.found(bytes.fromhex("5A 05 11 01 70")) is None  # by chance, in a frame
-    with pytest.raises(DeviceError, match="did not save"):
+    with pytest.raises(DeviceError):
         ask.found(bytes.fromhex("5A 05 11 01 71"))
 
 
@@ -87,9 +87,9 @@ def test_the_original_is_told_nothing() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"rate_hz": 400}, "1000 divided by a whole number"),
-        ({"rate_hz": 1000, "baud": 57600}, "90000 baud and the line has 57600"),
-        ({"model": "original", "rate_hz": 50}, "100 Hz in cm alone"),
+        ({"rate_hz": 400}, r"\b1000\b"),
+        ({"rate_hz": 1000, "baud": 57600}, r"\b90000\b.*\b57600\b"),
+        ({"model": "original", "rate_hz": 50}, r"\b100 Hz"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused(options: dict[str, object], words: str) -> None:

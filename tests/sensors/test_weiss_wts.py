@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.weiss_wts import WeissWts, message, messages, run_lengths
-from tests.sensors import made, told
+from tests.sensors import described, made
 
 SMALL = WeissWts(rows=2, columns=3)
 PLAIN = message(0, bytes.fromhex("10270000 00" + "0100 0200 0300 FF0F 0000 0500".replace(" ", "")))  # at 0.1 s
@@ -72,7 +72,7 @@ def test_the_device_answers_the_opening_while_it_still_streams() -> None:
     device = SMALL.device()
     device.streaming = True
 
-    written = told.hold(SMALL.opening({}), device, before=PLAIN + PLAIN[:9])
+    written = described.hold(SMALL.opening({}), device, before=PLAIN + PLAIN[:9])
 
     assert [next(messages(one))[0] for one in written] == [0x22, 0x30, 0x21]
     assert device.streaming and device.rate_hz == 100
@@ -80,7 +80,7 @@ def test_the_device_answers_the_opening_while_it_still_streams() -> None:
 
 def test_a_sensor_with_another_matrix_is_named() -> None:
     with pytest.raises(DeviceError, match=r"2 rows of 3 columns.*14 of 6"):
-        told.hold(WeissWts().opening({}), SMALL.device())
+        described.hold(WeissWts().opening({}), SMALL.device())
 
 
 def test_a_refusal_is_an_error() -> None:
@@ -94,12 +94,12 @@ def test_a_refusal_is_an_error() -> None:
 
 def test_a_tare_is_answered_and_a_closing_stops() -> None:
     device = SMALL.device()
-    told.hold(SMALL.opening({}), device)
-    assert told.hold(SMALL.taring(), device) == [message(0x23, b"\x01")]
+    described.hold(SMALL.opening({}), device)
+    assert described.hold(SMALL.taring(), device) == [message(0x23, b"\x01")]
     device.hear(SMALL.closing())
     assert not device.streaming
 
 
 def test_a_rate_of_no_whole_milliseconds_is_refused() -> None:
-    with pytest.raises(UsageError, match="whole milliseconds"):
+    with pytest.raises(UsageError, match="rate_hz"):
         WeissWts(rate_hz=60)

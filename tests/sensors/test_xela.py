@@ -132,5 +132,5 @@ def test_what_is_encoded_is_decoded(seed: int, rows: int, forces: bool, taxels: 
 
 @pytest.mark.parametrize("options", [{"sensor": 0}, {"taxels": 0}, {"taxels": 100}])
 def test_a_sensor_that_cannot_be_is_refused(options: dict[str, int]) -> None:
-    with pytest.raises(UsageError, match="xela: sensor is"):
+    with pytest.raises(UsageError, match="xela: "):
         Xela(**options)  # type: ignore[arg-type]

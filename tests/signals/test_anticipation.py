@@ -53,17 +53,17 @@ def step(at: int, rows: int = 200, size: float = 10.0) -> np.ndarray:
     return truth
 
 
-def judged(
+def score(
     truth: np.ndarray, ahead: np.ndarray, groups: np.ndarray | None = None, held: np.ndarray | None = None
 ) -> Anticipation:
-    """Judge one feature against a noise of 1 count and alarms beyond 1 count."""
+    """Evaluate one feature against a noise of 1 count and alarms beyond 1 count."""
     groups = np.zeros(len(truth)) if groups is None else groups
     one = np.ones(truth.shape[1])
     return anticipation.score(truth, ahead, groups, horizon=HORIZON, sd=one, theta=one, rate_hz=RATE_HZ, held=held)
 
 
 def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
-    """Judge a forecast on fresh recordings, calibrated on others of the same kind."""
+    """Evaluate a forecast on fresh recordings, calibrated on others of the same kind."""
 
     def ahead(truth: np.ndarray, groups: np.ndarray) -> np.ndarray:
         kind, _, rows = forecast.partition(" ")
@@ -141,14 +141,14 @@ def test_a_lead_counts_from_the_first_alarm_in_the_horizon_before_the_onset() ->
     for alarm, lead in ((99, 1), (96, 4), (91, 9), (90, 10)):
         ahead = truth.copy()
         ahead[[alarm, 99]] += 5
-        found = judged(truth, ahead, held=held)
+        found = score(truth, ahead, held=held)
         assert (found.events, found.recall, found.median_lead_rows) == (1, 1, lead)
         assert found.median_lead_frames == sum(row % 4 == 0 for row in range(alarm + 1, 101))
         assert found.false_alarms_per_minute == 0
     for alarm in (89, 100, 101):
         ahead = truth.copy()
         ahead[alarm] += 5
-        assert judged(truth, ahead).recall == 0
+        assert score(truth, ahead).recall == 0
 
 
 def test_what_alarms_near_no_event_is_false_once_for_the_rows_that_it_foretells() -> None:
@@ -159,11 +159,11 @@ def test_what_alarms_near_no_event_is_false_once_for_the_rows_that_it_foretells(
         ahead = truth.copy()
         ahead[alarm] += 5
         expected = (alarm in free) / (len(free) / RATE_HZ / 60)
-        assert judged(truth, ahead).false_alarms_per_minute == pytest.approx(expected)
+        assert score(truth, ahead).false_alarms_per_minute == pytest.approx(expected)
     for rows, alarms in ((11, 1), (12, 2), (22, 2), (23, 3)):
         ahead = truth.copy()
         ahead[30 : 30 + rows] += 5
-        assert judged(truth, ahead).false_alarms_per_minute == pytest.approx(alarms / (len(free) / RATE_HZ / 60))
+        assert score(truth, ahead).false_alarms_per_minute == pytest.approx(alarms / (len(free) / RATE_HZ / 60))
 
 
 def changes(values: np.ndarray, groups: np.ndarray | None = None) -> list[list[int]]:
@@ -206,13 +206,13 @@ def test_nothing_crosses_groups() -> None:
         ]
         assert changes(values, groups) == apart
         alarms = np.full((len(values), 1), 99.0)
-        together = judged(values[:, None], alarms, groups)
-        alone = [judged(part[:, None], np.full((len(part), 1), 99.0)) for part in parts]
+        together = score(values[:, None], alarms, groups)
+        alone = [score(part[:, None], np.full((len(part), 1), 99.0)) for part in parts]
         assert together.events == sum(one.events for one in alone) == 3
         ends = np.zeros_like(alarms)
         ends[offsets[1:-1] - 1] = 99  # in the last row of each
-        assert judged(values[:, None], values[:, None] + ends, groups).recall == 0
-        assert judged(values[:, None], values[:, None] + ends, groups).false_alarms_per_minute == 0
+        assert score(values[:, None], values[:, None] + ends, groups).recall == 0
+        assert score(values[:, None], values[:, None] + ends, groups).false_alarms_per_minute == 0
 
 
 def test_false_alarms_in_neighbouring_groups_are_counted_apart() -> None:
@@ -220,21 +220,21 @@ def test_false_alarms_in_neighbouring_groups_are_counted_apart() -> None:
     ahead = truth.copy()
     ahead[[89, 100]] = 5  # the last row of the first whose forecast is recorded, and the first of the second
     minutes = 180 / RATE_HZ / 60
-    assert judged(truth, ahead, np.arange(200) // 100).false_alarms_per_minute == pytest.approx(2 / minutes)
+    assert score(truth, ahead, np.arange(200) // 100).false_alarms_per_minute == pytest.approx(2 / minutes)
     ahead[100], ahead[99] = 0, 5
-    assert judged(truth, ahead, np.arange(200) // 100).false_alarms_per_minute == pytest.approx(1 / minutes)
+    assert score(truth, ahead, np.arange(200) // 100).false_alarms_per_minute == pytest.approx(1 / minutes)
     truth = step(101)  # begins 12 rows after row 89, which is of another group
     ahead = truth.copy()
     ahead[89] = 5
     minutes = (90 + 190 - 111) / RATE_HZ / 60
-    assert judged(truth, ahead, np.arange(200) // 100).false_alarms_per_minute == pytest.approx(1 / minutes)
+    assert score(truth, ahead, np.arange(200) // 100).false_alarms_per_minute == pytest.approx(1 / minutes)
 
 
 def test_rows_without_a_forecast_are_no_rows_in_which_an_alarm_could_have_been() -> None:
     truth = np.zeros((200, 1))
     ahead = truth.copy()
     ahead[50], ahead[100:] = 5, np.nan
-    assert judged(truth, ahead).false_alarms_per_minute == pytest.approx(1 / (100 / RATE_HZ / 60))
+    assert score(truth, ahead).false_alarms_per_minute == pytest.approx(1 / (100 / RATE_HZ / 60))
 
 
 def test_events_without_a_forecast_in_all_rows_before_are_not_counted() -> None:
@@ -242,9 +242,9 @@ def test_events_without_a_forecast_in_all_rows_before_are_not_counted() -> None:
     for row, events in ((89, 1), (90, 0), (99, 0), (100, 1)):
         ahead = truth + 5
         ahead[row] = np.nan
-        assert judged(truth, ahead).events == events
-    assert judged(step(9), step(9) + 5).events == 0
-    assert judged(step(10), step(10) + 5).events == 1
+        assert score(truth, ahead).events == events
+    assert score(step(9), step(9) + 5).events == 0
+    assert score(step(10), step(10) + 5).events == 1
 
 
 @given(st.sets(st.integers(0, 14), max_size=11), st.integers(1, 5))
@@ -287,7 +287,7 @@ def test_few_rows_tell_nothing(rows: int) -> None:
     assert anticipation.difference_sd(truth, groups, horizon=HORIZON).tolist() == [0, 0]
     theta = anticipation.calibrate(truth, truth, groups, horizon=HORIZON, sd=one, rate_hz=RATE_HZ)
     assert theta.tolist() == ([0, 0] if rows == 11 else [np.inf, np.inf])
-    found = judged(truth, truth + 5)
+    found = score(truth, truth + 5)
     assert found.events == 0
     assert math.isnan(found.recall)
 

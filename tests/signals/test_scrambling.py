@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 
 from tacpipe.signals.axes import is_time
 from tacpipe.signals.scrambling import scramble, unscramble
-from tests.formats.slide_files import felt
+from tests.formats.slide_files import touched
 
 slides = hnp.arrays(np.float32, hnp.array_shapes(min_dims=3, max_dims=5, max_side=7), elements=st.floats(width=32))
 
@@ -32,7 +32,7 @@ def test_each_reading_goes_where_the_formula_says(triangles: int, taxels: int, f
 
 
 def test_what_is_scrambled_has_no_time_axis_and_what_is_not_has() -> None:
-    for slide in felt(20):
+    for slide in touched(20):
         assert is_time(slide, -1)
         assert not is_time(scramble(slide), -1)
         assert is_time(unscramble(scramble(slide)), -1)

@@ -12,8 +12,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.io.hashing import digest
 from tacpipe.simulation.grasp import simulate_trial
 from tacpipe.simulation.grasp_scene import Rig
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 
 SEED = 5
 

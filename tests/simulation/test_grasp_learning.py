@@ -37,7 +37,7 @@ def trained(training: Any, workspace: Path, **changed: Any) -> dict[str, bytes]:
     return touch.train(params, training, None, workspace)
 
 
-def judged(training: Any, tested: Any, workspace: Path, **changed: Any) -> Metrics:
+def evaluated(training: Any, tested: Any, workspace: Path, **changed: Any) -> Metrics:
     files = trained(training, workspace, **changed)
     found: Metrics = json.loads(touch.evaluate(files, tested).files["metrics.json"])
     return found
@@ -71,8 +71,8 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
         "inputs": "xyzpose",
         "epochs": 15,
     }
-    boxed = judged(training, tested, tmp_path / "boxed", **scaled)
-    metric = judged(training, tested, tmp_path / "metric", **pressures)
+    boxed = evaluated(training, tested, tmp_path / "boxed", **scaled)
+    metric = evaluated(training, tested, tmp_path / "metric", **pressures)
     for target in ("pdc_th", "pdc_mf"):
         assert boxed["model"]["r2"][target] <= 0.05
         assert metric["model"]["r2"][target] >= 0.8
@@ -82,7 +82,7 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
 def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_can_know(tmp_path: Path) -> None:
     rig = Rig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)  # drift would be learned from time
     training, tested = grasps(rig, range(1000)), grasps(rig, range(1000, 1200))
-    told = judged(training, tested, tmp_path, leaf=2)
+    told = evaluated(training, tested, tmp_path, leaf=2)
     for target in biotac_sp.TARGETS:
         bound = float(np.sqrt(readings(tested, target, "truth", "gt_variance_").mean()))
         assert (
@@ -116,7 +116,7 @@ def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
             type(made)({name: made.recordings[name] for name in part}, {}) for part in _parted(names, fold)
         )
         errors = [
-            judged(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
+            evaluated(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
             for inputs in ("xyz", "rgb")
         ]
         for target, gain in gains.items():
@@ -134,7 +134,7 @@ def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and
     small = {**POINTNET, "targets": "e_th,e_mf", "multi_target": True, "points": 32, "epochs": 20}
     errors = {}
     for inputs in ("xyz", "xyzcont"):
-        told = judged(training, tested, tmp_path / inputs, **{**small, "inputs": inputs})
+        told = evaluated(training, tested, tmp_path / inputs, **{**small, "inputs": inputs})
         errors[inputs] = told["model"]["rmse"]
     mean = told["object_mean"]["rmse"]
     for target in ("e_th", "e_mf"):

@@ -16,6 +16,7 @@ from tacpipe.signals.holds import held
 from tacpipe.simulation import taxels
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
 from tacpipe.simulation.pick_and_move import MASSES_KG, Rig, Scene, perform, simulate_trial, touch
+from tests.fake_recordings import column
 
 CLEAN = Rig(
     hold_probability=0.0,
@@ -39,11 +40,6 @@ def tactile(table: pa.Table) -> np.ndarray:
     names = [name for name in table.column_names if name.startswith("taxel")]
     counts: np.ndarray = np.column_stack([table.column(name).to_numpy() for name in names]).astype(float)
     return counts
-
-
-def column(table: pa.Table, name: str) -> np.ndarray:
-    values: np.ndarray = table.column(name).to_numpy()
-    return values
 
 
 def decoded(scene: Scene, recording: Any, finger: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from tacpipe.channels import schema
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import faults, pick_and_move, taxels
-from tests.fake_recordings import FakeRecording
+from tests.fake_recordings import FakeRecording, column
 
 TRIALS = 20
 simulate, synchronize = load("simulate.forward"), load("synchronize")
@@ -36,8 +36,8 @@ def labelled(trial: int, **rig: Any) -> pa.Table:
     return slips(slips.params(), FakeRecording(contacts(contacts.params(), FakeRecording({"": table})).streams))
 
 
-def column(table: pa.Table, name: str) -> np.ndarray:
-    return np.asarray(table.column(name).to_numpy() > 0)
+def flags(table: pa.Table, name: str) -> np.ndarray:
+    return np.asarray(column(table, name) > 0)
 
 
 @pytest.mark.long
@@ -51,8 +51,8 @@ def column(table: pa.Table, name: str) -> np.ndarray:
 )
 def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], least: float) -> None:
     tables = [labelled(trial, **rig) for trial in range(TRIALS)]
-    found = np.concatenate([column(table, "slip") for table in tables])
-    truth = np.concatenate([column(table, "gt_slip") for table in tables])
+    found = np.concatenate([flags(table, "slip") for table in tables])
+    truth = np.concatenate([flags(table, "gt_slip") for table in tables])
     assert 2 * (found & truth).sum() / (found.sum() + truth.sum()) >= least
 
 
@@ -60,7 +60,7 @@ def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], least: f
 def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
     for trial in range(TRIALS):
         table = labelled(trial, effort=1.15)
-        found, truth = column(table, "dropped"), column(table, "gt_dropped")
+        found, truth = flags(table, "dropped"), flags(table, "gt_dropped")
         assert found.any() == truth.any()
         assert abs(int(found.argmax()) - int(truth.argmax())) <= 2
 
@@ -68,10 +68,10 @@ def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
 @pytest.mark.long
 def test_where_nothing_slips_there_is_at_most_one_false_frame_a_minute() -> None:
     tables = [labelled(trial, friction_scale=4.0) for trial in range(TRIALS)]
-    assert not any(column(table, "gt_slip").any() for table in tables)
+    assert not any(flags(table, "gt_slip").any() for table in tables)
     minutes = sum(table.num_rows for table in tables) / 50 / 60
     for name in ("slip", "slip_online", "dropped"):
-        assert sum(column(table, name).sum() for table in tables) <= minutes
+        assert sum(flags(table, name).sum() for table in tables) <= minutes
 
 
 def test_the_offset_of_each_clock_is_known_to_a_fraction_of_a_sample() -> None:
@@ -134,7 +134,7 @@ def test_held_frames_are_found() -> None:
             again = again.append_column(first.schema.field(name), first.column(name))
         table = synced(RecordingOutput({**streams, "xela1": again}), grid="logged").streams[""]
         rows = np.searchsorted(first.column("seq").to_numpy(), table.column("xela1_seq").to_numpy())
-        marked = column(table, "xela1_held")
+        marked = flags(table, "xela1_held")
         hits, found, held = hits + (marked & repeated[rows]).sum(), found + marked.sum(), held + repeated[rows].sum()
     assert hits / found >= 0.99
     assert hits / held >= 0.99

@@ -1,6 +1,6 @@
 """What can be learned of the simulated rig: how much the plan tells, what bounds a forecast, and what nobody can foresee.
 
-Forecasters are trained and judged on trials in which nothing slips. Ground truth serves to judge, never to train.
+Forecasters are trained and evaluated on trials in which nothing slips. Ground truth serves to judge, never to train.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, predicted
 from tests.asked import fitting
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeShard, dataset
+from tests.fake_recordings import FakeRecording, FakeShard, column, dataset
 
 HORIZON = 10
 ROW_NS = 20_000_000
@@ -78,12 +77,12 @@ def forecasters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Forecaste
     }
 
 
-def column(shard: FakeShard, name: str) -> AnyFloats:
-    return np.asarray(shard.content.column(name).to_numpy(), dtype=np.float64)
+def floats(shard: FakeShard, name: str) -> AnyFloats:
+    return column(shard.content, name).astype(np.float64)
 
 
 def columns(shard: FakeShard, pattern: str) -> AnyFloats:
-    return np.column_stack([column(shard, pattern.format(axis)) for axis in "xyz"])
+    return np.column_stack([floats(shard, pattern.format(axis)) for axis in "xyz"])
 
 
 def aloft(shard: FakeShard, starts: Int64s) -> Bools:
@@ -198,10 +197,10 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     ahead = np.full_like(track.tactile, np.nan)
     for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
         ahead[some.now] = some.predictions[MODEL].count[:, -1]
-    felt = pull_over_pressure(track.tactile)
-    pull = np.hypot(column(shard, "gt_force_x_n"), column(shard, "gt_force_z_n"))
-    pressure = column(shard, "gt_finger1_normal_n") + column(shard, "gt_finger2_normal_n")
-    held = (column(shard, "gt_slip") == 0) & (pressure > 2) & (pull > 0.1 * pressure)
+    felt = pull_over_pressure(track.tactile[:])
+    pull = np.hypot(floats(shard, "gt_force_x_n"), floats(shard, "gt_force_z_n"))
+    pressure = floats(shard, "gt_finger1_normal_n") + floats(shard, "gt_finger2_normal_n")
+    held = (floats(shard, "gt_slip") == 0) & (pressure > 2) & (pull > 0.1 * pressure)
     true = pull[held] / pressure[held]
     limit = float(felt[held] @ true / (true @ true)) * float(shard.attributes["gt_friction"])
     return Watch(felt, pull_over_pressure(ahead), limit)
@@ -225,7 +224,7 @@ def median_lead(forecaster: Forecaster, kind: dict[str, Any]) -> float:
     """
     found = []
     for shard in trials(SLIPPING, **kind):
-        slipping = np.flatnonzero(column(shard, "gt_slip") > 0)
+        slipping = np.flatnonzero(floats(shard, "gt_slip") > 0)
         if not len(slipping):
             continue
         seen, onset = watch(forecaster, shard), int(slipping[0])

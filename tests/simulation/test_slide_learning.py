@@ -16,7 +16,7 @@ import pytest
 from tacpipe.simulation.slide import Rig
 from tacpipe.testing.texture_likelihood import likelihood_accuracy
 from tests.simulation.slide_datasets import SEED, indices, slides
-from tests.tasks.material.textures import dataset, judged, trained
+from tests.tasks.material.textures import dataset, evaluated, trained
 
 RIG = Rig(materials=8, pac=False, arm_every=0)
 FEWER = replace(RIG, materials=6)  # for networks, which take their time
@@ -68,7 +68,7 @@ def within_chance(right: int, n: int, share: float, clusters: int) -> bool:
 @pytest.mark.long
 def test_the_strong_classifier_comes_close_to_one_that_knows_the_spectra(tmp_path: Path) -> None:
     training, watched, tested = whole()
-    metrics, _ = judged(trained(tmp_path, training, watched, **STRONG), tested)
+    metrics, _ = evaluated(trained(tmp_path, training, watched, **STRONG), tested)
     for sensor in BOTH:
         bound = likelihood_accuracy(SEED, indices(RIG, [sensor], TESTED), RIG)
         assert bound > 0.8
@@ -79,7 +79,7 @@ def test_the_strong_classifier_comes_close_to_one_that_knows_the_spectra(tmp_pat
 def joint(pairing: str) -> dict[str, Any]:
     training, watched, tested = short()
     with tempfile.TemporaryDirectory() as folder:
-        metrics, result = judged(trained(Path(folder), training, watched, **NETWORK, pairing=pairing), tested)
+        metrics, result = evaluated(trained(Path(folder), training, watched, **NETWORK, pairing=pairing), tested)
     return {**metrics, "history": [json.loads(line) for line in result.files["history.jsonl"].splitlines()]}
 
 
@@ -110,7 +110,7 @@ def test_pairs_of_other_materials_align_and_swap_as_well_so_that_sharing_is_driv
 @pytest.mark.long
 def test_labels_dealt_out_anew_are_named_by_chance(tmp_path: Path) -> None:
     training, watched, tested = whole()
-    metrics, _ = judged(trained(tmp_path, training, watched, **STRONG, labels="permuted"), tested)
+    metrics, _ = evaluated(trained(tmp_path, training, watched, **STRONG, labels="permuted"), tested)
     for sensor in BOTH:
         correct, n = metrics["model"]["correct"][sensor], metrics["model"]["n"][sensor]
         assert within_chance(correct, n, 1 / RIG.materials, n), (sensor, correct, n)
@@ -136,9 +136,9 @@ def test_of_materials_that_are_all_the_same_sessions_are_told_and_nothing_is_lef
         return dataset(*of(1, numbers).recordings.values(), *of(2, numbers).recordings.values())
 
     model = {"features": 2_000}
-    blocked, _ = judged(trained(tmp_path, both(range(12)), dataset(), **model), both(range(12, 16)))
+    blocked, _ = evaluated(trained(tmp_path, both(range(12)), dataset(), **model), both(range(12, 16)))
     assert accuracy(blocked, "mean_level")["biotac"] > 0.25  # the baseline that gives the session away
-    apart, _ = judged(trained(tmp_path, of(1, range(16)), dataset(), **model), of(2, range(16)))
+    apart, _ = evaluated(trained(tmp_path, of(1, range(16)), dataset(), **model), of(2, range(16)))
     clusters = rig.materials
     for predictor in ("model", "mean_level"):
         found = apart[predictor]

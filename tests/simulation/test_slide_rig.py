@@ -20,6 +20,7 @@ from tacpipe.signals.axes import is_time, lag_one
 from tacpipe.signals.scrambling import scramble, unscramble
 from tacpipe.simulation import fingertip, forearm
 from tacpipe.simulation.slide import SENSORS, Rig, material, nuisance, place, simulate_trial
+from tests.fake_recordings import column
 
 PLAIN = Rig(pac=False, arm_every=0)
 QUIET = replace(PLAIN, noise_scale=0.0, session_scale=0.0)
@@ -30,11 +31,6 @@ stage = load("simulate.material")
 def trial(sensor: str, number: int = 0, of: int = 1, materials: int = 20) -> int:
     """The index of a trial: sensors by turns, then materials, then numbers."""
     return 2 * materials * number + 2 * (of - 1) + SENSORS.index(sensor)
-
-
-def column(table: pa.Table, name: str) -> np.ndarray:
-    values: np.ndarray = table.column(name).to_numpy()
-    return values
 
 
 def tactile(table: pa.Table) -> np.ndarray:

@@ -1,43 +1,17 @@
-"""Recordings, datasets and tables made by hand, with what the stages of learning read of real ones."""
+"""Synchronized recordings made by hand, with what the stages of learning read of real ones."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.io.hashing import digest
+from tests.fake_recordings import FakeShard
 
 CHANNELS = [f"xela{sensor}_taxel{taxel:02d}_{axis}" for sensor in (1, 2) for taxel in (1, 2) for axis in "xyz"]
 REST = 16000.0
-
-
-@dataclass
-class FakeShard:
-    name: str
-    content: pa.Table
-    attributes: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def digest(self) -> str:
-        return digest([self.name, self.content.num_rows])
-
-    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        return self.content if columns is None else self.content.select(list(columns))
-
-
-@dataclass
-class FakeDataset:
-    recordings: Mapping[str, FakeShard] = field(default_factory=dict)
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    manifest: dict[str, Any] = field(default_factory=dict)
-
-
-def dataset(*shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
-    return FakeDataset({shard.name: shard for shard in shards}, files or {})
 
 
 def table(

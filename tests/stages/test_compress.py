@@ -11,7 +11,8 @@ import pytest
 from tacpipe.codecs import stored
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
 
 PCA = registry.load("compress.pca")
 assert PCA.fit is not None

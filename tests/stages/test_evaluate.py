@@ -10,7 +10,8 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
-from tests.stages.learning_fakes import dataset, motion
+from tests.fake_recordings import dataset
+from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import compressed, trained
 
 EVALUATE = registry.load("evaluate")
@@ -29,7 +30,7 @@ def model(codec_files: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return dataset(files=files)
 
 
-def test_a_model_with_a_codec_is_judged_in_counts_beside_the_codecs_own_loss(model: Any, codec_files: Any) -> None:
+def test_a_model_with_a_codec_is_evaluated_in_counts_beside_the_codecs_own_loss(model: Any, codec_files: Any) -> None:
     result = EVALUATE(EVALUATE.params(), model, compressed(motion(20), motion(21), files=codec_files))
     metrics = json.loads(result.files["metrics.json"])
     assert {"model", "persistence", "codec", "codec_persistence", "context_mean", "skill", "counts"} < set(metrics)

@@ -25,14 +25,14 @@ grasps = load("segment.grasps")
 Recording = Callable[..., Any]
 
 
-def felt(rows: int = 300) -> pa.Table:
+def touched(rows: int = 300) -> pa.Table:
     """Return both fingers' stream: channel k has the level 1000 + k, and 300 more from row `SETTLED` on."""
     level = 1000 + np.arange(58)[:, None] + 300 * np.clip((np.arange(rows) - CLOSED) / (SETTLED - CLOSED), 0, 1)
     return schema.stream(START_NS + np.arange(rows) * STEP_NS, list(np.rint(level)), biotac_sp.fields())
 
 
 def raw(whole: Scene, **other: pa.Table) -> dict[str, pa.Table]:
-    return {"scene": whole.cloud.table(), "grasp": whole.grasp.table(START_NS), "biotac_sp": felt(), **other}
+    return {"scene": whole.cloud.table(), "grasp": whole.grasp.table(START_NS), "biotac_sp": touched(), **other}
 
 
 def cut(recording: Any, **params: Any) -> RecordingOutput:
@@ -125,7 +125,7 @@ def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_on
 
 
 def test_single_wrong_readings_in_the_window_do_not_count(shard: Recording) -> None:
-    stream = felt()
+    stream = touched()
     column = stream.column("mf_electrode07").to_numpy().copy()
     column[[SETTLED + 3, SETTLED + 9]] = 4095
     place = stream.column_names.index("mf_electrode07")
@@ -197,8 +197,8 @@ def test_what_cannot_be_found_is_told_with_the_recording(shard: Recording) -> No
     with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
         cut(shard(raw(whole, scene=Cloud(whole.cloud.points_m[whole.ball]).table())))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
-        cut(shard(raw(whole, biotac_sp=felt(CLOSED))))
+        cut(shard(raw(whole, biotac_sp=touched(CLOSED))))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
         cut(shard(raw(whole)), on_count=400.0)
     with pytest.raises(TacpipeError, match="Recording trial: No table is found"):
-        cut(shard(raw(whole)), plane_share=0.99)
+        cut(shard(raw(whole)), plane_fraction=0.99)

@@ -6,7 +6,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
-from tests.stages.learning_fakes import FakeDataset, dataset
+from tests.fake_recordings import FakeDataset, dataset
 
 REPORT = registry.load("report")
 

@@ -190,10 +190,10 @@ def published() -> dict[str, Any]:
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "biotac_slide_20_50").is_dir(), reason="the published recordings are not here")
 def test_in_published_slides_nothing_but_glitches_is_mended(published: dict[str, Any], shard: Recording) -> None:
-    mended: dict[str, int] = {}
+    repaired: dict[str, int] = {}
     for name, recording in published.items():
         given = recording.streams["biotac"]
-        found = cut(shard(recording.streams, name=name), crop="none", moving_share=0.0)
+        found = cut(shard(recording.streams, name=name), crop="none", moving_fraction=0.0)
         table = found.streams["slide"]
         assert table.num_rows == given.num_rows  # each begins at its trigger
         for column in table.column_names:
@@ -201,11 +201,11 @@ def test_in_published_slides_nothing_but_glitches_is_mended(published: dict[str,
             changed = before != after
             assert (before[changed] > 2500).all()
             assert (after[changed] <= 255).all()
-            mended[name] = mended.get(name, 0) + int(changed.sum())
-        assert found.attributes["spikes"] == mended[name]
+            repaired[name] = repaired.get(name, 0) + int(changed.sum())
+        assert found.attributes["spikes"] == repaired[name]
         electrodes = [table.column(f"electrode{number:02d}").to_numpy() for number in range(1, 20)]
         assert max(column.max() for column in electrodes) <= 255
-    assert {name: count for name, count in mended.items() if count} == {
+    assert {name: count for name, count in repaired.items() if count} == {
         "biotac-m02-t007": 8,
         "biotac-m02-t009": 4,
         "biotac-m05-t050": 8,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
@@ -12,14 +11,10 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
 from tests.asked import asked
+from tests.fake_recordings import FakeDataset
 
 split = load("split")
 Recording = Callable[..., Any]
-
-
-@dataclass(frozen=True)
-class FakeDataset:
-    recordings: dict[str, Any]
 
 
 def dataset(shard: Recording, count: int) -> FakeDataset:

@@ -11,7 +11,8 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tests.asked import asked
-from tests.stages.learning_fakes import dataset, motion
+from tests.fake_recordings import dataset
+from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import SMALL, compressed
 
 STAGE = registry.load("train.forward")

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tests.stages.learning_fakes import FakeDataset, FakeShard
+from tests.fake_recordings import FakeDataset, FakeShard
 
 STEPS = (1, 2, 3)
 GROUPS = {"both": 12, "sensor1": 6, "sensor2": 6, "x": 4, "standard": 12, "feature": 3}  # channels of each

@@ -15,8 +15,8 @@ import pytest
 from tacpipe.report.forward import comparison, methods
 from tacpipe.report.forward.comparison import Pool
 from tacpipe.report.forward.methods import Method, Run
+from tests.fake_recordings import FakeDataset
 from tests.report.forward.result_fakes import WINDOWS, errors, result
-from tests.stages.learning_fakes import FakeDataset
 
 RATIO = {"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}
 STEPS = (1, 3)

@@ -14,9 +14,9 @@ import pytest
 from tacpipe.report.forward import overview, section, tables
 from tacpipe.report.forward.methods import Run
 from tacpipe.report.forward.overview import Overview
+from tests.fake_recordings import FakeDataset
 from tests.report.forward.result_fakes import WINDOWS, codec, errors, result
 from tests.report.forward.test_comparison import RATIO
-from tests.stages.learning_fakes import FakeDataset
 
 
 def over(*results: Any) -> Overview:

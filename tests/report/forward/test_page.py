@@ -9,9 +9,9 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.report import page
 from tacpipe.report.forward import section
+from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report.elements import Elements
 from tests.report.forward import result_fakes
-from tests.stages.learning_fakes import FakeDataset, FakeShard
 
 
 @pytest.fixture

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset, FakeShard
+from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 
 MATERIALS, TRIALS = 4, 5  # of the test slides of a sensor
 MANIFEST = {

@@ -9,10 +9,10 @@ import pytest
 
 from tacpipe.report import page
 from tacpipe.report.material import wording
+from tests.fake_recordings import FakeDataset
 from tests.report import elements
 from tests.report.material import material_fakes
 from tests.report.material.material_fakes import result
-from tests.stages.learning_fakes import FakeDataset
 
 BOTH = {"biotac": 1, "roboskin": 2}
 PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}

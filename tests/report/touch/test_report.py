@@ -10,9 +10,9 @@ import pytest
 
 from tacpipe.report import page
 from tacpipe.report.touch import wording
+from tests.fake_recordings import FakeDataset
 from tests.report import elements
 from tests.report.touch.touch_fakes import NOVEL, recorded, result
-from tests.stages.learning_fakes import FakeDataset
 
 BASELINES = {"object_mean": 0.08, "nearest_in_time": 0.09}
 FULL: dict[str, Any] = {"novel": NOVEL, "baselines": BASELINES}

@@ -13,8 +13,7 @@ from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 
 KNOWN, NOVEL = ("bleach", "coffee", "spam"), ("drill", "shoe")
 PER_OBJECT = 8  # unseen grasps

@@ -15,7 +15,7 @@ from tacpipe.metrics import headline
 from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward.model import ForwardModel
-from tests.stages.learning_fakes import FakeShard, dataset
+from tests.fake_recordings import FakeShard, dataset
 from tests.tasks.forward.trials import CONTEXT, HORIZON, params
 
 AXES = ("x", "y", "z")

@@ -1,4 +1,4 @@
-"""What is judged is what numpy computes from the recordings' columns, and everything stands where it is looked for."""
+"""What is evaluated is what numpy computes from the recordings' columns, and everything stands where it is looked for."""
 
 from __future__ import annotations
 
@@ -19,8 +19,19 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import parquet
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
-from tests.tasks.forward.trials import CONTEXT, HORIZON, LENGTH, compressed, counts, foretold, judged, poses, trained
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
+from tests.tasks.forward.trials import (
+    CONTEXT,
+    HORIZON,
+    LENGTH,
+    compressed,
+    counts,
+    evaluated,
+    poses,
+    predicted_windows,
+    trained,
+)
 
 LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
 
@@ -70,7 +81,7 @@ def oracle(*shards: FakeShard) -> dict[str, AnyFloats]:
 
 
 def test_persistence_and_context_mean_are_what_numpy_computes_from_the_columns(model: dict[str, bytes]) -> None:
-    metrics, _ = judged(model, *TEST)
+    metrics, _ = evaluated(model, *TEST)
     groups = {
         "both": np.ones(len(CHANNELS), dtype=bool),
         "sensor1": np.array([name.startswith("xela1") for name in CHANNELS]),
@@ -98,7 +109,7 @@ def test_persistence_and_context_mean_are_what_numpy_computes_from_the_columns(m
 
 
 def test_the_model_s_errors_are_those_of_a_loop_over_predict(model: dict[str, bytes]) -> None:
-    metrics, result = judged(model, *TEST)
+    metrics, result = evaluated(model, *TEST)
     forecaster, errors = ForwardModel.load(model), []
     for shard in TEST:
         arm = tracks.track(shard, forecaster.codec).arm  # type: ignore[arg-type]
@@ -122,14 +133,14 @@ def test_the_model_s_errors_are_those_of_a_loop_over_predict(model: dict[str, by
 
 
 def test_the_model_beats_persistence_where_the_plan_tells_all(model: dict[str, bytes]) -> None:
-    metrics, _ = judged(model, *TEST)
+    metrics, _ = evaluated(model, *TEST)
     assert metrics["skill"]["mse_counts"]["t4"]["low"] > 0.5
     assert metrics["model"]["mse_counts"]["both"]["t4"] < 0.5 * metrics["persistence"]["mse_counts"]["both"]["t4"]
 
 
 def test_the_sums_of_the_errors_table_are_the_means_of_the_metrics(model: dict[str, bytes]) -> None:
     shards = [*TEST, TRAIN[0]]
-    metrics, result = judged(model, *shards)
+    metrics, result = evaluated(model, *shards)
     found = parquet.from_parquet(result.files["errors.parquet"]).to_pandas()
     assert set(found["recording"]) == {one.name for one in shards}
     assert set(found["object"]) == {"cup", "jug"}
@@ -153,9 +164,9 @@ def test_the_sums_of_the_errors_table_are_the_means_of_the_metrics(model: dict[s
 
 
 def test_objects_that_the_model_was_trained_on_and_others_are_told_apart(model: dict[str, bytes]) -> None:
-    metrics, result = judged(model, *TEST)
+    metrics, result = evaluated(model, *TEST)
     assert (metrics["known"]["counts"]["recordings"], metrics["unseen"]["counts"]["recordings"]) == (2, 1)
-    alone, _ = judged(model, TEST[0], TEST[2])
+    alone, _ = evaluated(model, TEST[0], TEST[2])
     assert metrics["known"]["model"] == alone["model"]
     assert not {"known", "unseen", "seen"} & set(alone)
     rows = {row["recording"]: row for row in csv.DictReader(io.StringIO(result.files["trials.csv"].decode()))}
@@ -164,24 +175,24 @@ def test_objects_that_the_model_was_trained_on_and_others_are_told_apart(model: 
         "false",
         "true",
     )
-    unnamed, _ = judged(model, held(20, None), TEST[1])
+    unnamed, _ = evaluated(model, held(20, None), TEST[1])
     assert unnamed["known"]["counts"]["recordings"] == 1  # nobody said what is held
 
 
 def test_recordings_that_the_model_has_seen_are_told_apart(model: dict[str, bytes]) -> None:
-    alone, _ = judged(model, *TEST)
-    mixed, result = judged(model, *TEST, TRAIN[0], held(10, "cup"))
+    alone, _ = evaluated(model, *TEST)
+    mixed, result = evaluated(model, *TEST, TRAIN[0], held(10, "cup"))
     assert {name: value for name, value in mixed.items() if name != "seen"} == alone
     assert mixed["seen"]["counts"]["recordings"] == 2
     assert result.recordings[TRAIN[0].name].attributes["seen"] is True
     assert result.recordings[TEST[0].name].attributes == {"trial": 20, "object": "cup", "seen": False}
-    only, _ = judged(model, TRAIN[0])
+    only, _ = evaluated(model, TRAIN[0])
     assert "model" not in only and "anticipation" not in only
     assert only["counts"]["recordings"] == 0 and only["seen"]["counts"]["recordings"] == 1
 
 
 def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]) -> None:
-    metrics, result = judged(model, *TEST)
+    metrics, result = evaluated(model, *TEST)
     for predictor in ("model", "persistence"):
         for group in ("sensor1", "sensor2", "both"):
             assert set(metrics[predictor]["mae_counts"][group]) == {"t1", "t2", "t3", "t4", "mean"}
@@ -205,7 +216,7 @@ def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]
 
 
 def test_alarms_are_counted_for_the_model_and_whatever_it_has_to_beat(model: dict[str, bytes]) -> None:
-    metrics, _ = judged(model, *TEST)
+    metrics, _ = evaluated(model, *TEST)
     assert set(metrics["anticipation"]) == {"model", "persistence", *(LINEAR - {"train_mean"})}
     for found in metrics["anticipation"].values():
         assert set(found) == {
@@ -214,7 +225,7 @@ def test_alarms_are_counted_for_the_model_and_whatever_it_has_to_beat(model: dic
 
 
 def test_features_are_measured_in_half_their_training_range(model: dict[str, bytes]) -> None:
-    metrics, _ = judged(model, *TEST)
+    metrics, _ = evaluated(model, *TEST)
     half = np.ptp(np.concatenate([counts(one) for one in TRAIN]), axis=0) / 2
     wanted = np.square(oracle(*TEST)["persistence"] / half).mean()
     assert metrics["persistence"]["mse_feature"]["mean"] == pytest.approx(wanted, rel=1e-4)
@@ -233,7 +244,7 @@ def test_what_the_codec_alone_loses_stands_beside_the_model(
 ) -> None:
     of = name.split()[1]
     codec, test = latents[of], compressed(*TEST, files=latents[of].files, representation=of)
-    metrics, result = judged(latent_models[name], *test.recordings.values(), files=codec.files)
+    metrics, result = evaluated(latent_models[name], *test.recordings.values(), files=codec.files)
     assert set(metrics) - LINEAR - {"known", "unseen", "counts", "skill", "anticipation", "context_mean"} == {
         *("model", "persistence"),
         *rows,
@@ -254,7 +265,7 @@ def test_what_the_codec_loses_is_what_numpy_computes(
 ) -> None:
     codec = ForwardModel.load(latent_models["gru levels"]).codec
     test = compressed(*TEST, files=latents["levels"].files)
-    metrics, _ = judged(latent_models["gru levels"], *test.recordings.values(), files=latents["levels"].files)
+    metrics, _ = evaluated(latent_models["gru levels"], *test.recordings.values(), files=latents["levels"].files)
     lost = {one.name: codec.decode(codec.encode(counts(one), CHANNELS)) - counts(one) for one in TEST}
     windows = np.concatenate([sliding(one) for one in lost.values()])
     for predictor, wanted in (
@@ -271,22 +282,22 @@ def test_latents_of_another_codec_are_refused(
 ) -> None:
     other = compressed(*TEST)
     with pytest.raises(TacpipeError, match="another codec than the model's"):
-        judged(latent_models["gru levels"], *other.recordings.values(), files=other.files)
+        evaluated(latent_models["gru levels"], *other.recordings.values(), files=other.files)
     with pytest.raises(TacpipeError, match="trial-20: There is no column z00"):
-        judged(latent_models["gru levels"], *TEST)
+        evaluated(latent_models["gru levels"], *TEST)
 
 
 def test_a_model_of_raw_channels_reads_recordings_that_have_latents_too(
     model: dict[str, bytes], latents: Mapping[str, Any]
 ) -> None:
     test = compressed(*TEST, files=latents["levels"].files)
-    metrics, _ = judged(model, *test.recordings.values(), files=latents["levels"].files)
-    assert metrics == judged(model, *TEST)[0]
+    metrics, _ = evaluated(model, *test.recordings.values(), files=latents["levels"].files)
+    assert metrics == evaluated(model, *TEST)[0]
 
 
 def test_a_signal_that_stays_has_no_error_and_no_skill(model: dict[str, bytes]) -> None:
     still = FakeShard("still", table(np.full((40, len(CHANNELS)), 12.0)))
-    metrics, result = judged(model, still)
+    metrics, result = evaluated(model, still)
     assert metrics["persistence"]["mse_counts"]["both"]["mean"] == 0
     assert metrics["context_mean"]["mae_counts"]["x"]["t3"] == 0
     assert metrics["skill"]["mse_counts"] == {}
@@ -297,29 +308,29 @@ def test_a_signal_that_stays_has_no_error_and_no_skill(model: dict[str, bytes]) 
 def test_recordings_without_a_window_are_counted_and_do_no_harm(model: dict[str, bytes]) -> None:
     empty = FakeShard("a-empty", table(np.zeros((0, len(CHANNELS)))))
     short = FakeShard("short", motion(1, rows=LENGTH - 1).content)
-    metrics, result = judged(model, empty, *TEST, short)
-    wanted, _ = judged(model, *TEST)
+    metrics, result = evaluated(model, empty, *TEST, short)
+    wanted, _ = evaluated(model, *TEST)
     assert metrics["counts"] == wanted["counts"] | {"recordings_without_window": 2}
     assert metrics["model"] == wanted["model"]
     for name in ("a-empty", "short"):
         found = result.recordings[name].tables
         assert isinstance(found, pa.Table)
         assert found.num_rows == 0
-    none, _ = judged(model, empty)
+    none, _ = evaluated(model, empty)
     assert none == {"counts": {"windows": 0, "recordings": 0, "recordings_without_window": 1, "effective_windows": 0}}
 
 
 def test_every_window_is_judged_in_contact_or_not(model: dict[str, bytes]) -> None:
     free = FakeShard("trial-20", table(counts(TEST[0]), poses(TEST[0]), contact=np.full(80, -1)), TEST[0].attributes)
-    metrics, result = judged(model, free)
-    assert metrics["model"] == judged(model, TEST[0])[0]["model"]
+    metrics, result = evaluated(model, free)
+    assert metrics["model"] == evaluated(model, TEST[0])[0]["model"]
     found = result.recordings["trial-20"].streams[""]
     assert set(found["contact"].to_pylist()) == {-1}
 
 
 def test_predictions_stand_at_the_time_they_are_known(model: dict[str, bytes]) -> None:
-    _, result = judged(model, TEST[0])
-    _, _, some = foretold(ForwardModel.load(model), TEST[0])
+    _, result = evaluated(model, TEST[0])
+    _, _, some = predicted_windows(ForwardModel.load(model), TEST[0])
     found, name = result.recordings[TEST[0].name].streams[""], CHANNELS[0]
     assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
     assert [column for column in found.column_names if column.startswith(name)] == [name, f"{name}_t1", f"{name}_t3"]
@@ -331,18 +342,18 @@ def test_recordings_of_another_rate_or_grid_are_refused(model: dict[str, bytes])
     content = TEST[0].content
     fast = content.set_column(0, content.schema.field(0), [np.arange(80) * 10_000_000])
     with pytest.raises(TacpipeError, match=r"100 rows a second and the model was trained at 50.*--rate-hz 50"):
-        judged(model, FakeShard("fast", fast))
+        evaluated(model, FakeShard("fast", fast))
     with pytest.raises(TacpipeError, match=r"fresh has a fresh grid and the model was trained on a uniform one"):
-        judged(model, FakeShard("fresh", content, {"grid": "fresh"}))
+        evaluated(model, FakeShard("fresh", content, {"grid": "fresh"}))
 
 
 def test_recordings_of_another_layout_are_refused(model: dict[str, bytes]) -> None:
     fewer = FakeShard("fewer", TEST[0].content.drop_columns(CHANNELS[-3:]))
     with pytest.raises(TacpipeError, match="fewer: The codec does not fit this table"):
-        judged(model, fewer)
+        evaluated(model, fewer)
 
 
 def test_judging_again_gives_the_same_bytes_for_a_control_too(tmp_path: Path) -> None:
     files = trained(tmp_path, actions="shuffled")
-    (_, first), (_, again) = judged(files, *TEST), judged(files, *TEST)
+    (_, first), (_, again) = evaluated(files, *TEST), evaluated(files, *TEST)
     assert first.files == again.files

@@ -19,8 +19,8 @@ from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.task import ForwardModel, load
 from tests.conftest import sample_data
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeRecording, FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
     HORIZON,
@@ -28,9 +28,9 @@ from tests.tasks.forward.trials import (
     asked,
     compressed,
     counts,
-    foretold,
     panda,
     poses,
+    predicted_windows,
     trained,
 )
 
@@ -79,7 +79,7 @@ def test_predict_says_what_is_judged(
 ) -> None:
     made = load(models[name])
     shard = TEST if "raw" in name else compressed(TEST, files=latents["levels"].files).recordings[TEST.name]
-    found, starts, some = foretold(made, shard)
+    found, starts, some = predicted_windows(made, shard)
     predicted = made.predict(*asked(found, starts))
     assert predicted.shape == (72, HORIZON, len(CHANNELS))
     assert predicted.dtype == np.float64
@@ -92,7 +92,7 @@ def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_wi
 ) -> None:
     made = load(models["gru increments"])
     shard = compressed(TEST, files=latents["increments"].files, representation="increments").recordings[TEST.name]
-    found, starts, some = foretold(made, shard)
+    found, starts, some = predicted_windows(made, shard)
     predicted, wanted = made.predict(*asked(found, starts)), some.predictions["model"].count
     # the first window begins where the recording does, so that nothing is lost
     assert np.allclose(predicted[0], wanted[0], atol=0.05)
@@ -146,7 +146,7 @@ def test_touch_after_now_does_not_change_what_is_predicted_now(
     shards: list[Any] = [TEST, later]
     if "levels" in name:
         shards = [compressed(one, files=latents["levels"].files).recordings[TEST.name] for one in shards]
-    (_, _, before), (_, _, after) = (foretold(made, one) for one in shards)
+    (_, _, before), (_, _, after) = (predicted_windows(made, one) for one in shards)
     known = now - CONTEXT + 2  # windows whose last frame of the past is not after ``now``
     for predictor, said in before.predictions.items():
         if not predictor.startswith("codec"):  # which tells what the codec loses of the truth
@@ -273,6 +273,6 @@ def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:
     felt = 1000 * (pose[:, :1] - pose[0, :1]) + np.random.default_rng(0).normal(0, 1, (80, len(CHANNELS)))
     shard = FakeShard("panda", table(felt, pose, extra=joints))
     made = load(trained(tmp_path, dataset(shard), dataset(shard), epochs=1))
-    found, starts, some = foretold(made, shard)
+    found, starts, some = predicted_windows(made, shard)
     assert np.allclose(made.predict(*asked(found, starts)), some.predictions["model"].count, atol=0.05)
     assert found.arm[0, 7:].any()

@@ -10,8 +10,9 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.tasks.forward import task as forward
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
-from tests.tasks.forward.trials import HORIZON, compressed, foretold, trained
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
+from tests.tasks.forward.trials import HORIZON, compressed, predicted_windows, trained
 
 TEST = motion(20)
 
@@ -23,7 +24,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def test_each_row_holds_what_the_model_says_of_the_steps_asked_for(model: dict[str, bytes]) -> None:
     found = forward.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
-    _, _, some = foretold(forward.load(model), TEST)
+    _, _, some = predicted_windows(forward.load(model), TEST)
     assert found.column_names[:3] == ["t_ns", f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t4"]
     assert found.num_columns == 1 + 2 * len(CHANNELS)
     assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]

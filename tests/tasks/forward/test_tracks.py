@@ -12,7 +12,8 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
-from tests.stages.learning_fakes import CHANNELS, FakeShard, table
+from tests.fake_recordings import FakeShard
+from tests.stages.learning_fakes import CHANNELS, table
 from tests.tasks.forward.trials import panda, track
 
 RNG = np.random.default_rng(0)

@@ -17,8 +17,9 @@ from tacpipe.models.forecasts import ARCHITECTURES
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import task as forward
 from tacpipe.training import checkpoint
-from tests.stages.learning_fakes import CHANNELS, FakeShard, dataset, motion, table
-from tests.tasks.forward.trials import HORIZON, compressed, judged, params, trained
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, motion, table
+from tests.tasks.forward.trials import HORIZON, compressed, evaluated, params, trained
 
 TRAIN, VAL = [motion(seed) for seed in range(3)], [motion(10), motion(11)]
 FILES = {"model.safetensors", "baselines.safetensors", "config.json", "history.jsonl"}
@@ -115,7 +116,7 @@ def test_a_channel_that_never_moves_and_one_recording_without_rows_do_no_harm(tm
     given = dataset(*map(dead, TRAIN))
     files = trained(tmp_path / "dead", given, dataset(dead(VAL[0])), architecture="taxelwise")
     assert config(files)["scaling"]["channel_count"][4] == 1.0
-    metrics, _ = judged(files, dead(motion(20)))
+    metrics, _ = evaluated(files, dead(motion(20)))
     assert np.isfinite(metrics["model"]["mse_standard"]["mean"])
     empty = FakeShard("empty", table(np.zeros((0, len(CHANNELS)))))
     with_empty = trained(tmp_path / "a", dataset(empty, *TRAIN), dataset(empty, *VAL), epochs=1)
@@ -145,7 +146,7 @@ def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
 def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_path: Path) -> None:
     sizes = {"epochs": 15, "patience": 15, "learning_rate": 0.01, "baselines": False}
     files = trained(tmp_path, dataset(*map(strolling, range(3))), dataset(strolling(10)), actions=actions, **sizes)
-    metrics, _ = judged(files, strolling(20), strolling(21))
+    metrics, _ = evaluated(files, strolling(20), strolling(21))
     skill = metrics["skill"]["mse_counts"][f"t{HORIZON}"]["mean"]
     assert skill > 0.9 if actions == "planned" else skill < 0.2
 
@@ -245,7 +246,7 @@ def test_baselines_can_be_left_out(tmp_path: Path) -> None:
     files = trained(tmp_path, baselines=False)
     assert set(files) == FILES - {"baselines.safetensors"}
     assert not {"baselines", "anticipation"} & set(config(files))
-    metrics, _ = judged(files, motion(20))
+    metrics, _ = evaluated(files, motion(20))
     assert {"model", "persistence", "context_mean", "skill", "counts"} == set(metrics)
 
 

@@ -22,7 +22,8 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
-from tests.stages.learning_fakes import CHANNELS, REST, FakeShard, dataset, motion, table
+from tests.fake_recordings import FakeShard, dataset
+from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 
 CONTEXT, HORIZON = 5, 4
 LENGTH = CONTEXT + HORIZON
@@ -56,14 +57,14 @@ def track(content: pa.Table, name: str = "trial", **attributes: Any) -> tracks.T
     return tracks.track(shard, tracks.codec_of(content, {}))
 
 
-def judged(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
-    """``metrics.json`` and the result of judging a model on recordings."""
+def evaluated(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
+    """``metrics.json`` and the result of evaluating a model on recordings."""
     result: Result = forward.evaluate(model, dataset(*shards, files=files))
     return json.loads(result.files["metrics.json"]), result
 
 
-def foretold(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, Int64s, Predicted]:
-    """What a model says of all windows of a recording, with the windows' first rows."""
+def predicted_windows(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, Int64s, Predicted]:
+    """What a model predicts for all windows of a recording, with the windows' first rows."""
     found = tracks.track(shard, forecaster.codec)
     starts = found.starts(forecaster.context, forecaster.horizon)
     (some,) = predicted(forecaster, found, starts)

@@ -17,7 +17,7 @@ CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
 SHAPES = {"a": Shape(4, 3, hidden=6, latents=5), "b": Shape(7, 3, hidden=6, latents=5)}
 
 
-def felt(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
+def touched(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
     generator = torch.Generator().manual_seed(len(sensor) + SHAPES[sensor].channels)
     return ScaledSlides(torch.randn(len(classes), 9, SHAPES[sensor].channels, generator=generator), classes)
 
@@ -28,7 +28,7 @@ def networks(architecture: str = "raec") -> nn.ModuleDict:
 
 
 def work(weights: Weights, frozen: str = "", **classes: Tensor) -> JointWork:
-    given = {name: felt(name, classes.get(name, CLASSES)) for name in SHAPES}
+    given = {name: touched(name, classes.get(name, CLASSES)) for name in SHAPES}
     pairs = Pairs({name: one.classes for name, one in given.items()}, 16)
     return JointWork(given, given, pairs, weights, frozen)
 

@@ -21,7 +21,7 @@ from tacpipe.tasks.material import losses
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
 from tacpipe.training import loop
-from tests.tasks.material.textures import MATERIALS, dataset, judged, slide, slides, trained
+from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
 RAEC = {"architecture": "raec", "epochs": 3}
 
@@ -33,7 +33,7 @@ def predictions(result: Any) -> dict[str, list[Any]]:
 
 @pytest.mark.parametrize("changed", [{}, RAEC, {"architecture": "x-lstm"}, {**RAEC, "joint": False}])
 def test_every_unseen_slide_of_every_sensor_is_counted(tmp_path: Path, changed: dict[str, Any]) -> None:
-    metrics, result = judged(trained(tmp_path, **changed), slides(8, 3))
+    metrics, result = evaluated(trained(tmp_path, **changed), slides(8, 3))
     rows = predictions(result)
     assert metrics["model"]["n"] == {"biotac": 12, "roboskin": 12}
     assert metrics["counts"]["slides"] == {"biotac": 12, "roboskin": 12}
@@ -53,7 +53,7 @@ def test_every_unseen_slide_of_every_sensor_is_counted(tmp_path: Path, changed: 
 
 
 def test_the_strong_classifier_names_textures_that_it_can_tell_apart(tmp_path: Path) -> None:
-    metrics, _ = judged(trained(tmp_path), slides(8, 3))
+    metrics, _ = evaluated(trained(tmp_path), slides(8, 3))
     assert metrics["model"]["accuracy"] == {"biotac": 1.0, "roboskin": 1.0}
     assert metrics["permuted_labels"]["accuracy"]["biotac"] < 0.7
 
@@ -61,37 +61,37 @@ def test_the_strong_classifier_names_textures_that_it_can_tell_apart(tmp_path: P
 @pytest.mark.long
 def test_a_network_learns_textures_given_time(tmp_path: Path) -> None:
     time = {"epochs": 40, "hidden": 16, "latents": 8, "align_from": 5, "learning_rate": 0.01, "scaling": "standard"}
-    metrics, _ = judged(trained(tmp_path, architecture="raec", **time), slides(8, 3))
+    metrics, _ = evaluated(trained(tmp_path, architecture="raec", **time), slides(8, 3))
     assert metrics["model"]["low"]["biotac"] > 0.25
 
 
 def test_labels_dealt_out_anew_leave_nothing_to_learn(tmp_path: Path) -> None:
-    metrics, _ = judged(trained(tmp_path, labels="permuted"), slides(8, 6))
+    metrics, _ = evaluated(trained(tmp_path, labels="permuted"), slides(8, 6))
     low, _ = wilson(metrics["model"]["correct"]["biotac"], metrics["model"]["n"]["biotac"])
     assert low < 0.25
 
 
 def test_slides_that_the_model_has_seen_are_reported_apart(tmp_path: Path) -> None:
-    metrics, result = judged(trained(tmp_path), slides(5, 4))
+    metrics, result = evaluated(trained(tmp_path), slides(5, 4))
     assert metrics["model"]["n"]["biotac"] == 4
     assert metrics["seen"]["model"]["n"]["biotac"] == 12
     assert sum(predictions(result)["seen"]) == 24
 
 
 def test_the_confusions_add_up_to_the_unseen_slides(tmp_path: Path) -> None:
-    _, result = judged(trained(tmp_path), slides(5, 4))
+    _, result = evaluated(trained(tmp_path), slides(5, 4))
     lines = result.files["confusion.csv"].decode().splitlines()[1:]
     assert sum(int(line.split(",")[-1]) for line in lines) == 8
 
 
 def test_dropping_the_last_batch_counts_whole_batches_only(tmp_path: Path) -> None:
-    metrics, _ = judged(trained(tmp_path, **RAEC, drop_last=True), slides(8, 3))
+    metrics, _ = evaluated(trained(tmp_path, **RAEC, drop_last=True), slides(8, 3))
     assert metrics["model"]["n"] == {"biotac": 8, "roboskin": 8}
     assert metrics["model"]["correct"]["biotac"] == round(8 * metrics["model"]["accuracy"]["biotac"])
 
 
 def test_scores_and_latents_of_a_network_lie_beside_what_it_names(tmp_path: Path) -> None:
-    _, result = judged(trained(tmp_path, **RAEC), slides(8, 1))
+    _, result = evaluated(trained(tmp_path, **RAEC), slides(8, 1))
     rows = predictions(result)
     scores = np.array([rows[f"score_{kind:02d}"] for kind in MATERIALS])
     assert rows["model"] == [MATERIALS[i] for i in scores.argmax(axis=0)]
@@ -100,7 +100,7 @@ def test_scores_and_latents_of_a_network_lie_beside_what_it_names(tmp_path: Path
 
 def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
     files = trained(tmp_path, **RAEC)
-    _, result = judged(files, slides(8, 1))
+    _, result = evaluated(files, slides(8, 1))
     rows, found = predictions(result), material.load(files)
     frames = np.column_stack(
         [slide("biotac", 2, 8).table("slide").column(f"channel{number:02d}").to_numpy() for number in range(1, 6)]
@@ -119,7 +119,7 @@ def test_both_the_best_and_the_last_weights_are_kept(tmp_path: Path, select: str
     config = json.loads(files[CONFIG])
     best = max(history, key=lambda line: (sum(one["accuracy"] for one in line["val"].values()), line["epoch"]))
     assert config["validation"]["epoch"] == dict.fromkeys(("biotac", "roboskin"), best["epoch"])
-    assert ("last_epoch" in judged(files, slides(8, 1))[0]) == (select == "best")
+    assert ("last_epoch" in evaluated(files, slides(8, 1))[0]) == (select == "best")
 
 
 @cache
@@ -159,19 +159,19 @@ def test_mapping_to_a_known_space_leaves_the_known_sensor_as_it_was(tmp_path: Pa
             assert torch.equal(after[name], value)
     assert torch.equal(after["biotac.classifier.weight"], before["roboskin.classifier.weight"])
     assert not torch.equal(after["biotac.to_latents.weight"], before["biotac.to_latents.weight"])
-    assert "swapped" not in judged(mapped, slides(8, 1))[0]
+    assert "swapped" not in evaluated(mapped, slides(8, 1))[0]
 
 
 def test_slides_of_the_model_that_a_mapping_began_with_count_as_seen(tmp_path: Path) -> None:
     known = trained(tmp_path / "known", slides(20, 6), **RAEC, joint=False)
     mapped = trained(tmp_path / "mapped", **RAEC, frozen_sensor="roboskin", init=known)
-    metrics, _ = judged(mapped, slides(20, 2))
+    metrics, _ = evaluated(mapped, slides(20, 2))
     assert metrics["seen"]["counts"]["slides"] == {"biotac": 8, "roboskin": 8}
     assert metrics["counts"]["slides"] == {"biotac": 0, "roboskin": 0}
 
 
 def test_materials_held_out_are_named_by_the_other_sensors_classifier_alone(tmp_path: Path) -> None:
-    metrics, _ = judged(trained(tmp_path, **RAEC, hold_out="roboskin=3,4"), slides(8, 3))
+    metrics, _ = evaluated(trained(tmp_path, **RAEC, hold_out="roboskin=3,4"), slides(8, 3))
     assert metrics["model"]["n"] == {"biotac": 12, "roboskin": 6}
     zero = metrics["zero_shot"]
     assert zero["n"] == {"roboskin": 6}
@@ -184,7 +184,7 @@ def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(t
     files = trained(tmp_path, **RAEC, pairing="permuted")
     partners = {int(one): other for one, other in json.loads(files[CONFIG])["partners"].items()}
     assert sorted(partners.values()) == list(MATERIALS)
-    _, result = judged(files, slides(8, 2))
+    _, result = evaluated(files, slides(8, 2))
     rows, found = predictions(result), material.load(files)
     latents = np.array([rows[f"z{number:02d}"] for number in range(1, 7)], np.float32).T
     for sensor, partner in (("biotac", "roboskin"), ("roboskin", "biotac")):
@@ -197,10 +197,10 @@ def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(t
 def test_one_sensor_alone_is_trained_where_only_it_is_asked_for(tmp_path: Path) -> None:
     files = trained(tmp_path, **RAEC, sensors="roboskin")
     assert list(json.loads(files[CONFIG])["sensors"]) == ["roboskin"]
-    assert judged(files, slides(8, 1, ("roboskin",)))[0]["model"]["n"] == {"roboskin": 4}
-    assert judged(files, slides(8, 1))[0]["model"]["n"] == {"roboskin": 4}
+    assert evaluated(files, slides(8, 1, ("roboskin",)))[0]["model"]["n"] == {"roboskin": 4}
+    assert evaluated(files, slides(8, 1))[0]["model"]["n"] == {"roboskin": 4}
     with pytest.raises(TacpipeError, match="No recording is of the sensor roboskin; there are biotac"):
-        judged(files, slides(8, 1, ("biotac",)))
+        evaluated(files, slides(8, 1, ("biotac",)))
 
 
 def test_the_strong_classifier_needs_no_validation_slides_and_learns_from_those_there_are(tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_the_strong_classifier_needs_no_validation_slides_and_learns_from_those_
 def test_baselines_can_be_left_out(tmp_path: Path) -> None:
     files = trained(tmp_path, **RAEC, baselines=False)
     assert BASELINES not in files
-    assert "mean_level" not in judged(files, slides(8, 1))[0]
+    assert "mean_level" not in evaluated(files, slides(8, 1))[0]
 
 
 def test_networks_are_trained_by_the_loop_that_all_tasks_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,8 +310,8 @@ def test_the_published_code_with_its_quirks_is_a_preset() -> None:
 def test_the_published_quirks_train_and_are_judged_on_whole_batches(tmp_path: Path) -> None:
     quirks = {"pairing": "fixed", "shuffle": False, "drop_last": True, "unpool": "last", "select": "last", "seed": 1}
     files = trained(tmp_path, **RAEC, **quirks)
-    metrics, _ = judged(files, slides(8, 3))
+    metrics, _ = evaluated(files, slides(8, 3))
     assert metrics["model"]["n"] == {"biotac": 8, "roboskin": 8}
     assert json.loads(files[CONFIG])["shapes"]["roboskin"]["unpool"] == "last"
-    few, _ = judged(trained(tmp_path / "few", validation=slides(6, 1), **RAEC, **quirks), slides(8, 1))
+    few, _ = evaluated(trained(tmp_path / "few", validation=slides(6, 1), **RAEC, **quirks), slides(8, 1))
     assert few["model"]["n"] == {"biotac": 4, "roboskin": 4}

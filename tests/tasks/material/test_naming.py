@@ -14,8 +14,8 @@ from tacpipe.report.material.methods import Run
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
-from tests.stages.learning_fakes import FakeDataset
-from tests.tasks.material.textures import MATERIALS, dataset, judged, slide, slides, trained
+from tests.fake_recordings import FakeDataset
+from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
 WORDS = {1: "cork", 2: "felt", 3: "foam, soft", 4: "über-rubber"}  # in the order of their numbers, as sorted
 
@@ -57,7 +57,7 @@ def test_a_label_that_no_model_knows_is_refused_with_those_that_it_does() -> Non
 def test_words_give_the_predictions_of_numbers_in_words(tmp_path: Path, key: str) -> None:
     by_number = trained(tmp_path / "n", numbered(0, 4), numbered(4, 1), architecture="minirocket")
     by_word = trained(tmp_path / "w", worded(0, 4, key), worded(4, 1, key), architecture="minirocket", label=key)
-    (first, found), (second, other) = judged(by_number, numbered(5, 2)), judged(by_word, worded(5, 2, key))
+    (first, found), (second, other) = evaluated(by_number, numbered(5, 2)), evaluated(by_word, worded(5, 2, key))
     assert first == second
     tables = [result.recordings["predictions"].streams[""] for result in (found, other)]
     for column in ("material", "model", "mean_level"):
@@ -81,7 +81,7 @@ def test_slides_of_an_unknown_word_are_refused_by_evaluation_and_read_by_predict
     model = trained(tmp_path, worded(0, 3), worded(3, 1), architecture="minirocket")
     strange = dataset(slide("biotac", 2, 9, material="tin"))
     with pytest.raises(TacpipeError, match=r"biotac-m02-t009.*tin.*cork"):
-        judged(model, strange)
+        evaluated(model, strange)
     assert material.predict(model, strange).recordings["predictions"].streams[""].num_rows == 1
 
 
@@ -89,7 +89,7 @@ def test_slides_of_an_unknown_word_are_refused_by_evaluation_and_read_by_predict
 def test_networks_and_held_out_classes_go_by_their_words(tmp_path: Path) -> None:
     both = [dataset(*worded(*span).recordings.values(), *_skin(*span)) for span in ((0, 4), (4, 2), (6, 2))]
     files = trained(tmp_path, both[0], both[1], architecture="raec", hold_out="roboskin=cork,über-rubber")
-    tree, result = judged(files, both[2])
+    tree, result = evaluated(files, both[2])
     assert tree["zero_shot"]["n"]["roboskin"] == 4
     table = result.recordings["predictions"].streams[""]
     read = predictions.read(table, MaterialModel.load(files).config)
@@ -100,7 +100,7 @@ def test_networks_and_held_out_classes_go_by_their_words(tmp_path: Path) -> None
 
 def test_a_report_has_the_words(tmp_path: Path) -> None:
     files = trained(tmp_path, worded(0, 4), worded(4, 1), architecture="minirocket")
-    _, result = judged(files, worded(5, 3))
+    _, result = evaluated(files, worded(5, 3))
     shards = {"predictions": _Shard(result.recordings["predictions"].streams[""])}
     run = Run.read(FakeDataset(shards, result.files, {}))  # type: ignore[arg-type]
     method: Any = type("M", (), {"of": lambda self, sensor: [run]})()

@@ -13,7 +13,7 @@ import pytest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, WEIGHTS
-from tests.tasks.material.textures import Slide, dataset, judged, params
+from tests.tasks.material.textures import Slide, dataset, evaluated, params
 
 # Two waves, in periods a metre, by which each of eight materials is known.
 WAVES = {kind + 1: (60.0 + 25 * kind, 270.0 - 25 * ((3 * kind) % 8)) for kind in range(8)}
@@ -60,7 +60,7 @@ def predictions(result: Any) -> dict[str, list[Any]]:
 
 
 def test_a_sensor_names_materials_whose_labels_only_the_other_one_was_told(tmp_path: Path) -> None:
-    metrics, result = judged(trained(tmp_path, hold_out="roboskin=3,6"), slides(5, 3))
+    metrics, result = evaluated(trained(tmp_path, hold_out="roboskin=3,6"), slides(5, 3))
     zero = metrics["zero_shot"]
     assert zero["n"] == {"roboskin": 6}
     assert zero["chance"] == {"roboskin": 1 / 8}
@@ -96,7 +96,7 @@ def test_a_material_that_a_sensor_never_felt_is_as_one_held_out(tmp_path: Path) 
     ]
     files = trained(tmp_path, dataset(*some))
     assert json.loads(files[CONFIG])["held_out"] == {"biotac": [], "roboskin": [4]}
-    assert judged(files, slides(5, 3))[0]["zero_shot"]["n"] == {"roboskin": 3}
+    assert evaluated(files, slides(5, 3))[0]["zero_shot"]["n"] == {"roboskin": 3}
 
 
 def test_the_speed_is_that_which_recordings_tell_and_else_that_of_params(tmp_path: Path) -> None:
@@ -108,13 +108,15 @@ def test_the_speed_is_that_which_recordings_tell_and_else_that_of_params(tmp_pat
 
 
 def test_the_wrong_speed_takes_what_sensors_share(tmp_path: Path) -> None:
-    right = judged(trained(tmp_path, hold_out="roboskin=1,3,6,8"), slides(5, 3))[0]["zero_shot"]["accuracy"]["roboskin"]
+    right = evaluated(trained(tmp_path, hold_out="roboskin=1,3,6,8"), slides(5, 3))[0]["zero_shot"]["accuracy"][
+        "roboskin"
+    ]
     files = trained(tmp_path, hold_out="roboskin=1,3,6,8", speeds="biotac=0.025,roboskin=0.03")
-    assert judged(files, slides(5, 3))[0]["zero_shot"]["accuracy"]["roboskin"] < right - 0.2
+    assert evaluated(files, slides(5, 3))[0]["zero_shot"]["accuracy"]["roboskin"] < right - 0.2
 
 
 def test_one_sensor_alone_learns_its_own_materials(tmp_path: Path) -> None:
-    metrics, _ = judged(
+    metrics, _ = evaluated(
         trained(tmp_path, sensors="roboskin"),
         dataset(*(one for one in slides(5, 3).recordings.values() if one.attributes["sensor"] == "roboskin")),
     )
@@ -125,7 +127,7 @@ def test_one_sensor_alone_learns_its_own_materials(tmp_path: Path) -> None:
 
 def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
     files = trained(tmp_path)
-    rows = predictions(judged(files, slides(5, 1))[1])
+    rows = predictions(evaluated(files, slides(5, 1))[1])
     one = slide("roboskin", 2, 5)
     table = one.table("slide")
     frames = np.column_stack([table.column(name).to_numpy() for name in table.column_names])
@@ -136,7 +138,7 @@ def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
 
 
 def test_labels_dealt_out_anew_leave_nothing_to_learn(tmp_path: Path) -> None:
-    metrics, _ = judged(trained(tmp_path, labels="permuted"), slides(5, 4))
+    metrics, _ = evaluated(trained(tmp_path, labels="permuted"), slides(5, 4))
     assert metrics["model"]["low"]["biotac"] < 1 / 8
     assert metrics["model"]["low"]["roboskin"] < 1 / 8
 

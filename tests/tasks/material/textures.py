@@ -14,8 +14,7 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.material import task as material
 from tests.asked import fitting
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 
 MATERIALS = (1, 2, 3, 4)
 FRAMES = {"biotac": 40, "roboskin": 24}
@@ -78,7 +77,7 @@ def trained(
     )
 
 
-def judged(model: Mapping[str, bytes], recordings: Any) -> tuple[dict[str, Any], Result]:
-    """``metrics.json`` and the result of judging a model."""
+def evaluated(model: Mapping[str, bytes], recordings: Any) -> tuple[dict[str, Any], Result]:
+    """``metrics.json`` and the result of evaluating a model."""
     result: Result = material.evaluate(model, recordings)
     return json.loads(result.files["metrics.json"]), result

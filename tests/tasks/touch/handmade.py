@@ -20,8 +20,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch.grasps import Grasps
 from tests.asked import fitting
-from tests.fake_recordings import FakeRecording
-from tests.stages.learning_fakes import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 
 OBJECTS = {"ball": 0.03, "melon": 0.05}  # metres, half the size
 POINTS = 40
@@ -104,8 +103,8 @@ def trained(folder: Path, training: Any = None, validation: Any = None, **change
     return touch.train(params(**changed), training or recordings(), validation or dataset(), folder)
 
 
-def judged(model: Mapping[str, bytes], given: Any) -> tuple[dict[str, Any], Result]:
-    """``metrics.json`` and the result of judging a model."""
+def evaluated(model: Mapping[str, bytes], given: Any) -> tuple[dict[str, Any], Result]:
+    """``metrics.json`` and the result of evaluating a model."""
     result: Result = touch.evaluate(model, given)
     return json.loads(result.files["metrics.json"]), result
 

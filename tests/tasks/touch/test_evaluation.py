@@ -19,7 +19,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics import regression
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.touch import task as touch
-from tests.tasks.touch.handmade import dataset, judged, recording, recordings, trained
+from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
 
 PREDICTORS = ("model", "constant", "object_mean", "nearest_in_time")
 FAST = {"architecture": "trees", "inputs": "xyz"}
@@ -40,7 +40,7 @@ def asked() -> Any:
 
 @pytest.fixture(scope="module")
 def result(model: dict[str, bytes], asked: Any) -> Result:
-    return judged(model, asked)[1]
+    return evaluated(model, asked)[1]
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_measures_are_scikit_learns_on_the_predictions_written(
 
 
 def test_the_letters_figure_is_no_larger_than_the_error_over_all(model: dict[str, bytes]) -> None:
-    tree, result = judged(model, recordings(10, 20))  # four batches of ten
+    tree, result = evaluated(model, recordings(10, 20))  # four batches of ten
     true, told = (result.recordings["predictions"].streams[name] for name in ("true", "model"))
     for target in biotac_sp.TARGETS:
         mine, batch = (tree["model"][name][target] for name in ("rmse", "rmse_batch_mean"))
@@ -164,7 +164,7 @@ def test_novel_objects_are_resampled_whole_and_known_ones_by_grasp(result: Resul
 
 
 def test_the_metrics_are_json_without_values_that_are_not_numbers(model: dict[str, bytes]) -> None:
-    files = judged(model, dataset(recording(50, "shoe")))[1].files  # one grasp: no spread, no interval
+    files = evaluated(model, dataset(recording(50, "shoe")))[1].files  # one grasp: no spread, no interval
 
     def refuse(name: str) -> float:
         raise AssertionError(name)
@@ -194,7 +194,7 @@ def test_the_streams_have_the_columns_and_types_that_are_promised(result: Result
 
 
 def test_grasps_all_seen_leave_nothing_to_judge_but_what_was_seen(model: dict[str, bytes]) -> None:
-    tree, result = judged(model, recordings())
+    tree, result = evaluated(model, recordings())
     assert tree["counts"] == {"grasps": 0}
     assert "model" not in tree
     assert tree["seen"]["model"]["n"] == 12
@@ -204,19 +204,19 @@ def test_grasps_all_seen_leave_nothing_to_judge_but_what_was_seen(model: dict[st
 def test_a_grasp_counts_as_seen_by_its_content_or_its_reading_and_not_by_its_name(model: dict[str, bytes]) -> None:
     copy = dataclasses.replace(recording(0), name="ball-000")
     changed = recording(0, session="other")
-    tree, _ = judged(model, dataset(copy))
+    tree, _ = evaluated(model, dataset(copy))
     assert tree["seen"]["counts"]["grasps"] == 1
-    assert judged(model, dataset(changed))[0]["seen"]["counts"]["grasps"] == 1  # a reading that was logged twice
+    assert evaluated(model, dataset(changed))[0]["seen"]["counts"]["grasps"] == 1  # a reading that was logged twice
 
 
 def test_results_on_simulated_grasps_say_so(model: dict[str, bytes]) -> None:
-    _, result = judged(model, dataset(recording(60, simulated=True)))
+    _, result = evaluated(model, dataset(recording(60, simulated=True)))
     assert dict(result.recordings["predictions"].attributes) == {"simulated": True}
 
 
 def test_the_model_and_its_history_come_along(tmp_path: Path) -> None:
     files = trained(tmp_path, architecture="patches", inputs="xyz")
-    result = judged(files, recordings(6, 1))[1]
+    result = evaluated(files, recordings(6, 1))[1]
     assert set(result.files) == {"metrics.json", "by_object.csv", "headline.json", "config.json", "history.jsonl"}
     assert all(result.files[name] == files[name] for name in ("config.json", "history.jsonl"))
 

@@ -108,7 +108,7 @@ def test_the_same_generator_draws_the_same_points() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 64, 130])
-def test_what_is_foretold_is_the_mean_over_visits_of_every_grasp(count: int) -> None:
+def test_what_is_predicted_is_the_mean_over_visits_of_every_grasp(count: int) -> None:
     found = predictions(Sum(), Numbers(), count, draws=3)
     np.testing.assert_allclose(found, np.repeat(np.arange(count)[:, None] + 10.0, 2, axis=1))
 

@@ -8,7 +8,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch import task as touch
-from tests.tasks.touch.handmade import cloud, dataset, judged, recording, recordings, trained
+from tests.tasks.touch.handmade import cloud, dataset, evaluated, recording, recordings, trained
 
 FAST = {"architecture": "trees", "targets": "pdc_th,e_mf"}
 
@@ -18,7 +18,7 @@ def test_grasps_without_reading_are_told_what_evaluate_tells(tmp_path: Path) -> 
     table = touch.predict(files, recordings(6, 2, felt=False)).recordings["predictions"].streams[""]
     assert table.column_names == ["recording", "pdc_th", *(f"e_mf_{n:02d}" for n in range(1, 25))]
     assert table.column("recording").to_pylist() == ["ball-006", "ball-007", "melon-006", "melon-007"]
-    told = judged(files, recordings(6, 2))[1].recordings["predictions"].streams["model"]
+    told = evaluated(files, recordings(6, 2))[1].recordings["predictions"].streams["model"]
     assert table.drop_columns(["recording"]).equals(told)
 
 

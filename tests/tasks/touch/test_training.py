@@ -23,9 +23,9 @@ from tests.tasks.touch.handmade import (
     cloud,
     config,
     dataset,
+    evaluated,
     grasps,
     history,
-    judged,
     params,
     recording,
     recordings,
@@ -185,7 +185,7 @@ def test_some_targets_alone_are_told_where_only_they_are_asked_for(changed: dict
     assert config(files)["targets"] == ["pdc_mf", "e_th"]
     told = touch.load(files).predict_grasps(grasps(6, 1))
     assert {target: values.shape for target, values in told.items()} == {"pdc_mf": (2, 1), "e_th": (2, 24)}
-    metrics, result = judged(files, recordings(6, 2))
+    metrics, result = evaluated(files, recordings(6, 2))
     assert list(metrics["model"]["rmse"]) == ["e_th", "pdc_mf"]
     streams = result.recordings["predictions"].streams
     assert {tuple(streams[name].column_names) for name in streams if name != "grasps"} == {
@@ -254,7 +254,7 @@ def test_the_papers_networks_learn_shares_of_its_ranges_and_the_balanced_loss_st
 
 
 def test_trees_tell_large_objects_from_small_ones(tmp_path: Path) -> None:
-    metrics, _ = judged(trained(tmp_path, **{**TREES, "trees": 40}, targets="pdc_th"), recordings(6, 5))
+    metrics, _ = evaluated(trained(tmp_path, **{**TREES, "trees": 40}, targets="pdc_th"), recordings(6, 5))
     assert metrics["model"]["skill"]["pdc_th"] > 0.4
     assert math.isfinite(metrics["model"]["skill_low"]["pdc_th"])
 

@@ -1,0 +1,36 @@
+"""What `tacpipe demo` runs: the commands that a lab would type, on simulated recordings or on an emulated rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tacpipe.plugins import registry
+
+LIVE_S, LIVE_TRIALS = 30, 6  # of the emulated rig
+EMULATED = "emulated"  # the folder of the emulated rig's own rig file
+
+
+def commands(output: Path) -> list[list[str]]:
+    """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
+    demos = [describe(output) for describe in registry.demos().values()]
+    given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.others)]
+    return [*(words for demo in demos for words in demo.commands), ["report", *given, "-o", str(page(output))]]
+
+
+def rig(output: Path) -> list[list[str]]:
+    """Return the commands after the emulated rig is up: 30 s recorded live, then the chain to a forecast."""
+    from tacpipe.tasks.forward import demo
+
+    recordings = str(output / "recordings")
+    live = ["--trials", str(LIVE_TRIALS), "--duration", str(LIVE_S / LIVE_TRIALS)]
+    return [
+        ["acquire", str(output / EMULATED / "rig.toml"), "-o", recordings, *live],
+        ["show", recordings],
+        *demo.chain(output),
+        ["report", str(output / "results"), "-o", str(page(output))],
+    ]
+
+
+def page(output: Path) -> Path:
+    """Return the path of the page of results."""
+    return output / "report.html"
