@@ -62,8 +62,11 @@ class Draft(Hashed):
             raise sentence(self._root, error) from error
 
     def release(self) -> None:
-        """Let go of the file."""
-        os.close(self._handle)
+        """Let go of the file. Raises `StorageError` as `write` does."""
+        try:
+            os.close(self._handle)
+        except OSError as error:
+            raise sentence(self._root, error) from error
 
 
 @contextlib.contextmanager
@@ -80,6 +83,8 @@ def begun(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Draft]:
     try:
         yield draft
     finally:
-        draft.release()
-        with contextlib.suppress(OSError):  # one that stays is swept up later
-            os.unlink(path)  # noqa: PTH108
+        try:
+            draft.release()
+        finally:
+            with contextlib.suppress(OSError):  # one that stays is swept up later
+                os.unlink(path)  # noqa: PTH108

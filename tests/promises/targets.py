@@ -17,7 +17,7 @@ import sqlite3
 import tempfile
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -363,7 +363,9 @@ def ingested(name: str, folder: Path) -> list[Any]:
     for one in list(stage.discover(given, folder).values())[:3]:
         source = one if isinstance(one, Source) else Source(one)
         values = {"values": source.values} if stage.argument("Values") else {}
-        found.append(stage(given, files=source.files, **values))
+        made = stage(given, files=source.files, **values)
+        whole = {name: rows if isinstance(rows, pa.Table) else rows.read_all() for name, rows in made.streams.items()}
+        found.append(replace(made, tables=whole))
     return found
 
 

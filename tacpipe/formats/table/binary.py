@@ -258,10 +258,11 @@ class JsonLines:
         if not any(_BEGUN.search(piece) for piece in pieces):
             return
         try:
-            table = pj.read_json(pa.BufferReader(owned(*pieces)), pj.ReadOptions(use_threads=False))
-        except (pa.ArrowInvalid, OSError) as error:
+            table = pj.read_json(pa.BufferReader(owned(*pieces)), pj.ReadOptions(use_threads=False)).flatten()
+            table.column_names  # noqa: B018  (names that are not UTF-8 are found here)
+        except (pa.ArrowInvalid, OSError, UnicodeDecodeError) as error:
             raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
-        yield table.flatten()
+        yield table
 
     def _widths(self, block: pa.Table, found: dict[str, int]) -> None:
         """Add the length that the lists of each column have. Raises `TacpipeError` where they differ."""

@@ -282,6 +282,12 @@ def test_a_key_that_only_later_lines_have_is_a_column_and_lists_of_two_lengths_a
         reading.table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "x_*" }'))
 
 
+def test_a_key_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "skin.jsonl").write_bytes(b'{"time": 1, "f\xff": 2}\n')
+    with pytest.raises(TacpipeError, match="not JSON lines"):
+        reading.table(tmp_path / "skin.jsonl", labs.stream())
+
+
 def test_a_file_that_is_one_endless_line_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(text, "LONGEST_LINE", 1000)
     monkeypatch.setattr(text, "BLOCK_BYTES", 400)
