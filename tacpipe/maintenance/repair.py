@@ -149,9 +149,12 @@ def _roots_again(store: Store) -> list[str]:
 
 
 def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
-    """Write the manifest at a root's path anew where it is damaged; return its digest. What lay there goes to quarantine."""
+    """Write the manifest at a root's path anew where it is damaged; return its digest. What lay there goes to quarantine.
+
+    Only at paths that this user's own roots name: another user's could name any file that is called so.
+    """
     path = Path(root["path"]) / manifest_of.NAME
-    if root["kind"] == PUSHED or not path.is_file():
+    if root["kind"] == PUSHED or not path.is_file() or not store.roots.own(root):
         return []
     try:
         manifest_of.find(path).manifest  # noqa: B018  (is it sound?)

@@ -122,6 +122,17 @@ class Roots:
         """Return whether the root of this name represents the dataset at ``path``."""
         return self._file(*self.named(path)).stem == name
 
+    def own(self, root: Root) -> bool:
+        """Return whether this user wrote a root: in a shared store another one's may name any path."""
+        kind, name = root["kind"], str(root["path"])
+        if kind == BESIDE and Path(name).is_absolute():
+            name = os.path.relpath(name, self.store.root.parent)
+        try:
+            with readable_errors(self.store.root, reading=True):
+                return self._file(kind, name, project_id(root)).lstat().st_uid == os.getuid()
+        except FileNotFoundError:
+            return False
+
     def named(self, path: Path) -> tuple[str, str]:
         """Return kind and name of a root: relative where the dataset lies next to its store, so that both can move."""
         beside = self.store.root.parent

@@ -84,10 +84,20 @@ def run(folder: Path, words: Sequence[str], log: Path, inject: str = "", names: 
     traced = ",".join(f"?{name}" for name in names or FAULTS)
     command = ["strace", "-f", "-qq", "-y", "-s", "4096", "-e", f"trace={traced}", "-e", "signal=none", "-o", str(log)]
     command += ["-e", f"inject={inject}"] if inject else []
+    path = os.pathsep.join(
+        filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    )  # an empty part is the folder
     ran = subprocess.run(
-        [*command, sys.executable, "-m", "tacpipe", *words],
+        [
+            *command,
+            sys.executable,
+            "-P",
+            "-m",
+            "tacpipe",
+            *words,
+        ],  # Python looks for modules elsewhere: it would not start
         cwd=folder,
-        env={**os.environ, "PYTHONHASHSEED": "0"},
+        env={**os.environ, "PYTHONHASHSEED": "0", "PYTHONPATH": path},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
