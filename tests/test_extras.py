@@ -304,7 +304,7 @@ def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monke
 def test_modules_belong_to_the_extra_whose_package_brings_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = {"torch": "learn", "sklearn": "learn", "scipy": "learn", "safetensors": "learn", "matplotlib": "learn"}
     wanted |= {"open3d": "clouds", "serial": "devices", "hid": "devices", "hidraw": "devices", "can": "devices"}
-    wanted |= {"websockets": "devices"}
+    wanted |= {"websockets": "devices", "rerun": "view", "rerun_cli": "view"}
 
     assert {module: extras.of(module) for module in wanted} == wanted
     assert extras.of("numpy") is None and extras.of("nobody") is None

@@ -24,6 +24,8 @@ PACKAGES = {  # modules whose package has another name
     "hidraw": "hidapi",
     "mlflow": "mlflow-skinny",
     "mpl_toolkits": "matplotlib",
+    "rerun": "rerun-sdk",
+    "rerun_cli": "rerun-sdk",
     "serial": "pyserial",
     "sklearn": "scikit-learn",
     "vl_convert": "vl-convert-python",

@@ -203,7 +203,7 @@ class Stream:
         self._static((CARPET, "image"), rr.Image(picture))
         names = _labels([(BINS / 2, y) for _, y in labels], [name for name, _ in labels])
         self._static((CARPET, "names"), names)
-        cursor_ns = np.linspace(start_ns, stop_ns, BINS).astype(np.int64)
+        cursor_ns = start_ns + np.linspace(0, stop_ns - start_ns, BINS).astype(np.int64)
         strips = np.zeros((BINS, 2, 2), np.float32)
         strips[:, :, 0] = np.arange(BINS)[:, None]
         strips[:, 1, 1] = picture.shape[0]
