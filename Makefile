@@ -15,6 +15,7 @@ OPEN3D_LIBRARIES := libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6
 MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 BROWSER := chromium fonts-dejavu-core
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
+SCREEN := xvfb mesa-vulkan-drivers libxkbcommon-x11-0
 BLOCK_REPLAY := user-mode-linux dmsetup e2fsprogs xfsprogs btrfs-progs
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
@@ -49,7 +50,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -116,6 +117,25 @@ test-exports: $(VENV)/.dev ## have LeRobot's loader, datasets and mlcroissant op
 	    $(BIN)/python -m tests.exports.environment .cache/exports && touch .cache/exports/bin/.made; \
 	fi
 	@TACPIPE_EXPORTS_PYTHON=$(CURDIR)/.cache/exports/bin/python $(PYTEST) tests/exports
+
+test-viewer: $(VENV)/.dev ## have Rerun's own reader open what `tacpipe view` writes, in an environment of its own (0.5 GB)
+	@if [ ! -e .cache/viewer/bin/.made ]; then \
+	    $(BIN)/python -m tests.viewer.environment .cache/viewer && touch .cache/viewer/bin/.made; \
+	fi
+	@OMP_NUM_THREADS=1 .cache/viewer/bin/python -m pytest -q tests/viewer
+
+viewer-pictures: $(VENV)/.dev ## take the pictures of the viewer in the documentation, under a virtual screen (Xvfb)
+	@if [ ! -e .cache/viewer/bin/.made ]; then \
+	    $(BIN)/python -m tests.viewer.environment .cache/viewer && touch .cache/viewer/bin/.made; \
+	fi
+	@if ! command -v Xvfb > /dev/null; then $(call debian,$(SCREEN)); fi
+	@.cache/viewer/bin/python docs/viewer_pictures.py
+
+test-trackers: $(VENV)/.dev ## have TensorBoard, an MLflow server and W&B read what --track gives them, in an environment of their own (1 GB)
+	@if [ ! -e .cache/trackers/bin/.made ]; then \
+	    $(BIN)/python -m tests.trackers.environment .cache/trackers && touch .cache/trackers/bin/.made; \
+	fi
+	@TACPIPE_TRACKERS_PYTHON=$(CURDIR)/.cache/trackers/bin/python $(PYTEST) tests/trackers
 
 test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
 	@$(BIN)/python -m tests.packaging.environments

@@ -32,6 +32,7 @@ MODULES = (
     "chain",
     "sizes",
     "array_files",
+    "tables",
 )
 RESULTS = Path(__file__).with_name("results.md")
 

@@ -1,7 +1,7 @@
 """Evaluate a model on recordings, next to its baselines.
 
-Prints how the model compares with the best baseline, with intervals over recordings, and writes it to ``headline.json``.
-Writes ``metrics.json``,
+Prints how the model compares with the best baseline, with intervals over recordings, and writes it to ``headline.json``,
+and to ``summary.json`` in few numbers, for DVC. Writes ``metrics.json``,
 ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
 predictions of each recording. Recordings that the model was trained on are reported apart,
 under ``seen``.
@@ -11,10 +11,11 @@ Example: tacpipe evaluate models/forward data/segments --split data/split -o res
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.metrics import headline
+from tacpipe.metrics import headline, summary
 from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class Params:
     """Nothing to choose: the evaluation of a model does not depend on who trained it."""
 
 
-@stage(version=3, headline=headline.FILE)
+@stage(version=4, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Evaluate a model on recordings, by the measures of the task it was trained for."""
     from tacpipe.datasets import model_files
@@ -37,4 +38,7 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     task = model_files.task(model.files)
     with model_files.validated("the model"):
         result: Result = task.evaluate(model.files, recordings)
-    return result
+    if headline.FILE not in result.files:  # of a task of another package that has none
+        return result
+    found = summary.write(headline.read(result.files[headline.FILE]), getattr(task, "SHORT_NAMES", {}))
+    return dataclasses.replace(result, files={**result.files, summary.FILE: found})

@@ -25,6 +25,7 @@ from tacpipe.errors import (
 from tacpipe.plugins.stage import RecordingOutput, Result, Stage, stage
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from os import PathLike
 
     from tacpipe.datasets.dataset import Dataset, Recording
@@ -98,10 +99,12 @@ def run(
     params_file: str | PathLike[str] | None = None,
     block: str | None = None,
     jobs: int = 0,
+    executor: str = "",
     skip_bad: bool = False,
     rerun: bool = False,
     replace: bool = False,
     progress: bool = False,
+    track: Sequence[str] = (),
     **params: Any,
 ) -> Dataset | Any:
     """Run a stage and return its opened output; what was computed before is not computed again.
@@ -124,6 +127,7 @@ def run(
     :param jobs: processes to use; 0: one a core. ``skip_bad`` leaves out recordings that cannot be read, ``rerun``
         computes what is stored too, ``replace`` lets the output replace what it must not lose otherwise.
     :param progress: show progress on a terminal, and print what a command prints while it runs.
+    :param track: trackers that follow a training, as ``("tensorboard", "mlflow:http://127.0.0.1:5000")``.
     :param params: params of the stage, checked as on the command line.
     :returns: a `Dataset`, or a `pathlib.Path` where the output is a file.
     :raises UsageError: for an unknown stage, param or value, and where an input is missing or the output must stay.
@@ -140,7 +144,7 @@ def run(
         output,
         {key: given for key, given in named.items() if given is not None},
         params,
-        calling.How(fold, role, preset, params_file, block, jobs, skip_bad, rerun, replace, progress),
+        calling.How(fold, role, preset, params_file, block, jobs, executor, skip_bad, rerun, replace, progress, track),
     )
 
 

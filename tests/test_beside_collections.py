@@ -103,8 +103,8 @@ def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_mi
     honest = repair._wanted
     looks: list[dict[str, str]] = []
 
-    def wanted(store: Store) -> dict[str, str]:
-        looks.append(honest(store))
+    def wanted(store: Store, found: repair.Soundness) -> dict[str, str]:
+        looks.append(honest(store, found))
         return {**looks[-1], **({"ab" * 32: "manifest.json"} if len(looks) == 1 else {})}
 
     monkeypatch.setattr(repair, "_wanted", wanted)

@@ -34,6 +34,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
             "howto/stage",
             "tutorials/own-data",
             "howto/hdf5",
+            "howto/view",
             "howto/export",
             "howto/format",
             "tutorials/ci-and-dvc",

@@ -244,6 +244,8 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
     assert metrics["touch/trees-known/0"]["known"]["counts"]["grasps"] in (4, 5, 6)  # of 24 in 5 folds of 2 objects
     assert metrics["touch/trees-novel/0"]["novel"]["counts"] == {"grasps": 12, "objects": 1}
     assert metrics["touch/trees-later/0"]["known"]["counts"] == {"grasps": 6, "objects": 2}
+    lines = project.run("dvc metrics show").splitlines()
+    assert lines[0].split()[:5] == ["Path", "e_mf", "e_th", "gain", "high"] and max(map(len, lines)) <= 120
     page = (project.folder / "results/touch.html").read_text()
     for shown in ("5 folds", "leave one object out", "later grasps", "<td>XYZ</td>", "<td>RGBCont</td>"):
         assert shown in page

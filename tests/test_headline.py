@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from tacpipe.cli import headline_table
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline, Row
 
@@ -90,23 +91,25 @@ def test_headlines_are_read_as_they_were_written() -> None:
 
 
 def test_the_table_has_the_model_above_its_best_baseline_and_how_the_interval_was_made() -> None:
-    lines = headline.text([ONE, of(part="known objects", seeds=3)]).splitlines()
+    lines = headline_table.text([ONE, of(part="known objects", seeds=3)]).splitlines()
     assert lines[0].split() == ["MAE", "t+1", "skill", "95", "%", "interval", "n"]
-    assert lines[1].split() == [
-        "unseen",
-        "objects",
-        "net",
-        "7.5",
-        "+0.100",
-        "+0.020",
-        "to",
-        "+0.200",
-        "12",
-        "recordings",
-    ]
-    assert lines[2].split() == ["best", "baseline:", "ridge", "8.25", "model", "is", "better"]
-    assert lines[3].endswith("12 recordings, 3 seeds")
-    told = " ".join(lines[5:])
-    assert "1 − error / error of the best baseline; the error is the squared error" in told
-    assert "bootstrap over recordings or recordings and seeds" in told
-    assert "No recording was left" in headline.text([])
+    assert lines[1] == "unseen objects"
+    assert lines[2].split() == ["net", "7.5", "+0.100", "+0.020", "to", "+0.200", "12"]
+    assert lines[3].split() == ["vs", "ridge", "8.25", "model", "is", "better"]
+    assert lines[4] == "known objects"
+    said = " ".join(lines[7:])
+    assert "n: recordings. vs: the best of 2 baselines." in said
+    assert "1 − error / error of the best baseline; the error is the squared error" in said
+    assert "bootstrap over recordings or recordings and seeds" in said
+    assert headline_table.text([]) == headline_table.EMPTY
+
+
+def test_the_table_fits_the_width_and_keeps_the_error_that_ranks_and_the_interval() -> None:
+    columns = ("MAE t+1", "MAE t+3", "MAE t+5", "MAE t+10", "vs persistence")
+    rows = [Row(name, (5.7, 13.39, 21.85, 40.87, 0.3803)) for name in ("taxelwise · raw", "last_value_linear")]
+    one = of(columns=columns, model=rows[0], baselines=(rows[1],), method="taxelwise · raw", low=-0.068, high=0.025)
+    for width, shown in ((120, columns), (80, ("MAE t+1", "vs persistence"))):
+        lines = headline_table.text([one], width).splitlines()
+        assert max(map(len, lines)) <= width
+        assert [name for name in columns if name in lines[0]] == list(shown)
+        assert "−0.068 to +0.025" in lines[2]

@@ -1,6 +1,11 @@
 import json
+import os
 from pathlib import Path
+from typing import Any
 
+import pytest
+
+from tacpipe.store.store import Store
 from tests.conftest import Lab
 
 
@@ -58,3 +63,29 @@ def test_a_dataset_that_came_without_its_ancestors_is_explained_as_far_as_it_goe
         if path.read_bytes()[:1] == b"{" and b'"simulate.toy"' in path.read_bytes():
             path.unlink()
     assert "not in this store" in lab.run("explain data/s").out
+
+
+def test_explain_reads_the_record_of_the_dataset_and_not_those_of_its_recordings(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run("simulate toy --trials 30 --rows 3 -o data/r --jobs 1")
+    lab.run("scale data/r -o data/s --jobs 1")
+    honest, read = Store.read_record, list[str]()
+
+    def counted(store: Store, key: str) -> Any:
+        read.append(key)
+        return honest(store, key)
+
+    monkeypatch.setattr(Store, "read_record", counted)
+    for dataset in ("data/r", "data/s"):
+        read.clear()
+        assert explained(lab, dataset)["provenance"] is not None
+        assert len(read) == 1 < len(list(lab.store.root.glob("records/*/*"))) / 30
+
+
+def test_a_record_that_was_written_at_another_time_than_its_root_is_found_all_the_same(lab: Lab) -> None:
+    lab.run("simulate toy --trials 3 --rows 3 -o data/r --jobs 1")
+    made = explained(lab, "data/r")["provenance"]
+    for number, path in enumerate(sorted(lab.store.root.glob("records/*/*"))):
+        os.utime(path, (10**9 + number, 10**9 + number))
+    assert made is not None and explained(lab, "data/r")["provenance"] == made

@@ -109,3 +109,12 @@ def test_a_limit_is_named_and_a_library_without_room_is_not_loaded(monkeypatch: 
         TacpipeError, match=r"torch takes .* MB to load; 105 MB are left, of the 512 MB that `ulimit -v`"
     ):
         memory.require_library("torch")
+
+
+def test_a_sound_recording_that_is_larger_than_what_is_left_is_not_called_damaged(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = to_parquet(pa.table({"x": np.arange(20_000_000)}))
+    monkeypatch.setattr(memory, "available", lambda: 1 << 27)
+    with pytest.raises(ShortageError, match=r"declares 0\.2 GB of data, and 0\.1 GB of memory are left"):
+        from_parquet(content)

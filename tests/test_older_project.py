@@ -20,7 +20,6 @@ HITS = {  # commands whose results are in the store, under the keys that they ha
     "data/segments": "segment contacts data/synced",
     "data/split": "split data/segments --scheme random --val 0.34 --test 0.34",
     "data/latents": "compress pca data/segments --split data/split --components 2",
-    "results/forward": "evaluate models/forward data/latents --split data/split",
     "data/predicted": "predict models/forward data/latents --steps 1",
 }
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tacpipe.cli import headline_table
+from tacpipe.io import tables
 from tacpipe.metrics import headline
 from tests import chain
 from tests.conftest import tacpipe
@@ -63,7 +66,7 @@ def test_a_result_is_shown_by_its_headline_its_baselines_and_what_it_rests_on(la
     text, value = shown(lab, "results/forward")
     told = headline.read((lab / "results/forward/headline.json").read_bytes())
     assert value["kind"] == "result"
-    assert text.startswith(headline.text(told))
+    assert text.startswith(headline_table.text(told, tables.width_of(sys.stdout)))
     assert value["headline"] == [one.to_json() for one in told]
     assert value["baselines"] == [one.name for one in told[0].baselines]
     assert "ridge" in row(text, "baselines") and "codec" not in row(text, "baselines")
@@ -84,6 +87,7 @@ def test_a_result_of_before_headlines_says_so() -> None:
         "evaluated_on": {"n": 3},
         "by_part": {},
         "role": None,
+        "params": {},
     }
     value |= {"baselines": [], "trained_on": {"roles": {}, "recordings": None}, "inputs": {}}
     assert "run `tacpipe evaluate` again" in model_overview.result_text(value)[0]
@@ -115,7 +119,8 @@ def test_showing_a_model_or_a_result_imports_nothing_heavy(lab: Path, what: str)
 
 
 def test_evaluate_prints_its_headline_on_a_hit_too_and_stdout_is_the_output_alone(lab: Path) -> None:
-    told = headline.text(headline.read((lab / "results/forward/headline.json").read_bytes()))
+    found = headline.read((lab / "results/forward/headline.json").read_bytes())
+    told = headline_table.text(found, tables.width_of(sys.stderr))
     done = tacpipe(lab, EVALUATE)
     assert done.stdout == "results/forward\n"
     assert "0 ran" in done.stderr and told in done.stderr
@@ -137,7 +142,7 @@ def test_a_page_says_of_a_result_what_the_terminal_says(lab: Path) -> None:
     opened = library.open(lab / "results/forward")
     (page,) = section.headlines(opened)
     (printed,) = headline.read(opened.files[headline.FILE])
-    assert headline.text([page]) == headline.text([printed])  # sums are kept to nine digits
+    assert headline_table.text([page]) == headline_table.text([printed])  # sums are kept to nine digits
     assert page.gain == pytest.approx(printed.gain) and page.verdict == printed.verdict
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import LockedError, TacpipeError
+from tacpipe.io.drafts import Draft
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store.store import MissingError, Store, locate, project
 
@@ -36,6 +37,36 @@ def test_putting_twice_writes_once(store: Store) -> None:
     inode = path.stat().st_ino
     store.put(b"touch")
     assert path.stat().st_ino == inode
+
+
+def test_what_is_written_bit_by_bit_is_the_object_that_it_would_be_in_one_piece(store: Store) -> None:
+    def write(file: Draft) -> None:
+        for piece in (b"to", memoryview(b"uc"), b"", b"h"):
+            file.write(piece)
+
+    for durable in (False, True):
+        assert store.put_written(write, durable=durable) == store.put(b"touch")
+    path = Path(store.object_path(bytes_digest(b"touch")))
+    assert path.read_bytes() == b"touch" and path.stat().st_mode & 0o777 == 0o444
+    assert not list((store.root / "tmp").iterdir())
+
+
+def test_what_fails_while_it_is_written_leaves_nothing(store: Store) -> None:
+    def write(file: Draft) -> None:
+        file.write(b"tou")
+        raise TacpipeError("the rest cannot be read")
+
+    with pytest.raises(TacpipeError, match="the rest"):
+        store.put_written(write)
+    assert not [path for name in ("tmp", "objects") for path in (store.root / name).rglob("*") if path.is_file()]
+
+
+def test_what_is_written_durably_replaces_a_damaged_copy(store: Store) -> None:
+    path = Path(store.object_path(store.put(b"touch").digest))
+    path.chmod(0o644)
+    path.write_bytes(b"torch")
+    store.put_written(lambda file: file.write(b"touch"), durable=True)
+    assert store.read(bytes_digest(b"touch")) == b"touch"
 
 
 @given(st.data())

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import DamagedError
+from tacpipe.io import parquet
 from tacpipe.io.parquet import from_parquet, owned, to_parquet, with_metadata
 from tests.any_table import bits, tables
 
@@ -82,6 +83,49 @@ def test_the_same_values_give_the_same_bytes_however_they_lie_in_memory(table: p
     assert to_parquet(pa.concat_tables(pieces)) == content
     assert to_parquet(within) == content
     assert to_parquet(pq.read_table(pa.BufferReader(owned(content))).cast(table.schema)) == content
+
+
+def batches_of(table: pa.Table, rows: int) -> pa.RecordBatchReader:
+    return pa.RecordBatchReader.from_batches(table.schema, iter(table.to_batches(max_chunksize=rows)))
+
+
+def written(source: pa.Table | pa.RecordBatchReader) -> bytes:
+    sink = io.BytesIO()
+    assert parquet.write(source, sink) == pq.ParquetFile(io.BytesIO(sink.getvalue())).metadata.num_rows
+    return sink.getvalue()
+
+
+@given(tables(), st.integers(1, 1500))
+@drawn
+def test_batches_as_they_come_give_the_bytes_of_the_table_that_they_make(table: pa.Table, rows: int) -> None:
+    assert written(batches_of(table, rows)) == to_parquet(table)
+
+
+@pytest.mark.parametrize("rows", [400, 401, 2000])  # that make a group of rows, one more, and many
+def test_groups_of_rows_are_the_same_in_batches(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    monkeypatch.setattr(parquet, "ROW_GROUP_ROWS", 400)
+    held = np.concatenate([np.repeat(np.arange(100), 4), np.arange(1600)])[:rows]  # still at first, moving later
+    table = pa.table({"t_ns": np.arange(rows), "x": pa.array(held, pa.uint16()), "y": np.sqrt(np.arange(rows))})
+    content = to_parquet(table)
+    assert all(written(batches_of(table, size)) == content for size in (1, 7, 399, 400, 3000))
+    groups = pq.ParquetFile(io.BytesIO(content)).metadata
+    assert [groups.row_group(number).num_rows for number in range(groups.num_row_groups)][:-1] == [400] * (
+        (rows - 1) // 400
+    )
+    assert from_parquet(content).equals(table)
+
+
+def test_frames_of_many_sizes_are_grouped_alike_in_a_table_and_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "GROUP_BYTES", 40_000)
+    monkeypatch.setattr(parquet, "PAGE_BYTES", 5_000)
+    rng = np.random.default_rng(0)
+    frames = [rng.bytes(int(size)) for size in rng.integers(0, 2000, 300)]
+    table = pa.table({"t_ns": np.arange(300), "jpeg": pa.array(frames, pa.binary())})
+    content = to_parquet(table)
+    assert pq.ParquetFile(io.BytesIO(content)).metadata.num_row_groups > 3
+    cut = pa.concat_tables([table.slice(start, 11) for start in range(0, 300, 11)])
+    assert written(cut) == content
+    assert all(written(batches_of(table, size)) == content for size in (1, 7, 50, 1000))
 
 
 def test_what_lies_under_a_null_does_not_count() -> None:

@@ -3,15 +3,17 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import tacpipe
 from tacpipe.io import regular
+from tacpipe.io.hashing import bytes_digest
 from tacpipe.io.hashing import digest as values_digest
 from tacpipe.maintenance import repair
 from tacpipe.store import projects
-from tacpipe.store.roots import HISTORY
+from tacpipe.store.roots import HISTORY, Roots
 from tacpipe.store.store import MissingError, Store
 from tests.conftest import Lab
 from tests.test_pipeline import counts
@@ -406,3 +408,28 @@ def test_an_object_of_many_blocks_goes_over_without_being_held_in_memory(
     with pytest.raises(MissingError, match="damaged"):
         Store(tmp_path / "two").take(name, one.blocks(name, len(content)))
     assert two.read(name) == content and not list((tmp_path / "two/tmp").iterdir())
+
+
+def test_a_push_that_another_one_writes_over_where_nothing_locks_says_so_and_its_rerun_keeps_both(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run("simulate toy -o data/r --trials 1 --rows 3")
+    lab.run("store push remote data/r")
+    lab.run("label data/r trial-000 --set material=foam")
+    remote = Store(lab.folder / "remote")
+    (before,) = remote.roots.all()
+    other, honest = "ab" * 32, Roots.push
+
+    def push(roots: Roots, *given: Any, **more: Any) -> None:
+        honest(roots, *given, **more)
+        name, project, _, _ = given  # the other one looked before this one wrote
+        honest(roots, name, project, other, before, lasting=False)
+
+    with monkeypatch.context() as meanwhile:
+        meanwhile.setattr(Roots, "push", push)
+        ran = lab.call("store push remote data/r")
+    assert ran.code == 1 and "run the same command again" in ran.err.lower()
+    lab.run("store push remote data/r --replace")
+    (root,) = remote.roots.all()
+    assert {root["manifest"], *(one["manifest"] for one in root["history"])} >= {other, before["manifest"]}
+    assert root["manifest"] == bytes_digest(Path("data/r/manifest.json").read_bytes())

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Bools, Int64s
 
 GRID = "grid"  # attribute of a synchronized recording: uniform, logged or fresh
-_GAP = "_gap"  # how the masks of gaps end
+GAP = "_gap"  # how the masks of gaps end
 _APART = {"logged": 3.0, "fresh": 3.0}  # times the median step, by grid: further apart, rows are missing between
 _UNIFORM = 1.5
 
@@ -24,7 +24,7 @@ def gaps(table: pa.Table) -> Bools:
     """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` marks it."""
     gap = np.zeros(table.num_rows, dtype=bool)
     for name in table.column_names:
-        if name.endswith(_GAP):
+        if name.endswith(GAP):
             gap |= table.column(name).to_numpy().astype(bool)
     return gap
 

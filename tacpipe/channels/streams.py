@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Int64s
+    from tacpipe.arrays import AnyArray, Indices, Int64s
 
 TRUTH = "gt_"  # how columns with ground truth begin
+_GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 
 
 def rate_hz(table: pa.Table) -> float | None:
@@ -27,6 +28,18 @@ def rate_hz(table: pa.Table) -> float | None:
         return round(float(np.diff(table["seq"].to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
     median_ns = float(np.median(step_ns))
     return round(1e9 / median_ns, 3) if median_ns else None
+
+
+def gaps_before(table: pa.Table) -> Indices:
+    """Return the rows of a stream before which samples are missing: by the device's own counter where there is one, else by
+    steps above three times the median one.
+    """
+    import numpy as np
+
+    step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
+    if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
+        return np.flatnonzero(np.diff(table["seq"].to_numpy()) > 1) + 1
+    return np.flatnonzero(step_ns > _GAP_FACTOR * float(np.median(step_ns))) + 1
 
 
 def of_quantity(table: pa.Table, quantity: str) -> list[str]:

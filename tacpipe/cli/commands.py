@@ -17,6 +17,9 @@ SUMMARIES = {
     "acquire": "Record every stream of a rig.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
+    "compare": "Compare results: the best first, columns for what differs.",
+    "track": "Give models and results to trackers of experiments.",
+    "view": "Show recordings on one time axis, in Rerun's viewer.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage what keeps the bytes: verify, repair, push, pull.",
@@ -76,16 +79,77 @@ def _label(program: typer.Typer) -> None:
 
 
 def _show(program: typer.Typer) -> None:
-    @program.command("show", help=SUMMARIES["show"] + "\n\nExample: tacpipe show data/recordings")
+    @program.command(
+        "show",
+        help=SUMMARIES["show"]
+        + "\n\nExample: tacpipe show data/recordings"
+        + "\n\nExample: tacpipe show data/recordings trial-003 --plot trial-003.png",
+    )
     def show(
         dataset: Annotated[Path, typer.Argument(help="A dataset.")],
+        recording: Annotated[str | None, typer.Argument(help="Name of the recording that --plot draws.")] = None,
+        plot: Annotated[
+            Path | None, typer.Option("--plot", help="Draw one recording over time: .png, .svg or .pdf.")
+        ] = None,
         as_json: AsJson = False,
         full: Annotated[bool, typer.Option("--full", help="All recordings, not the first 20, and all labels.")] = False,
     ) -> None:
         from tacpipe.cli import show as overview
 
+        if plot is not None or recording is not None:
+            from tacpipe.cli import plot as pictures
+
+            terminal.result(pictures.write(dataset, recording, plot))
+            return
         most = None if full or as_json else overview.SHOWN
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)
+
+
+def _compare(program: typer.Typer) -> None:
+    @program.command(
+        "compare",
+        help=SUMMARIES["compare"]
+        + "\n\nErrors, and the gain over the best baseline with its interval. Runs that differ in seed or fold alone are "
+        "pooled.\n\nExample: tacpipe compare results/forward results/forward-gru",
+    )
+    def compare(
+        results: Annotated[list[Path], typer.Argument(help="Results of `tacpipe evaluate`.")],
+        each: Annotated[bool, typer.Option("--each", help="A row a result: pool no folds and seeds.")] = False,
+        as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+        as_json: AsJson = False,
+    ) -> None:
+        from tacpipe.cli import compare as comparing
+        from tacpipe.io import tables
+
+        if as_csv and as_json:
+            raise typer.BadParameter("give --csv or --json, not both", param_hint="--csv")
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        found = comparing.run(results, pool=not each)
+        if as_json:
+            terminal.result_json(found.to_json())
+        elif as_csv:
+            terminal.result(found.to_csv())
+        else:
+            for number, table in enumerate(found.tables()):
+                terminal.result("") if number else None
+                tables.show(table, result=True)
+
+
+def _track(program: typer.Typer) -> None:
+    @program.command(
+        "track",
+        help=SUMMARIES["track"]
+        + "\n\nParams, the epochs of the history and the figures of each; a model that was trained with --track is the "
+        "same run again.\n\nExample: tacpipe track models/forward results/forward --to tensorboard",
+    )
+    def track(
+        datasets: Annotated[list[Path], typer.Argument(help="Models and results.")],
+        to: Annotated[list[str], typer.Option("--to", help="Tracker, NAME or NAME:PLACE: tensorboard, mlflow, wandb.")],
+    ) -> None:
+        from tacpipe.cli import track as tracking
+
+        for name in tracking.run(datasets, to):
+            terminal.result(name)
 
 
 def _explain(program: typer.Typer) -> None:
@@ -135,6 +199,12 @@ def _candidates(program: typer.Typer) -> None:
     candidates.add(program, SUMMARIES["candidates"])
 
 
+def _view(program: typer.Typer) -> None:
+    from tacpipe.cli import view
+
+    view.add(program, SUMMARIES["view"])
+
+
 def _acquire(program: typer.Typer) -> None:
     from tacpipe.cli import acquire
 
@@ -150,6 +220,9 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _acquire,
     "label": _label,
     "show": _show,
+    "compare": _compare,
+    "track": _track,
+    "view": _view,
     "explain": _explain,
     "sensors": _sensors,
     "store": _store,

@@ -1,19 +1,20 @@
-"""Headlines of a result, read from the store and printed: a table with rules on a terminal, plain columns elsewhere."""
+"""Headlines of a result, read from the store and printed: a table in colours on a terminal, in plain text elsewhere."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from tacpipe import printable
 from tacpipe.datasets import manifest
-from tacpipe.io import terminal
+from tacpipe.io import tables, terminal
+from tacpipe.io.tables import Group, Row, Table
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline
 from tacpipe.plugins import params as params_of
 from tacpipe.store.store import locate
+
+EMPTY = "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
 
 
 def of_output(output: Path, file: str) -> list[Headline]:
@@ -32,30 +33,47 @@ def method(task: object, stored: object) -> str:
     return str(params_of.named(f"train.{task}", {"architecture": stored})["architecture"])
 
 
+def table(headlines: Sequence[Headline]) -> Table:
+    """Return the table of one headline or more: under each part the model, and below it its best baseline."""
+    first = headlines[0]
+    heads = ["", *first.columns, first.measure, "95 % interval", "n"]
+    groups = []
+    for one in headlines:
+        styles = {headline.BETTER: "green", headline.WORSE: "red"}
+        gain = [headline.signed(one.gain, one.measure) if one.best else headline.NONE, headline.bounds(one)]
+        cells = [one.method, *map(headline.number, one.model.values), gain[0], gain[1] or headline.NONE]
+        rows = [Row([*cells, f"{one.clusters:,}"], styles.get(one.verdict, ""))]
+        if one.best:
+            values = map(headline.number, one.best.values)
+            rows.append(Row([f"vs {one.best.name.replace('_', ' ')}", *values, "", _VERDICTS[one.verdict], ""], "dim"))
+        groups.append(Group(one.where, rows))
+    errors = list(range(1, len(first.columns)))  # the last one ranks
+    return Table(heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)])
+
+
+def caption(headlines: Sequence[Headline]) -> str:
+    """Return what the columns mean, what n counts, and among how many baselines the best was found."""
+    counts = dict.fromkeys(len(one.baselines) for one in headlines if one.baselines)
+    best = f"vs: the best of {' or '.join(map(str, counts))} baselines. " if counts else ""
+    return f"n: {', '.join(dict.fromkeys(one.cluster for one in headlines))}. {best}{headline.caption(headlines)}"
+
+
+_VERDICTS = {
+    headline.BETTER: "model is better",
+    headline.WORSE: "baseline is better",
+    headline.UNCLEAR: "no difference",
+    headline.NO_VERDICT: "n is too small",
+}
+
+
+def text(headlines: Sequence[Headline], width: int = tables.WIDTH) -> str:
+    """Return headlines as lines of text: their table, or a sentence where there is none."""
+    return table(headlines).text(width) if headlines else EMPTY
+
+
 def show(headlines: Sequence[Headline]) -> None:
     """Print headlines on stderr."""
-    if not (headlines and sys.stderr.isatty()):
-        terminal.note(headline.text(headlines))
-        return
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    heads, rows = headline.table(headlines)
-    grid = Table(
-        box=box.SIMPLE_HEAD,
-        caption=printable.shown(headline.caption(headlines)),
-        caption_justify="left",
-        pad_edge=False,
-    )
-    for at, head in enumerate(heads):
-        grid.add_column(printable.shown(head), justify="left" if at < 2 else "right")
-    styles = {headline.BETTER: "green", headline.WORSE: "red"}
-    for row, one in zip(rows, _each(headlines), strict=True):
-        grid.add_row(*map(printable.shown, row), style=styles.get(one.verdict) if row[0] else "dim")
-    Console(stderr=True, highlight=False, markup=False).print(grid)
-
-
-def _each(headlines: Sequence[Headline]) -> list[Headline]:
-    """Return the headline of each row of the table."""
-    return [one for one in headlines for _ in range(2 if one.best else 1)]
+    if headlines:
+        tables.show(table(headlines), result=False)
+    else:
+        terminal.note(EMPTY)

@@ -11,7 +11,7 @@ PARAMS, RUN, PRINTED = "Params", "Run", "Output"
 PANELS = {  # of the options that commands share; a stage's params name theirs
     **dict.fromkeys(("preset", "params_file", "block", "set_", "print_params"), PARAMS),
     **dict.fromkeys(("split", "fold", "role", "codec", "init", "extend"), "Data"),
-    **dict.fromkeys(("jobs", "skip_bad", "check", "compare", "rerun", "replace", "dry_run"), RUN),
+    **dict.fromkeys(("jobs", "executor", "skip_bad", "check", "compare", "rerun", "replace", "dry_run"), RUN),
     **dict.fromkeys(("output", "json_", "as_json", "quiet", "help"), PRINTED),
 }
 OPTIONS = "Options"

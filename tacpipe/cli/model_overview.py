@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from tacpipe.cli import headline_table
-from tacpipe.datasets import manifest
+from tacpipe.cli import headline_table, identities
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
+from tacpipe.io import tables
 from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
 from tacpipe.store.store import Store
@@ -51,7 +53,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
     """Return what a person asks of a result: how the model compares with its baselines, on how much, and of which role."""
     config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
-    identity = _identity(store, found.digest)
+    identity = identities.of_manifests(store).get(found.digest, {})
     return {
         **_architecture(config),
         "headline": None if headlines is None else [one.to_json() for one in headlines],
@@ -61,12 +63,13 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
         "fold": identity.get("fold"),
         "role": (identity.get("role") or "test") if "split" in opened.source.inputs else None,
         "trained_on": _learned(config)["trained_on"],
+        "params": params_of.named(f"train.{config.get('task')}", config.get("params", {})),
         "inputs": _inputs(opened.source.inputs, store),
     }
 
 
 def model_text(value: Mapping[str, Any]) -> list[str]:
-    """Return the lines that `of_model` is shown as."""
+    """Return the lines that `of_model` is shown as: what it is and how well it did, params, then where it comes from."""
     described = [
         ("task", value["task"]),
         ("architecture", value["architecture"]),
@@ -79,7 +82,17 @@ def model_text(value: Mapping[str, Any]) -> list[str]:
         ("behind", ", then ".join(value["chain"]) or None),
         *_from(value["inputs"]),
     ]
-    return _aligned(described)
+    return [_summary(value), "", *_aligned(described)]
+
+
+def _summary(value: Mapping[str, Any]) -> str:
+    """Return architecture, task, epochs and the best of them in a line."""
+    parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
+    if value["epochs"]:
+        parts.append(headline.counted(value["epochs"], "epochs"))
+    if value["validation"]:
+        parts.append(f"validation: {flat(value['validation'])}")
+    return "; ".join(parts)
 
 
 def result_text(value: Mapping[str, Any]) -> list[str]:
@@ -87,7 +100,8 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
     if value["headline"] is None:
         lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
     else:
-        lines = headline.text([headline.Headline.from_json(one) for one in value["headline"]]).splitlines()
+        found = [headline.Headline.from_json(one) for one in value["headline"]]
+        lines = headline_table.text(found, tables.width_of(sys.stdout)).splitlines()
     parts = {name: flat(one) for name, one in value["by_part"].items()}
     fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
     described = [
@@ -97,6 +111,7 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
         *((f"  {name}", text) for name, text in parts.items()),
         ("role", f"{value['role']}{fold}" if value["role"] else None),
         ("baselines", ", ".join(value["baselines"]) or None),
+        ("params", flat(value["params"]) if value["params"] else None),
         *(("trained on" if not at else "", text) for at, text in enumerate(_trained(value["trained_on"]))),
         *_from(value["inputs"]),
     ]
@@ -187,16 +202,6 @@ def _inputs(inputs: Mapping[str, Any], store: Store) -> dict[str, list[str]]:
     }
 
 
-def _identity(store: Store, name: str) -> Mapping[str, Any]:
-    """Return what the run that gave a manifest was asked for; empty where no record of it is left."""
-    for _, record in store.records():
-        file = record["result"]["files"].get(manifest.NAME)
-        if file is not None and file["digest"] == name:
-            found: Mapping[str, Any] = record["identity"]
-            return found
-    return {}
-
-
 def _tree(opened: Dataset, name: str) -> dict[str, Any]:
     if name not in opened.files:
         return {}
@@ -232,7 +237,37 @@ def _parameters(opened: Dataset) -> int | None:
 
 
 def _aligned(described: list[tuple[str, Any]]) -> list[str]:
-    """Return names and values in two columns; what is None is left out."""
+    """Return names and values in two columns, long values on several lines; what is None is left out."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
-    width = max((len(name) for name, _ in shown), default=0)
-    return [f"{name:<{width}}  {value}" for name, value in shown]
+    width = max((len(name) for name, _ in shown), default=0) + 2
+    room = max(tables.width_of(sys.stdout) - width, 20)
+    return [
+        f"{'' if at else name:<{width}}{line}" for name, value in shown for at, line in enumerate(_wrapped(value, room))
+    ]
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Return text as lines that end behind a comma.
+
+    >>> _wrapped("epochs 2, learning rate 0.002, seed 0", 20)
+    ['epochs 2,', 'learning rate 0.002,', 'seed 0']
+    """
+    kept = text.replace(" ", "\0").replace(",\0", ", ")
+    lines = textwrap.wrap(kept, width, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\0", " ") for line in lines]
+
+
+def files_text(files: Mapping[str, int]) -> list[str]:
+    """Return names and sizes of files.
+
+    >>> files_text({"config.json": 15696, "history.jsonl": 188})
+    ['files  config.json 15.7 kB, history.jsonl 188 bytes']
+    """
+    return _aligned([("files", ", ".join(f"{name} {_size(size)}" for name, size in files.items()))])
+
+
+def _size(count: int) -> str:
+    for factor, unit in ((1e6, "MB"), (1e3, "kB")):
+        if count >= factor:
+            return f"{count / factor:.1f} {unit}"
+    return f"{count} bytes"

@@ -24,7 +24,6 @@ from tacpipe.store.store import locate
 SHOWN = 20  # recordings listed before the rest is counted
 _TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
 _SPLIT = ("recording", "fold", "role")  # columns of a split
-_GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 
 
 def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
@@ -105,12 +104,9 @@ def _stream(shard: Recording, stream: str) -> dict[str, Any]:
     found: dict[str, Any] = {"rows": table.num_rows, "columns": table.num_columns}
     if "t_ns" in table.column_names and table.num_rows > 1:
         step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
-        median_ns = float(np.median(step_ns))
         found["duration_s"] = round(float(step_ns.sum()) / 1e9, 3)
         found["rate_hz"] = streams.rate_hz(table)
-        found["gaps"] = int((step_ns > _GAP_FACTOR * median_ns).sum())
-        if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
-            found["gaps"] = int((np.diff(table["seq"].to_numpy()) > 1).sum())
+        found["gaps"] = len(streams.gaps_before(table))
     integers = [
         table[field.name].to_numpy()
         for field in table.schema
@@ -129,7 +125,7 @@ def to_text(value: dict[str, Any], *, full: bool = False) -> str:
     texts = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
     if value["kind"] in texts:
         made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        return printable.lines([*texts[value["kind"]](value), *_files(value), made])
+        return printable.lines([*texts[value["kind"]](value), *model_overview.files_text(value["files"]), made])
     return printable.lines(_recordings_text(value, full))
 
 

@@ -11,10 +11,10 @@ from typing import Any, Literal, get_args, get_origin
 
 import typer
 
-from tacpipe.engine import pipeline
+from tacpipe.engine import by_recording, grid, pipeline
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import OPTIONS, Request
-from tacpipe.errors import FAILED
+from tacpipe.errors import FAILED, TacpipeError
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
@@ -41,8 +41,9 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 
 def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str]) -> None:
     progress.set_quiet(given["quiet"])
+    folds = grid.folds(given.get("fold") or "0")
     for flag, kind in OPTIONS.items():
-        if given.get(flag) is not None:  # not every stage has each of them
+        if flag != "fold" and given.get(flag) is not None:  # not every stage has each of them
             fields_of.check(given[flag], kind, f"--{flag}")
     if given.get("guess") and stage.guess is not None:
         terminal.result(stage.guess(given["source"]).rstrip("\n"))
@@ -70,18 +71,37 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         params,
         given["output"],
         datasets=given.get("datasets") or (),
-        fold=given.get("fold") or 0,
         role=given.get("role"),
         jobs=given["jobs"],
+        executor=given["executor"] or "",
         skip_bad=given["skip_bad"],
         check=given["check"],
         compare=given["compare"],
         rerun=given["rerun"],
         replace=given["replace"],
+        track=tuple(given.get("track") or ()),
         **paths,
     )
     shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
-    _report(pipeline.run(request), shown, as_json=given["json_"], quiet=given["quiet"])
+    requests = grid.requests(request, folds)
+    if len(requests) == 1:
+        _report(pipeline.run(requests[0]), shown, as_json=given["json_"], quiet=given["quiet"])
+    else:
+        _run_folds(requests, shown, as_json=given["json_"], quiet=given["quiet"])
+
+
+def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
+    """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end where some failed."""
+    failed: list[TacpipeError] = []
+    for one, became in grid.run(requests, requests[0].jobs):
+        if isinstance(became, TacpipeError):
+            failed.append(became)
+            terminal.note(f"tacpipe: fold {one.fold}: {became}")
+        else:
+            _report(became, headline, as_json=as_json, quiet=quiet)
+    if failed:
+        what = f"{len(failed)} of {len(requests)} folds failed; the others are written."
+        raise by_recording.error(max(one.exit_code for one in failed), what)
 
 
 def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
@@ -137,7 +157,13 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
             _parameter(
                 "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
             ),
-            _parameter("fold", int, typer.Option(0, "--fold", help="Fold of the split.")),
+            _parameter(
+                "fold",
+                str | None,
+                typer.Option(
+                    None, "--fold", help="Fold of the split; several as 0-4, with {fold} in paths such as -o."
+                ),
+            ),
         ]
     if stage.reads_model:
         found.append(
@@ -149,6 +175,9 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     if "init" in stage.arguments:
         text = "A model to begin with."
         found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+    if stage.tracked:
+        text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
+        found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))
     if "Roles" in kinds:
         text = "An older split whose roles to keep."
         found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
@@ -190,6 +219,13 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
         ),
         ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
+        (
+            "executor",
+            str | None,
+            typer.Option(
+                None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT."
+            ),
+        ),
         ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),
         ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
         (

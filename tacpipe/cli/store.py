@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tacpipe.errors import DAMAGED, UsageError
-from tacpipe.io import terminal
+from tacpipe.errors import DAMAGED, FAILED, UsageError
+from tacpipe.io import progress, terminal
 from tacpipe.maintenance import garbage
 from tacpipe.printable import plain
 from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import Store, locate
+
+if TYPE_CHECKING:
+    from tacpipe.maintenance.repair import Soundness
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
@@ -81,7 +84,8 @@ def checkout(
 def verify(as_json: AsJson = False) -> None:
     """Check every stored object and record for damage.
 
-    Damaged ones are quarantined. Exits with 4 if one is damaged or missing.
+    Damaged ones are quarantined. Exits with 4 if one is damaged or missing,
+    with 1 if the system failed to read one.
 
     Example: tacpipe store verify
     """
@@ -89,8 +93,9 @@ def verify(as_json: AsJson = False) -> None:
 
     found = upkeep.verify(locate())
     _print(asdict(found), as_json=as_json, text=found.to_text())
-    if not found.clean:
+    if found.damaged or found.missing or found.lost:
         raise typer.Exit(DAMAGED)
+    _end_unread(found)
 
 
 def repair(as_json: AsJson = False) -> None:
@@ -106,6 +111,16 @@ def repair(as_json: AsJson = False) -> None:
     _print(asdict(found), as_json=as_json, text=found.to_text())
     if found.lost:
         raise typer.Exit(DAMAGED)
+    _end_unread(found)
+
+
+def _end_unread(found: Soundness) -> None:
+    """End with 1 where the system failed to read something, which states nothing of what was not read."""
+    if found.unread:
+        progress.report(
+            f"{len(found.unread)} objects or records could not be read: {next(iter(found.unread.values()))}"
+        )
+        raise typer.Exit(FAILED)
 
 
 def gc(

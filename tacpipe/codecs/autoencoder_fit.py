@@ -108,7 +108,7 @@ def fit(
     mean, scale = standard(train[:, -width:], representation)
     learned, watched = (torch.from_numpy(scaled(part, mean, scale)) for part in (train, val))
     found = [
-        _trained(learned, watched, network, schedule, workspace / f"{index:02d}", components, representation)
+        _trained(learned, watched, network, schedule, workspace, (index, len(tried)), components, representation)
         for index, network in enumerate(tried)
     ]
     best = min(range(len(found)), key=lambda index: _lowest(found[index]))
@@ -154,10 +154,11 @@ def _trained(
     network: Network,
     schedule: loop.Schedule,
     workspace: Path,
+    place: tuple[int, int],  # among the networks that are tried: index and number
     components: int,
     representation: str,
 ) -> loop.Trained:
-    widths = (learned.shape[1], *network.hidden, components)
+    widths, (index, count) = (learned.shape[1], *network.hidden, components), place
 
     def part(rows: Tensor) -> loop.Part:
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
@@ -170,8 +171,11 @@ def _trained(
         lambda: _Mirrored(widths, bias=representation == frame_stacking.LEVELS),
         loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
-        workspace,
+        workspace / f"{index:02d}",
         weight_decay=network.weight_decay,
+        number=index + 1,
+        count=count,
+        labels={"network": index} if count > 1 else None,
     )
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import StorageError
 from tacpipe.io import regular
+from tacpipe.io.files import unread
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.store.store import Store
 
@@ -16,12 +16,25 @@ def beside(name: str, path: str, directories: tuple[str, ...], size: int | None 
     """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it.
 
     It may be a link, as DVC and git-annex make them: its digest is what counts. ``size`` is what its manifest declares.
+    Raises `StorageError` where none has it and one may: the system failed to read what lies there, or memory is short.
     """
+    failed: StorageError | None = None
     for directory in directories:
-        with contextlib.suppress(OSError, regular.IrregularError, StorageError):
-            content = regular.content(Path(directory) / path, size)
-            if bytes_digest(content) == name:
-                return content
+        file = Path(directory) / path
+        try:
+            content = regular.content(file, size)
+        except (FileNotFoundError, NotADirectoryError, regular.IrregularError):
+            continue
+        except OSError as error:
+            failed = unread(file, error)
+            continue
+        except StorageError as error:
+            failed = error
+            continue
+        if bytes_digest(content) == name:
+            return content
+    if failed is not None:
+        raise failed
     return None
 
 

@@ -46,6 +46,11 @@ class Recording:
         streams = ", ".join(filter(None, self.streams))
         return f"Recording({self.name!r}{', streams ' * bool(streams)}{streams})"
 
+    def _repr_html_(self) -> str:
+        from tacpipe.datasets import overview
+
+        return overview.recording_html(self)
+
     def __reduce__(self) -> tuple[Any, ...]:
         if self._dataset is None:
             return Recording, (self.name, self._entry, self._read)

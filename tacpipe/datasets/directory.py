@@ -197,13 +197,14 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
 
     It is verified first. Raises `MissingError` if it is not in the store, or was damaged there.
     """
-    content = store.read(name)
+    for _ in store.blocks(name) if not copy else ():
+        pass
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex[:12]}{_DRAFT}")
     source = store.object_path(name)
     try:
         if copy or not _link(source, draft):
-            write_whole(str(path), content, str(draft))
+            write_whole(str(path), store.blocks(name), str(draft))  # verified before it gets its name
         else:
             draft.replace(path)
     except FileNotFoundError:

@@ -23,7 +23,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
             raise UsageError(f"--set {text} should read name=value, as in --set material=foam.")
-        labels[name] = _value(value) if value else ""
+        labels[name] = of_text(value) if value else ""
     if exclude is not None and include:
         raise UsageError("--exclude and --include contradict each other; give one.")
     if exclude is not None:
@@ -35,7 +35,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
     return labels
 
 
-def _value(text: str) -> Attribute:
+def of_text(text: str) -> Attribute:
     """Return the value of a text, where that is a number, true, false or null; else the text."""
     from tacpipe.io import yaml_text
 

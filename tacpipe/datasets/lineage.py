@@ -8,9 +8,10 @@ from typing import Any
 from tacpipe import printable
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed
+from tacpipe.store import records
 from tacpipe.store.store import Store, locate
 
 _SHOWN = 5  # names listed before the rest is counted
@@ -29,7 +30,8 @@ def of(path: Path) -> dict[str, Any]:
     places = {other["manifest"]: other["path"] for other in store.roots.all()}
     tree = _node(store, found.manifest, found.digest, places)
     changed = _changes(store, root, found.manifest)
-    return {**tree, "provenance": _provenance(store, found.digest), "changes": changed}
+    written_s = 0 if root is None else int(root.get("written_s", 0))
+    return {**tree, "provenance": _provenance(store, found.digest, written_s), "changes": changed}
 
 
 def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> dict[str, Any]:
@@ -40,6 +42,8 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
             try:
                 found = manifest_of.parse(store.read(given["manifest"]), given["manifest"])
                 inputs[argument].append(_node(store, found, given["manifest"], places))
+            except StorageError:
+                raise
             except TacpipeError as error:
                 inputs[argument].append({"manifest": given["manifest"], "digest": given["dataset"], "lost": str(error)})
     return {
@@ -59,8 +63,9 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
     }
 
 
-def _provenance(store: Store, manifest: str) -> dict[str, Any] | None:
-    for _, record in store.records():
+def _provenance(store: Store, manifest: str, written_s: int) -> dict[str, Any] | None:
+    """Return how a manifest was made, which was written at its path at ``written_s``; None where no record states it."""
+    for record in records.naming(store, manifest, written_s):
         file = record["result"]["files"].get(manifest_of.NAME)
         if file is not None and file["digest"] == manifest:
             return dict(record["provenance"])
@@ -73,6 +78,8 @@ def _changes(store: Store, root: dict[str, Any] | None, now: Manifest) -> list[s
         return None
     try:
         before = manifest_of.parse(store.read(root["previous"]), "the manifest before", verified=True)
+    except StorageError:
+        raise
     except TacpipeError:
         return ["the manifest of the run before is no longer in the store"]
     return changes(store, before, now)
@@ -108,6 +115,8 @@ def _input_changes(store: Store, argument: str, before: list[dict[str, str]], no
             [manifest_of.parse(store.read(given["manifest"]), argument, verified=True) for given in several]
             for several in (before, now)
         )
+    except StorageError:
+        raise
     except TacpipeError:
         return [f"inputs.{argument}: another dataset, whose manifest is no longer in the store"]
     found = []

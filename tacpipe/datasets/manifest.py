@@ -12,6 +12,7 @@ from typing import Any
 
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.io import places, regular
+from tacpipe.io.files import unread
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
@@ -244,20 +245,23 @@ class Found:
 
 
 def find(path: Path | str) -> Found:
-    """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself)."""
+    """Return the manifest of the dataset at ``path`` (its directory, or the manifest itself).
+
+    Raises `UsageError` where there is none, and `StorageError` where the system fails to read it.
+    """
     given = places.local(path)
     file = given if given.name == NAME else given / NAME
     try:
         return Found(file.parent, regular.content(file, regular.JSON_BYTES))
     except regular.IrregularError as error:
         raise UsageError(f"{error} There is no dataset.") from None
-    except PermissionError as error:
-        raise UsageError(f"{file} cannot be read ({error.strerror}). Ask its owner for leave to read it.") from None
     except (FileNotFoundError, NotADirectoryError):
         what = "is empty or not there" if not given.exists() else f"has no {NAME}"
         raise UsageError(
             f"{given} {what}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
         ) from None
+    except OSError as error:
+        raise unread(file, error) from error
 
 
 def merge(manifests: Sequence[Manifest]) -> Manifest:

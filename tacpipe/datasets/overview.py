@@ -53,6 +53,24 @@ def html(dataset: Dataset) -> str:
     return f"<table><caption>tacpipe.Dataset {escape(_title(dataset))}</caption>{rows}</table>"
 
 
+def recording_html(recording: Recording) -> str:
+    """Return a recording for a notebook: its labels and a small picture of its streams; every text is escaped."""
+    from tacpipe.traces import curves, sparkline, taxels
+
+    known = [f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)]
+    labels = escape(printable.lines([listed(known, _LABELS)])) if known else ""
+    title = f"<b>{escape(printable.shown(recording.name))}</b> {labels}"
+    try:
+        tables = (
+            {} if recording.streams == ("",) and "t_ns" not in recording.table().column_names else streams_of(recording)
+        )
+        picture = sparkline.svg(sparkline.rows(curves.of_streams(tables), taxels.of_streams(tables)))
+        picture = picture or f"<pre>{escape(repr(recording))}</pre>"
+    except TacpipeError as error:  # damaged
+        picture = f"<pre>{escape(printable.lines([str(error)]))}</pre>"
+    return f"<div>{title}<br/>{picture}</div>"
+
+
 def _title(dataset: Dataset) -> str:
     where = "" if dataset.path is None else f"{printable.shown(str(dataset.path))} "
     return f"{where}[{dataset.digest[:12]}]"

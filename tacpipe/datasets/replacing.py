@@ -11,7 +11,6 @@ What was replaced stays in the store and is listed by `tacpipe store list`.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import recording_names
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
-from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.printable import listed, plain
@@ -88,6 +87,8 @@ def occupant(store: Store, output: Path) -> Manifest | None:
         return None
     try:
         return manifest_of.find(output).manifest
+    except StorageError:
+        raise
     except TacpipeError as error:
         known = former(store, output)
         if known is None:
@@ -104,6 +105,8 @@ def former(store: Store, output: Path) -> Manifest | None:
     try:
         if root is not None:
             return manifest_of.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
+    except StorageError:
+        raise
     except TacpipeError:
         pass
     return None
@@ -248,10 +251,13 @@ def returning_labels(
     names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
     found: dict[str, Mapping[str, Any]] = {}
     for name in names if before is None else [name for name in names if name != bytes_digest(before.content)]:
-        with contextlib.suppress(TacpipeError):
+        try:
             known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
-            if known.stage != made.stage:
-                continue
+        except StorageError:
+            raise
+        except TacpipeError:
+            continue
+        if known.stage == made.stage:
             back = {one for one in coming & set(known.recordings) if not _gone(one, known, made)}
             found |= {one: known.labels[one] for one in back & set(known.labels)}
             coming -= back
@@ -266,6 +272,8 @@ def outgoing(store: Store, directory: Path) -> Manifest | None:
     try:
         found = manifest_of.find(directory)
         here = found.manifest
+    except StorageError:
+        raise
     except TacpipeError:
         return former(store, directory)
     root = store.roots.get(directory)

@@ -8,8 +8,9 @@ from typing import Any
 
 from tacpipe.datasets import manifest
 from tacpipe.datasets.manifest import Entry, Manifest
-from tacpipe.engine import execution, executors, keys
+from tacpipe.engine import execution, keys
 from tacpipe.engine.execution import Done, Task
+from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request
 from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError, WouldChangeError
@@ -27,6 +28,7 @@ class ByRecording:
     store: Store
     request: Request
     outcome: Outcome
+    chosen: Chosen
 
     def run(self, name: str, tasks: Sequence[Task], entries: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return what each task of stage ``name`` gives, with the attributes of ``entries`` before its own.
@@ -98,15 +100,20 @@ class ByRecording:
         self, name: str, tasks: Sequence[Task], stored: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Mapping[str, Any]]:
         results: dict[str, Mapping[str, Any]] = {}
+        if not tasks:
+            return results
         bad: dict[str, Done] = {}
+        executor = self.chosen.opened()
         module = registry.stages()[registry.whole(name)].partition(":")[0]
         preload = ["tacpipe.io.parquet", "tacpipe.engine.execution", module]
         with progress.bar(registry.whole(name), len(tasks)) as advance:
-            for done in executors.run(execution.compute, tasks, self.request.jobs, preload):
+            for done in executor.run(execution.compute, tasks, preload):
                 advance(note=done.recording)
                 if done.record is None:
                     bad[done.recording] = done
                     continue
+                if executor.elsewhere:  # whose announcements end with the worker
+                    self.store.announce(records.named(done.record["result"]))
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
                 self.outcome.add_record(name, done.recording, done.record)

@@ -32,10 +32,12 @@ class How:
     params_file: str | PathLike[str] | None = None
     block: str | None = None
     jobs: int = 0
+    executor: str = ""
     skip_bad: bool = False
     rerun: bool = False
     replace: bool = False
     progress: bool = False
+    track: Sequence[str] = ()
 
 
 def call(
@@ -69,9 +71,11 @@ def call(
         fold=how.fold,
         role=how.role,
         jobs=how.jobs,
+        executor=how.executor,
         skip_bad=how.skip_bad,
         rerun=how.rerun,
         replace=how.replace,
+        track=tuple(how.track),
         **paths,
     )
     with progress.shown(how.progress):
@@ -94,7 +98,8 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         "extend": "Roles" in kinds,
     }
     given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
-    reads |= {"fold": reads["split"], "role": stage.reads_model}
+    given["track"] = bool(how.track)
+    reads |= {"fold": reads["split"], "role": stage.reads_model, "track": stage.tracked}
     for key in given:
         if given[key] and not reads[key]:
             raise UsageError(f"The stage {name} does not read {key}; leave it out.")

@@ -16,14 +16,17 @@ from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest, shard_path
 from tacpipe.engine import provenance
+from tacpipe.engine.shared import SharedFiles
 from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
 from tacpipe.io import memory
+from tacpipe.io.drafts import Hashed
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Object, Store
+from tacpipe.training import display, following
 
 
 @dataclass(frozen=True)
@@ -89,28 +92,40 @@ class _Scratch:
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         return Object(bytes_digest(content), len(content))
 
+    def put_written(self, write: Callable[[Any], object], *, durable: bool = False) -> Object:
+        hashed = Hashed()
+        write(hashed)
+        return Object(hashed.digest, hashed.bytes)
+
 
 def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str, Any], list[str]]:
     """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
     stage, stage_name = stage_of(task.name), registry.whole(task.name)
     params = params_of.from_json(stage, task.identity["params"])
-    with _arguments(stage, task, store) as arguments:
+    with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments):
         try:
             with memory.raising_shortage(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
-                returned = stage(params, **arguments)
+                returned = _result(task.name, stage, stage(params, **arguments))
+                result = _stored(returned, sink, durable=stage.source)  # of batches it is here that they are read
         except Exception as error:
             failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
-    if not isinstance(returned, Result):
-        returned = (
-            Result(recordings={"": _recording(task.name, returned)}) if stage.mapped else _files(task.name, returned)
-        )
+    notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
+    return result, notes
+
+
+def _result(name: str, stage: AnyStage, returned: Any) -> Result:
+    if isinstance(returned, Result):
+        return returned
+    return Result(recordings={"": _recording(name, returned)}) if stage.mapped else _files(name, returned)
+
+
+def _stored(returned: Result, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
     recordings = {
-        name: _entry(recording, sink, durable=stage.source) for name, recording in sorted(returned.recordings.items())
+        name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
     files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
-    notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
-    return {"recordings": recordings, "files": files}, notes
+    return {"recordings": recordings, "files": files}
 
 
 def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
@@ -164,7 +179,13 @@ class _Reader:
         try:
             return self._store.read(name, size)
         except MissingError as error:
-            content = _adopt(self._store, name, path, self._beside, size)
+            try:
+                content = _adopt(self._store, name, path, self._beside, size)
+            except StorageError as unread:  # a copy may be there: the stage that made it is the other way to have it
+                try:
+                    return _remake(self._store, name, path, str(error), size)
+                except DamagedError:
+                    raise unread from error
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -269,17 +290,35 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
             found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
         elif kind in ("Trial", "Values", "RecordingName"):
             found[name] = inputs[name]
+        elif kind == "Shared":
+            found[name] = SharedFiles(store) if store.run else None
         elif kind == "Roles":
             found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}
         else:
-            found[name] = store.root / "checkpoints" / digest(task.identity)
-            if found[name].is_symlink():
-                raise StorageError(f"{found[name]} is a symbolic link, and none is followed within a store. Remove it.")
-            found[name].mkdir(parents=True, exist_ok=True)
+            found[name] = _workspace(store, task.identity)
     yield found
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
+
+
+def _workspace(store: Store, identity: Mapping[str, Any]) -> Path:
+    folder = store.root / "checkpoints" / digest(identity)
+    if folder.is_symlink():
+        raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@contextmanager
+def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Iterator[None]:
+    """Have what the stage trains, if it has a workspace to train in, followed by whoever looks."""
+    workspace = arguments.get(stage.argument("Workspace") or "")
+    if workspace is None:
+        yield
+        return
+    with display.on_stderr(registry.whole(name), workspace) as shown, following.in_workspace(workspace, *shown):
+        yield
 
 
 def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:
@@ -310,10 +349,16 @@ def _files(name: str, returned: Any) -> Result:
 
 
 def _entry(recording: RecordingOutput, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
-    from tacpipe.io.parquet import to_parquet
-
-    shards = {
-        stream: {**vars(sink.put(to_parquet(table), durable=durable)), "rows": table.num_rows}
-        for stream, table in sorted(recording.streams.items())
-    }
+    shards = {stream: _shard(table, sink, durable=durable) for stream, table in sorted(recording.streams.items())}
     return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
+
+
+def _shard(table: Any, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
+    """Store a table, or batches as they come, as a shard."""
+    from tacpipe.io import parquet
+
+    if hasattr(table, "num_rows"):
+        return {**vars(sink.put(parquet.to_parquet(table), durable=durable)), "rows": table.num_rows}
+    rows: list[int] = []
+    stored = sink.put_written(lambda file: rows.append(parquet.write(table, file)), durable=durable)
+    return {**vars(stored), "rows": rows[0]}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -15,15 +16,20 @@ from tacpipe.datasets.manifest import Entry, Manifest, shard_path
 from tacpipe.engine import by_recording, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.execution import Task
+from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
+from tacpipe.io import progress
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Store, locate
+from tacpipe.trackers import tracker, tracking
+from tacpipe.trackers.tracker import Tracker
+from tacpipe.training import following
 
 _NOTHING: Entry = {"attributes": {}, "shards": {}}  # of a part that gives files alone
 
@@ -42,23 +48,54 @@ def run(request: Request) -> Outcome:
     started = time.perf_counter()
     if request.rerun and (request.check or request.compare):
         raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")
+    if request.track and (request.check or request.compare):
+        raise UsageError("--track follows what is stored; it does not go with --check or --recompute-and-compare.")
+    trackers = tracking.opened(request.track) if request.track else {}
     replacing.refuse_inputs(request.output, request.reads)
     store = locate()
     inputs = Inputs(request, store)
-    work = _Run(request, store, inputs, inputs.identity())
-    made = output.settle(store, request, inputs.plan(), work)
-    outcome = work.outcome
-    outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results()]
+    with Chosen(request.executor, request.jobs) as chosen:
+        work = _Run(request, store, inputs, inputs.identity(), chosen)
+        outcome = work.outcome
+        with _tracked(request, trackers, outcome, store) as ended:
+            made = output.settle(store, request, inputs.plan(), work)
+            ended(made)
+    outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results(), *outcome.notes]
     outcome.rows = made.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome
 
 
+@contextmanager
+def _tracked(
+    request: Request, trackers: dict[str, Tracker], outcome: Outcome, store: Store
+) -> Iterator[Callable[[Manifest], None]]:
+    """Have what is trained in the block followed by trackers; yield what ends their run with the manifest that was made."""
+    if not trackers:
+        yield lambda made: None
+        return
+    params = {**params_of.to_json(request.params), "stage": request.name, "fold": request.fold}
+    tracked = tracking.Tracking(trackers, tracking.name_of(request.output, outcome.key), tracker.params(params))
+
+    def end(made: Manifest) -> None:
+        tracked.finish(request.output, tracking.files(made, store))
+        outcome.notes += tracked.failures if progress.is_quiet() else []
+
+    try:
+        with following.tracked([tracked]):
+            yield end
+    except BaseException:
+        tracked.abandon()
+        raise
+
+
 class _Run:
     """What a request asks for, of the store or by running what is missing there."""
 
-    def __init__(self, request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any]) -> None:
-        self.request, self.store, self.inputs, self.identity = request, store, inputs, identity
+    def __init__(
+        self, request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any], chosen: Chosen
+    ) -> None:
+        self.request, self.store, self.inputs, self.identity, self.chosen = request, store, inputs, identity, chosen
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
         self.reads = [found.digest for found in inputs.used]
@@ -147,7 +184,7 @@ class _Run:
 
     @property
     def _by_recording(self) -> ByRecording:
-        return ByRecording(self.store, self.request, self.outcome)
+        return ByRecording(self.store, self.request, self.outcome, self.chosen)
 
     def _chain(self) -> Sequence[Mapping[str, Any]]:
         if "model" in self.inputs.named:
@@ -257,9 +294,15 @@ class _Run:
             rerun=self.request.rerun,
             run=self.store.run,
         )
-        done = execution.compute(task)
+        executor = self.chosen.opened()
+        if executor.elsewhere:
+            (done,) = executor.run(execution.compute, [task], [])
+        else:
+            done = execution.compute(task)
         if done.record is None:
             raise by_recording.error(done.exit_code, done.error)
+        if executor.elsewhere:
+            self.store.announce(records.named(done.record["result"]))
         self.outcome.add_record(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:

@@ -13,8 +13,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tacpipe.engine.executors import usable_cores
-
 _CPUINFO = Path("/proc/cpuinfo")
 # those that the kernels of OpenBLAS, oneDNN, torch and numpy are chosen by
 _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
@@ -36,6 +34,13 @@ def threads() -> int:
         return int(torch.get_num_threads())
     given = (os.environ.get(name, "") for name in _THREADS)
     return next((int(text) for text in given if text.isdecimal() and int(text)), usable_cores())
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1  # macOS
 
 
 @functools.cache

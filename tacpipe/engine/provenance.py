@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from tacpipe.engine import processor
 from tacpipe.io.hashing import remembered_file_digest
 from tacpipe.plugins.stage import AnyStage
 
+_worker: ContextVar[str] = ContextVar("worker", default="")
 _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
 
@@ -41,10 +44,21 @@ def _here() -> dict[str, Any]:
 
 
 def of(seconds: float) -> dict[str, Any]:
-    """Return libraries, git commit, host, device and processor of this process, and the ``seconds`` that something took."""
+    """Return libraries, git commit, host, device, processor and worker of this process, and the ``seconds`` of something."""
     torch = sys.modules.get("torch")
     device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
-    return {**_here(), "device": device, "processor": processor.here(), "seconds": seconds}
+    made = {**_here(), "device": device, "processor": processor.here(), "seconds": seconds}
+    return {**made, "worker": _worker.get()} if _worker.get() else made
+
+
+@contextlib.contextmanager
+def worker(name: str) -> Iterator[None]:
+    """Have what is made in the block state the name of the executor's worker that made it."""
+    token = _worker.set(name)
+    try:
+        yield
+    finally:
+        _worker.reset(token)
 
 
 def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -21,7 +21,12 @@ from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
 
 # what options of a run may be that are no params
-OPTIONS = {"jobs": NonNegativeInt, "fold": NonNegativeInt, "role": Literal["train", "val", "test"] | None}
+OPTIONS = {
+    "jobs": NonNegativeInt,
+    "executor": str,
+    "fold": NonNegativeInt,
+    "role": Literal["train", "val", "test"] | None,
+}
 
 
 @dataclass(frozen=True)
@@ -41,10 +46,12 @@ class Request:
     extend: Path | None = None
     init: Path | None = None
     jobs: int = 0
+    executor: str = ""  # NAME or NAME://ADDRESS; empty: as the environment says, or this computer
     skip_bad: bool = False
     check: bool = False
     compare: bool = False
     rerun: bool = False  # compute what is stored too, and store what comes out
+    track: Sequence[str] = ()  # trackers that follow the training, as ``NAME`` or ``NAME:PLACE``
     replace: bool = False  # the output may hold another stage's dataset, or recordings and labels that will go
 
     @property

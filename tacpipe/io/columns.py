@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 from collections.abc import Sequence
 
 import pyarrow as pa
@@ -47,6 +49,13 @@ class Columns:
         """Let go of what was decoded last, unless it is the whole of a small stream."""
         if self._decoded.num_columns < len(self._blocks):
             self._decoded = pa.table({})
+
+
+def release() -> None:
+    """Give back memory that Arrow and the C library keep of what is gone: as much as a long recording took, once read."""
+    pa.default_memory_pool().release_unused()
+    with contextlib.suppress(OSError, AttributeError):  # of a C library without it
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _blocks(schema: pa.Schema, rows: int, block_bytes: int) -> list[Sequence[str]]:

@@ -27,17 +27,22 @@ def write_whole(
     """
     try:
         _write_synced(draft, content, mode)
-        try:
-            return _move(draft, path, exclusive)
-        except FileNotFoundError:
-            os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
-            return _move(draft, path, exclusive)
+        return move(draft, path, exclusive=exclusive)
     finally:
         with contextlib.suppress(OSError):  # a draft that stays is swept up later
             os.unlink(draft)  # noqa: PTH108
 
 
-def write_all(handle: int, content: bytes) -> None:
+def move(draft: str, path: str, *, exclusive: bool = False) -> bool:
+    """Give a draft that is whole its name, in a folder that is made if need be; return False if ``exclusive`` lost."""
+    try:
+        return _move(draft, path, exclusive)
+    except FileNotFoundError:
+        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        return _move(draft, path, exclusive)
+
+
+def write_all(handle: int, content: bytes | memoryview) -> None:
     """Write all of ``content``, however little of it the system takes at a time."""
     view = memoryview(content)
     while view:
@@ -144,14 +149,17 @@ def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | No
 
 
 @contextlib.contextmanager
-def readable_errors(root: Path) -> Iterator[None]:
-    """Turn what the file system states into a sentence; what is looked for and not there stays what it is."""
+def readable_errors(root: Path, *, reading: bool = False) -> Iterator[None]:
+    """Turn what the file system states into a sentence; what is looked for and not there stays what it is.
+
+    With ``reading`` nothing is written in the block, and the sentence is that of `unread`.
+    """
     try:
         yield
     except (FileNotFoundError, FileExistsError):
         raise
     except OSError as error:
-        raise sentence(root, error) from error
+        raise (unread(error.filename or root, error) if reading else sentence(root, error)) from error
 
 
 def may_not_write(error: StorageError) -> bool:
@@ -174,6 +182,16 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
     return StorageError(
         f"The store {root} cannot be used: {error.filename or 'a file'}: {error.strerror or error}. "
         f"Check the disk, then run the same command again."
+    )
+
+
+def unread(path: Path | str, error: OSError) -> StorageError:
+    """Return in words that the system fails to read a file, which states nothing of what the file holds."""
+    hint = "check the disk and its permissions"
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        hint = "allow more open files (`ulimit -n`)"
+    return StorageError(
+        f"{path} cannot be read: {error.strerror or error}. It may be sound: {hint}, then run the same command again."
     )
 
 

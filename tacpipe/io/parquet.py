@@ -5,14 +5,15 @@ from __future__ import annotations
 import io
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.io import memory
 from tacpipe.io.parquet_claims import claimed
 from tacpipe.printable import plain
@@ -23,6 +24,7 @@ LARGE_BYTES = 1 << 25  # in memory
 BATCH_ROWS = 1024  # Arrow's own
 PAGE_BYTES = 1 << 20  # of encoded frames; a batch of 1024 of them could be beyond the 2 GiB that a page may have
 GROUP_BYTES = 1 << 28  # of encoded frames in a group of rows
+BESIDE_BYTES = 32  # that a frame may take in memory beside its own: offsets, whether it is there
 TRIED_BYTES = 1 << 20  # of encoded frames that are compressed to see whether it is worth it
 WORTH = 0.95  # of their size
 ZSTD_LEVEL = 3
@@ -42,14 +44,29 @@ def to_parquet(table: pa.Table) -> bytes:
     >>> from_parquet(to_parquet(table)).equals(table)
     True
     """
-    held = _held_share(table) > HELD_SHARE
+    # Arrow's own stream is faster, but doubles when it grows and copies in the end: a large table would be there thrice
+    sink = io.BytesIO() if table.nbytes > LARGE_BYTES else pa.BufferOutputStream()
+    write(table, sink)
+    content: bytes = sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
+    return content
+
+
+def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
+    """Write a table, or batches as they come, to the file ``sink`` as Parquet; return how many rows there were.
+
+    The same rows give the same bytes, as one table and in batches of any sizes: how columns are stored is decided from the
+    first group of rows. Of batches one group of rows is in memory.
+    """
+    rows = _Rows(source)
+    head = rows.head()
+    held = _held_share(head) > HELD_SHARE
     encoding, compression_level = {}, {}
-    compression = dict.fromkeys(table.column_names, "zstd")
+    compression = dict.fromkeys(source.schema.names, "zstd")
     value_bytes = max(
-        [_mean_bytes(table.column(field.name)) for field in table.schema if _holds_bytes(field)], default=0
+        [_mean_bytes(head.column(field.name)) for field in source.schema if _holds_bytes(field)], default=0
     )
-    for field in table.schema:
-        if _holds_bytes(field) and _compressed_already(table.column(field.name)):
+    for field in source.schema:
+        if _holds_bytes(field) and _compressed_already(head.column(field.name)):
             compression[field.name] = "none"
         delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not held)
         compression_level[field.name] = ZSTD_LEVEL if delta or not held else ZSTD_LEVEL_HELD
@@ -59,12 +76,11 @@ def to_parquet(table: pa.Table) -> bytes:
             encoding[field.name] = "DELTA_BINARY_PACKED"
         elif not pa.types.is_boolean(field.type):
             encoding[field.name] = "PLAIN"
-    # Arrow's own stream is faster, but doubles when it grows and copies in the end: a large table would be there thrice
-    sink = io.BytesIO() if table.nbytes > LARGE_BYTES else pa.BufferOutputStream()
-    bare = table.cast(pa.schema([pa.field(field.name, field.type) for field in table.schema]))
+    bare = pa.schema([pa.field(field.name, field.type) for field in source.schema])
+    del head
     with pq.ParquetWriter(
         sink,
-        bare.schema,
+        bare,
         use_dictionary=False,
         column_encoding=encoding,
         compression=compression,
@@ -74,17 +90,70 @@ def to_parquet(table: pa.Table) -> bytes:
         write_page_checksum=True,
         store_schema=False,
     ) as writer:
-        writer.write_table(bare, row_group_size=max(1, min(ROW_GROUP_ROWS, GROUP_BYTES // max(value_bytes, 1))))
-        writer.add_key_value_metadata({_KEY: _fields_to_json(table.schema)})
-    content: bytes = sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
-    return content
+        count = 0
+        for group in rows.groups(max(1, min(ROW_GROUP_ROWS, GROUP_BYTES // max(value_bytes, 1)))):
+            writer.write_table(_uncut(group).cast(bare), row_group_size=max(1, group.num_rows))
+            count += group.num_rows
+        writer.add_key_value_metadata({_KEY: _fields_to_json(source.schema)})
+    return count
+
+
+class _Rows:
+    """The rows of a table or of batches, taken group by group."""
+
+    def __init__(self, source: pa.Table | pa.RecordBatchReader) -> None:
+        self._next = source if isinstance(source, pa.Table) else source.schema.empty_table()
+        batches = () if isinstance(source, pa.Table) else source
+        self._more = (pa.Table.from_batches([batch]) for batch in batches if batch.num_rows)
+
+    def head(self) -> pa.Table:
+        """Return the rows by which it is decided how columns are stored; they stay to be taken."""
+        frames = [field.name for field in self._next.schema if _holds_bytes(field)]
+        if not frames:
+            self._fill(ROW_GROUP_ROWS)
+        while frames and self._next.num_rows < ROW_GROUP_ROWS and self._fill(self._next.num_rows + 1):
+            most = GROUP_BYTES + BESIDE_BYTES * self._next.num_rows
+            if any(self._next.column(name).nbytes > most for name in frames):
+                break
+        head = self._first(ROW_GROUP_ROWS)
+        for name in frames:
+            ends = np.cumsum(pc.binary_length(head.column(name)).fill_null(0).to_numpy(), dtype=np.int64)
+            head = head.slice(0, max(1, int(np.searchsorted(ends, GROUP_BYTES, side="right"))))
+        return head
+
+    def groups(self, rows: int) -> Iterator[pa.Table]:
+        """Yield tables of ``rows`` rows, a last one with the rest; an empty one where there is none at all."""
+        self._fill(rows)
+        while True:
+            yield self._first(rows)
+            self._next = self._next.slice(rows)
+            self._fill(rows)
+            if not self._next.num_rows:
+                return
+
+    def _first(self, rows: int) -> pa.Table:
+        return self._next.slice(
+            0, min(rows, self._next.num_rows)
+        )  # without columns a slice has as many as are asked for
+
+    def _fill(self, rows: int) -> bool:
+        """Have ``rows`` rows waiting, or all that are left; return whether there are so many."""
+        waiting, count = [self._next], int(self._next.num_rows)
+        for more in self._more if count < rows else ():
+            waiting.append(more)
+            count += more.num_rows
+            if count >= rows:
+                break
+        if len(waiting) > 1:
+            self._next = pa.concat_tables(waiting)
+        return count >= rows
 
 
 def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
     """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
 
-    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there or more than
-    the memory that is left.
+    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there, and
+    `ShortageError` where it is more than the memory that is left, which a sound file may hold too.
     """
     return ParquetTable(content).read(columns)
 
@@ -113,7 +182,7 @@ class ParquetTable:
             needed = claimed(self._file.schema, memoryview(self._content).cast("B"), columns)
         except BROKEN as error:
             raise _unread(self._content.size, error) from error
-        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=DamagedError)
+        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=ShortageError)
         try:
             table = self._file.read(columns=list(columns) if columns is not None else None)
             return table if self._fields is None else table.cast(self._with_fields(table.schema))
@@ -124,15 +193,17 @@ class ParquetTable:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
 
 
-def owned(content: bytes) -> pa.Buffer:
-    """Return the bytes in memory of Arrow's own.
+def owned(*pieces: bytes | memoryview) -> pa.Buffer:
+    """Return bytes, one after another, in memory of Arrow's own.
 
     Arrow's threads may let go of a buffer after the table is read. One of Python's they cannot release while Python ends:
     then the process aborts, its work done.
     """
-    sink = pa.BufferOutputStream()
-    sink.write(content)
-    return sink.getvalue()
+    buffer = pa.allocate_buffer(sum(map(len, pieces)))
+    with pa.FixedSizeBufferWriter(buffer) as sink:
+        for piece in pieces:
+            sink.write(piece)
+    return buffer
 
 
 def _unread(size: int, error: Exception) -> TacpipeError:
@@ -146,8 +217,20 @@ def _holds_bytes(field: pa.Field) -> bool:
     return bool(pa.types.is_binary(field.type) or pa.types.is_large_binary(field.type))
 
 
+def _uncut(group: pa.Table) -> pa.Table:
+    """Return rows whose texts and bytes lie in one piece: pages of these would end where pieces do."""
+    for position, column in enumerate(group.columns):
+        if column.num_chunks > 1 and not pa.types.is_primitive(column.type):
+            group = group.set_column(position, group.schema.field(position), column.combine_chunks())
+    return group
+
+
 def _mean_bytes(column: pa.ChunkedArray) -> int:
-    return int(sum(chunk.nbytes for chunk in column.chunks) / max(len(column), 1))
+    """Return how many bytes a value takes in memory, however the column is cut."""
+    count = len(column)
+    offsets = (count + 1) * (8 if pa.types.is_large_binary(column.type) else 4)
+    nulls = -(-count // 8) if column.null_count else 0
+    return int(((pc.sum(pc.binary_length(column)).as_py() or 0) + offsets + nulls) / max(count, 1))
 
 
 def _compressed_already(column: pa.ChunkedArray) -> bool:

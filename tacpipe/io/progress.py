@@ -29,6 +29,11 @@ def shown(wanted: bool) -> Iterator[None]:
         set_quiet(before)
 
 
+def is_quiet() -> bool:
+    """Return whether nothing is to be shown but errors and results."""
+    return _quiet
+
+
 def wanted() -> bool:
     """Return whether somebody is looking: stderr is a terminal and nobody asked for quiet."""
     return sys.stderr.isatty() and not _quiet

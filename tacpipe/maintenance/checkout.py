@@ -14,7 +14,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import execution
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.maintenance import pushed, transfer
@@ -23,7 +23,7 @@ from tacpipe.store import projects
 from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import MissingError, Store, locate
 
-SHOWN, REPLACED, GONE = "at its path", "replaced", "directory gone"
+SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
 IN_STORE, EARLIER = "pushed here", "pushed earlier"
 SHORTEST = 6  # hex digits by which a manifest may be named
 _HEX = re.compile(rf"[0-9a-f]{{{SHORTEST},64}}")
@@ -54,6 +54,8 @@ def known(store: Store) -> list[Known]:
             name, path = entry["manifest"], str(root["path"])
             try:
                 manifest = manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+            except StorageError:
+                raise
             except TacpipeError:
                 continue  # collected, or damaged
             earlier = EARLIER if root["kind"] == PUSHED else REPLACED
@@ -81,8 +83,10 @@ def _state(root: dict[str, Any], name: str) -> str:
         return SHOWN
     try:
         there = bytes_digest(regular.content(path / manifest_of.NAME, regular.JSON_BYTES))
-    except (OSError, regular.IrregularError):
+    except (FileNotFoundError, NotADirectoryError, regular.IrregularError):
         return GONE
+    except (OSError, StorageError):
+        return UNREAD
     return SHOWN if there == name else REPLACED
 
 
@@ -147,6 +151,8 @@ def _is_manifest(store: Store, name: str) -> bool:
         return False
     try:
         manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+    except StorageError:
+        raise
     except TacpipeError:
         return False
     return True

@@ -17,7 +17,7 @@ from typing import Any
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
@@ -126,7 +126,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
     records = list(store.records())  # before what is needed: a damaged one goes to quarantine, and counts there
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
-    kept = set(needed.lasting)
+    kept, unneeded = set(needed.lasting), []
     for key, record in records:
         names = set(named(record["result"]))
         if names <= needed.objects or names <= kept:
@@ -134,11 +134,12 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         if record["provenance"].get("irreplaceable") and not recordings:
             kept |= names - needed.objects
             continue
-        collected.records += _remove_record(Path(store.record_path(key)), dry_run=dry_run)
+        unneeded.append(key)
     objects = list(layout.entries(store.root, "objects"))
     kept |= needed.objects
     named_by = {} if recordings else unnamed.kept((one for one in objects if one.name not in kept), needed.manifests)
     kept = kept.union(named_by, *named_by.values())
+    collected.records = sum(_remove_record(Path(store.record_path(key)), dry_run=dry_run) for key in unneeded)
     collected.kept_recordings = len(kept - needed.objects - needed.replaced - set(named_by))
     aside = []
     for path in objects:
@@ -211,6 +212,8 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_rec
         manifests.add(name)
         try:
             manifest = manifest_of.parse(contents.get(name) or store.read(name), name, verified=True)
+        except StorageError:  # the disk failed, or memory is short: what the manifest names is not known
+            raise
         except TacpipeError as error:
             if store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
                 raise DamagedError(
@@ -265,6 +268,8 @@ def _content(path: Path) -> tuple[bytes | None, bool]:
 def _expect_sound(content: bytes, path: Path) -> None:
     try:
         manifest_of.parse(content, str(path / manifest_of.NAME))
+    except StorageError:
+        raise
     except TacpipeError as error:
         raise DamagedError(
             f"{error} It is not known what it needs, so nothing was removed; `tacpipe store repair` may bring it back."

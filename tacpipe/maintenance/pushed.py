@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.printable import listed
 from tacpipe.store.projects import Project
 from tacpipe.store.roots import PUSHED, Root, project_id
@@ -134,6 +134,8 @@ def lasting(store: Store, manifest: str) -> bool:
     """Return whether a pushed manifest holds recordings or labels set by hand, or cannot be read to know that."""
     try:
         found = manifest_of.parse(store.read(manifest), manifest, verified=True)
+    except StorageError:
+        raise
     except TacpipeError:
         return True
     return replacing.lasting(found)

@@ -15,7 +15,7 @@ from tacpipe import printable
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.engine import execution
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import readable_errors, walk, write_whole
 from tacpipe.io.hashing import bytes_digest, file_digest
 from tacpipe.printable import plain
@@ -41,11 +41,12 @@ class Soundness:
     missing: list[str] = field(default_factory=list)  # objects that a root's manifest names
     repaired: list[str] = field(default_factory=list)
     lost: dict[str, str] = field(default_factory=dict)  # digest to why it cannot be recomputed
+    unread: dict[str, str] = field(default_factory=dict)  # digest or key to why the system failed to read it
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was damaged and nothing is missing."""
-        return not (self.damaged or self.missing or self.lost)
+        """Whether all was read, nothing was damaged and nothing is missing."""
+        return not (self.damaged or self.missing or self.lost or self.unread)
 
     def to_text(self) -> str:
         """Return the findings in words."""
@@ -59,9 +60,12 @@ class Soundness:
         lines += [f"missing: {name}" for name in self.missing]
         lines += [f"recomputed: {name}" for name in self.repaired]
         lines += [f"cannot be recomputed: {name}: {why}" for name, why in self.lost.items()]
+        lines += [f"not read, and perhaps sound: {name}: {why}" for name, why in [*self.unread.items()][:_SHOWN]]
+        if len(self.unread) > _SHOWN:
+            lines.append(f"not read, and perhaps sound: {len(self.unread) - _SHOWN} more")
         if self.clean:
             lines.append("all sound")
-        elif not self.repaired and not self.lost:
+        elif (self.damaged or self.missing) and not self.repaired and not self.lost:
             lines.append("`tacpipe store repair` recomputes what it can")
         return "\n".join(lines)
 
@@ -76,24 +80,26 @@ def verify(store: Store) -> Soundness:
         return Soundness(there=False)
     found = Soundness(foreign=layout.foreign(store.root))
     for path in layout.entries(store.root, "objects"):
-        found.objects += _read(store.read, path.name, found.damaged)
+        found.objects += _read(store.read, path.name, found)
     for path in layout.entries(store.root, "records"):
-        found.records += _read(store.read_record, path.stem, found.damaged)
+        found.records += _read(store.read_record, path.stem, found)
     store.roots.all()
     found.damaged += [f"root {name}" for name in store.roots.damaged()]
-    missing = set(_wanted(store)) - set(found.damaged)
-    found.missing = sorted(missing & set(_wanted(store))) if missing else []  # a root may have changed meanwhile
+    missing = set(_wanted(store, found)) - set(found.damaged)
+    found.missing = sorted(missing & set(_wanted(store, found))) if missing else []  # a root may have changed meanwhile
     return found
 
 
-def _read(read: Callable[[str], object], name: str, damaged: list[str]) -> bool:
-    """Return whether something was there to read; add its name to ``damaged`` where that failed."""
+def _read(read: Callable[[str], object], name: str, found: Soundness) -> bool:
+    """Return whether something was there to read; note its name where it was damaged, or where the disk failed."""
     try:
         read(name)
     except AbsentError:
         return False
     except MissingError:
-        damaged.append(name)
+        found.damaged.append(name)
+    except StorageError as error:
+        found.unread[name] = str(error)
     return True
 
 
@@ -111,12 +117,14 @@ def repair(store: Store) -> Soundness:
             if not store.has(one.digest):
                 store.put(one.content)
                 found.repaired.append(one.digest)
-        wanted = _wanted(store)
+        wanted = _wanted(store, found)
         read = execution.reader(store, tuple(root["path"] for root in roots))
         for name, path in sorted(wanted.items()):
             try:
                 read(name, path)
                 found.repaired.append(name)
+            except StorageError as error:
+                found.unread[name] = str(error)
             except TacpipeError as error:
                 found.lost[name] = str(error)
         found.missing = []
@@ -143,8 +151,15 @@ def _roots_again(store: Store) -> list[str]:
 def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
     """Write the manifest at a root's path anew where it is damaged; return its digest. What lay there goes to quarantine."""
     path = Path(root["path"]) / manifest_of.NAME
-    if root["kind"] == PUSHED or not path.is_file() or _find(root) is not None:
+    if root["kind"] == PUSHED or not path.is_file():
         return []
+    try:
+        manifest_of.find(path).manifest  # noqa: B018  (is it sound?)
+        return []
+    except StorageError:  # it may be
+        return []
+    except TacpipeError:
+        pass
     try:
         content = store.read(root["manifest"])
     except MissingError:
@@ -224,7 +239,7 @@ def status_text(value: dict[str, Any]) -> str:
 
 
 def _find(root: dict[str, Any]) -> manifest_of.Found | None:
-    """Return the manifest at a root's path, None if there is no sound one."""
+    """Return the manifest at a root's path, None if there is none that is sound and can be read."""
     return None if root["kind"] == PUSHED else _sound(Path(root["path"]))
 
 
@@ -237,18 +252,23 @@ def _sound(directory: Path) -> manifest_of.Found | None:
     return found
 
 
-def _wanted(store: Store) -> dict[str, str]:
-    """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name."""
+def _wanted(store: Store, found: Soundness) -> dict[str, str]:
+    """Return what roots need and is not in the store, with paths: manifests, and all that those at the paths name.
+
+    What the system fails to read, or to look for, is noted in ``found``.
+    """
     wanted = {}
     for root in store.roots.all():
-        found = _find(root)
+        here = _find(root)
         try:
-            content = store.read(root["manifest"]) if found is None else found.content
+            content = store.read(root["manifest"]) if here is None else here.content
             name = bytes_digest(content)
             manifest = manifest_of.parse(content, name, verified=True)
+            if not store.has(name):
+                wanted[name] = manifest_of.NAME
+            wanted.update({name: path for path, name in manifest.objects() if not store.has(name)})
+        except StorageError as error:
+            found.unread[root["manifest"]] = str(error)
         except TacpipeError:
             continue
-        if not store.has(name):
-            wanted[name] = manifest_of.NAME
-        wanted.update({name: path for path, name in manifest.objects() if not store.has(name)})
     return wanted

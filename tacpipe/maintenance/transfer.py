@@ -95,6 +95,7 @@ def push(
                 )
                 lasting = before is not None and pushed.lasting(there, before["manifest"])
                 there.roots.push(name, {"id": owner.id, "name": owner.name}, found.digest, before, lasting=lasting)
+                _expect_kept(there, name, owner, found.digest)
                 if before is not None and not project_id(before):
                     there.roots.remove(before)  # its manifests are in the history of the new one
             if writable:
@@ -176,6 +177,19 @@ def _before(
         every = pushed.roots(there)
         pushed.refuse_newer(there, before, seen, pushed.label(before, every))
     return before
+
+
+def _expect_kept(there: Store, name: str, owner: Project, manifest: str) -> None:
+    """Raise `TacpipeError` where a push of the same name wrote its root over this one's at the same time.
+
+    The lease excludes that, but for file systems without locks.
+    """
+    root = there.roots.pushed(name, owner.id) or {}
+    if manifest not in (root.get("manifest"), *(one["manifest"] for one in root.get("history", ()))):
+        raise TacpipeError(
+            f"Another push of {name} to {there.root} ended at the same time and wrote over this one: the file system has "
+            f"no locks. Run the same command again, and one push at a time."
+        )
 
 
 def _is(root: Root, owner: Project, name: str) -> bool:

@@ -13,8 +13,9 @@ from pathlib import Path
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io import regular
+from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
 
 _BEGINS = b"{\n"  # every manifest, and no Parquet file
@@ -34,11 +35,15 @@ def kept(objects: Iterable[Path], known: Iterable[Manifest]) -> dict[str, set[st
         if bytes_digest(content) != name:
             names[name] = digests(content)
             continue
-        with contextlib.suppress(TacpipeError):
+        try:
             manifest = manifest_of.parse(content, name, verified=True)
-            unlike = [(one, value) for one, value in replacing.possessions(manifest) if one not in covered]
-            if unlike:
-                found.append((name, manifest, {(*one, value) for one, value in unlike}))
+        except StorageError:
+            raise
+        except TacpipeError:
+            continue
+        unlike = [(one, value) for one, value in replacing.possessions(manifest) if one not in covered]
+        if unlike:
+            found.append((name, manifest, {(*one, value) for one, value in unlike}))
     there: set[tuple[object, ...]] = set()
     for name, manifest, holds in sorted(
         found, key=lambda one: (-len(one[2]), one[0])
@@ -59,7 +64,7 @@ def digests(content: bytes) -> set[str]:
 def _candidates(objects: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
     """Yield digest and content of the objects that begin as a manifest does."""
     for path in objects:
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError):
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(path, reading=True):
             with regular.opened(path, follow=False) as file:
                 if file.read(len(_BEGINS)) != _BEGINS:
                     continue

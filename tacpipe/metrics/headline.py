@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -207,22 +206,6 @@ def caption(headlines: Sequence[Headline]) -> str:
         f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: bootstrap over "
         f"{' or '.join(sorted(resampled))}, model and baseline on the same ones, 2,000 resamples."
     )
-
-
-def text(headlines: Sequence[Headline]) -> str:
-    """Return headlines as lines of text: a table with its caption, or a sentence where there is none."""
-    if not headlines:
-        return "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
-    heads, rows = table(headlines)
-    widths = [max(len(row[at]) for row in (heads, *rows)) for at in range(len(heads))]
-    lines = []
-    for row in (heads, *rows):
-        cells = [
-            cell.ljust(width) if at < 2 else cell.rjust(width)
-            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join([*lines, *textwrap.wrap(caption(headlines), max(map(len, lines)))])
 
 
 def _capital(words: str) -> str:

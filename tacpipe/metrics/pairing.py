@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
+from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.metrics import forecast
 from tacpipe.metrics.headline import Headline, Row
 
 Sums = Mapping[tuple[Hashable, str], AnyFloats]  # by seed and recording, (part,): what adds up over recordings
+ENUMERATED, SWAPS = 12, 9_999  # clusters that are exchanged in all ways; random ways of more
 _draws = functools.lru_cache(maxsize=8)(forecast.draws)
 
 
@@ -32,6 +33,18 @@ class Measure:
     error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to (draw,): the lower the better, NaN where not defined
     gain: Callable[[AnyFloats, AnyFloats], AnyFloats]  # errors of model and baseline (draw,) to (draw,)
     values: Callable[[AnyFloats], tuple[float, ...]]  # sums (part,) to a value a column
+    score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # what charts draw, from errors (draw,) to (draw,)
+    scored: str = "error"  # what ``score`` is, with its unit
+    rises: bool = False  # whether a higher score is better
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its 95 % interval; NaN where it is not defined, bounds also with fewer than two clusters."""
+
+    mean: float
+    low: float
+    high: float
 
 
 def headline(
@@ -54,11 +67,8 @@ def headline(
     """
     if not model:
         return None
-    known = {name: found for name, one in baselines.items() if len(found := _beside(model, one, clusters)[0])}
     width = len(next(iter(model.values())))
-    totals = {name: one.sum(axis=(0, 1)) for name, one in known.items()}
-    errors = {name: float(measure.error(one[None, width:])[0]) for name, one in totals.items()}
-    order = sorted(errors, key=lambda name: (np.isnan(errors[name]), errors[name], list(baselines).index(name)))
+    order, totals = _ranked(measure, {name: _beside(model, one, clusters)[0] for name, one in baselines.items()})
     own, names = _beside(model, model, clusters)
     seeds = len({seed for seed, _ in model})
     gain = low = high = float("nan")
@@ -86,6 +96,83 @@ def headline(
         runs,
         seeds,
     )
+
+
+def best(
+    measure: Measure, model: Sums, baselines: Mapping[str, Sums], clusters: Mapping[str, str] | None = None
+) -> str:
+    """Return the baseline of least error on the recordings that it shares with the model; empty where none shares any."""
+    ranked = _ranked(measure, {name: _beside(model, one, clusters)[0] for name, one in baselines.items()})[0]
+    return next(iter(ranked), "")
+
+
+def _ranked(measure: Measure, pairs: Mapping[str, AnyFloats]) -> tuple[list[str], dict[str, AnyFloats]]:
+    """Return baselines, the best first, and the totals of model and baseline of each, from their `_beside`."""
+    totals = {name: one.sum(axis=(0, 1)) for name, one in pairs.items() if one.size}
+    errors = {name: float(measure.error(one[None, len(one) // 2 :])[0]) for name, one in totals.items()}
+    names = list(totals)
+    return sorted(errors, key=lambda name: (np.isnan(errors[name]), errors[name], names.index(name))), totals
+
+
+def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = None) -> Estimate:
+    """Return the score of one predictor by itself, with the interval over clusters (and seeds where there are several)."""
+    own, names = _beside(sums, sums, clusters)
+    if not names:
+        return Estimate(float("nan"), float("nan"), float("nan"))
+    width = own.shape[2] // 2
+    return Estimate(*_interval(own[:, :, :width], lambda drawn: measure.score(measure.error(drawn))))
+
+
+def difference(
+    measure: Measure, first: Sums, second: Sums, clusters: Mapping[str, str] | None = None
+) -> tuple[Estimate, float, int]:
+    """Return what the first predictor gains over the second on the recordings of both, the p of `swap_test`, and clusters.
+
+    The gain is `Measure.gain` of their errors; all NaN where they share no recording.
+    """
+    pairs, names = _beside(first, second, clusters)
+    if not names:
+        return Estimate(float("nan"), float("nan"), float("nan")), float("nan"), 0
+    width = pairs.shape[2] // 2
+
+    def gain(sums: AnyFloats) -> AnyFloats:
+        return measure.gain(*map(measure.error, (sums[:, :width], sums[:, width:])))
+
+    totals = pairs.sum(axis=0)
+    return Estimate(*_interval(pairs, gain)), swap_test(measure, totals[:, :width], totals[:, width:]), len(names)
+
+
+def swap_test(measure: Measure, first: AnyFloats, second: AnyFloats) -> float:
+    """Return the two-sided p of two predictors that are alike, from their sums (cluster, part) on the same clusters.
+
+    If they are, either could have made each cluster's errors: the statistic is the difference of their errors, and its
+    distribution comes from exchanging the two in some clusters, in all ways up to `ENUMERATED` clusters, else in `SWAPS`
+    random ones (paired permutation test; of right and wrong answers, McNemar's exact test). NaN with fewer than two
+    clusters and where an error is not defined.
+    """
+    clusters = len(first)
+    if clusters < 2:
+        return float("nan")
+
+    def apart(swapped: AnyFloats) -> AnyFloats:
+        kept = 1 - swapped
+        one, other = (kept @ a + swapped @ b for a, b in ((first, second), (second, first)))
+        return measure.error(one) - measure.error(other)
+
+    seen = float(apart(np.zeros((1, clusters)))[0])
+    if np.isnan(seen):
+        return float("nan")
+    drawn = apart(_swaps(clusters).astype(np.float64))
+    extreme = int((np.abs(drawn) >= abs(seen) * (1 - 1e-9) - 1e-12).sum())  # NaN is not extreme
+    return extreme / len(drawn) if clusters <= ENUMERATED else (extreme + 1) / (len(drawn) + 1)
+
+
+@functools.lru_cache(maxsize=8)
+def _swaps(clusters: int) -> AnyArray:
+    """Return which clusters are exchanged, (draw, cluster), 0 or 1."""
+    if clusters <= ENUMERATED:
+        return np.arange(2**clusters)[:, None] >> np.arange(clusters) & 1
+    return np.random.default_rng(0).integers(0, 2, (SWAPS, clusters), dtype=np.int8)
 
 
 def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:

@@ -23,7 +23,7 @@ without actions needs the corner of those with actions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +122,11 @@ class Baselines:
         }
 
     def predict(self, past: AnyFloats, motion: AnyFloats) -> dict[str, AnyFloats]:
-        """Return each baseline's counts above rest by its name, (window, horizon, channel), float32.
+        """Return what `each` yields, by name."""
+        return dict(self.each(past, motion))
+
+    def each(self, past: AnyFloats, motion: AnyFloats) -> Iterator[tuple[str, AnyFloats]]:
+        """Yield each baseline's name and counts above rest, (window, horizon, channel), float32.
 
         ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
         where these are not what was fitted.
@@ -139,17 +143,16 @@ class Baselines:
         past = past.astype(np.float32, copy=False)
         last = past[:, -1:]  # (window, 1, channel)
         shape = len(past), horizon, channels
+        yield "train_mean", np.broadcast_to(self.mean_count, shape).copy()
         slope = (last - past[:, -1 - self.lag, None]) / np.float32(max(self.lag, 1))
         damping = _damping(np.array([self.phi]), horizon)[0].astype(np.float32)  # (step,)
+        yield "damped_trend", last + damping[:, None] * slope
         shared = np.matmul(self.shared_weight.T, past[:, :-1] - last) + self.shared_bias[:, None]
+        yield "last_value_linear", last + shared
+        del shared
         features = _features(past, motion.astype(np.float32, copy=False))
-        maps = {"ridge": self.ridge, "ridge_actions": self.ridge_actions}
-        return {
-            "train_mean": np.broadcast_to(self.mean_count, shape).copy(),
-            "damped_trend": last + damping[:, None] * slope,
-            "last_value_linear": last + shared,
-            **{name: last + one(features[:, : len(one.centre)]).reshape(shape) for name, one in maps.items()},
-        }
+        for name, one in (("ridge", self.ridge), ("ridge_actions", self.ridge_actions)):
+            yield name, last + one(features[:, : len(one.centre)]).reshape(shape)
 
     def to_tensors(self) -> dict[str, AnyFloats]:
         """Return all that `from_tensors` needs."""

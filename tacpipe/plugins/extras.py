@@ -22,6 +22,7 @@ PACKAGES = {  # modules whose package has another name
     "google": "protobuf",
     "hid": "hidapi",
     "hidraw": "hidapi",
+    "mlflow": "mlflow-skinny",
     "mpl_toolkits": "matplotlib",
     "serial": "pyserial",
     "sklearn": "scikit-learn",

@@ -1,4 +1,4 @@
-"""Names of stages, formats, exports, tasks, reports, demos and sensors, found through entry points and loaded on demand."""
+"""Names of what plug-ins bring (stages, formats, sensors and so on): found through entry points, loaded when asked for."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ from tacpipe.printable import plain
 STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
 EXPORTS = "tacpipe.exports"
 REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
+EXECUTORS = "tacpipe.executors"
 DEMOS = "tacpipe.demos"  # by the name of a task: what `tacpipe demo` runs of it
 COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
 OWN = "tacpipe"  # the name of its own entry point there
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS)
+TRACKERS = "tacpipe.trackers"
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 
 
@@ -160,6 +162,34 @@ def load_sensor(name: str) -> Any:
     return _import(name, target)
 
 
+def load_executor(name: str) -> Any:
+    """Return the function that connects to the executor of this name (`tacpipe.engine.executors.executor.Executor`).
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = entry_points()[EXECUTORS].get(name)
+    if target is None:
+        names = ", ".join(sorted(entry_points()[EXECUTORS]))
+        raise UsageError(f"There is no executor {plain(name)}; there are {names}.")
+    return _import(name, target)
+
+
+def trackers() -> dict[str, str]:
+    """Return the target of every tracker by name."""
+    return dict(sorted(entry_points()[TRACKERS].items()))
+
+
+def load_tracker(name: str) -> Any:
+    """Return what makes the tracker of this name, a `tacpipe.trackers.tracker.Tracker`, from the place to write to.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    target = trackers().get(name)
+    if target is None:
+        raise UsageError(f"There is no tracker {plain(name)}; there are {', '.join(trackers())}.")
+    return _import(name, target)
+
+
 def _import(name: str, target: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
@@ -188,8 +218,13 @@ def _package(target: str) -> str | None:
     """Return the name of the installed package whose entry point ``target`` is, if it is known."""
     from importlib.metadata import entry_points as every
 
-    found = (point for group in GROUPS for point in every(group=group))
-    return next((point.dist.name for point in found if point.value == target and point.dist is not None), None)
+    found = (point.dist for group in GROUPS for point in every(group=group) if point.value == target)
+    try:
+        return next((one.name for one in found if one is not None), None)
+    except (
+        FileNotFoundError
+    ):  # `importlib_metadata`, which takes over where it was imported, wants metadata to be there
+        return None
 
 
 def summary(name: str) -> str:

@@ -15,6 +15,7 @@ states by its annotation what the stage reads:
 ``RecordingName``  the name of the one recording; part of its key, so only stages that need it take it
 ``Files``          the files of one recording of a source; the stage's ``discover`` finds them
 ``Values``         what ``discover`` gave for one recording beside its files, as labels; part of its key
+``Shared``         files that the recordings of a run share, each made once; ``Shared | None``, since there may be no run
 ``Trial``          the number of one recording to simulate, from 0 to ``params.trials``
 ``Roles``          the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
 ``Workspace``      a folder that survives an interruption, for checkpoints
@@ -30,13 +31,14 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, TypeVar
 
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.io.drafts import Draft
     from tacpipe.plugins.requirements import Requirements
 
 ROLES = ("train", "val", "test")
@@ -49,12 +51,21 @@ Fitted = Mapping[str, bytes]  # file name, content
 Trial = int
 Roles = Mapping[tuple[str, int], str]
 Workspace = Path
+
+
+class Shared(Protocol):
+    """Files that the recordings of a run share; they are removed with its end."""
+
+    def file(self, of: Any, make: Callable[[Draft], None]) -> Path:
+        """Return the file that ``make`` wrote for ``of``, a value of JSON: now, or before in any process of the run."""
+
+
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
 ALL = ("*",)  # as ``reads``: every attribute
 _KINDS = (
     *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "RecordingName"),
-    *("Files", "Values", "Trial", "Roles", "Workspace"),
+    *("Files", "Values", "Shared", "Trial", "Roles", "Workspace"),
 )
 
 
@@ -62,16 +73,19 @@ _KINDS = (
 class RecordingOutput:
     """What a stage returns for one recording: a table, or one a stream, attributes to add, and notes for the user.
 
+    A stream that memory need not hold is a ``pyarrow.RecordBatchReader``: its batches are stored as they come, to the bytes
+    of the table that they make. What is raised on the way is an error of the recording.
+
     A note is a sentence about a result that is valid but probably not what was wanted. Commands print it as a warning, on
     a cache hit too; it is kept in the record and is part of no key or digest.
     """
 
-    tables: pa.Table | Mapping[str, pa.Table]
+    tables: pa.Table | pa.RecordBatchReader | Mapping[str, pa.Table | pa.RecordBatchReader]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
     @property
-    def streams(self) -> dict[str, pa.Table]:
+    def streams(self) -> dict[str, pa.Table | pa.RecordBatchReader]:
         """The tables by stream name; a recording of one table has the name ``""``."""
         return dict(self.tables) if isinstance(self.tables, Mapping) else {"": self.tables}
 
@@ -170,6 +184,12 @@ class Stage(Generic[P, R]):
     def needs_split(self) -> bool:
         """Whether the stage distinguishes training recordings from others."""
         return self.fit is not None or any(name in ROLES for name in self.arguments)
+
+    @property
+    def tracked(self) -> bool:
+        """Whether trackers can follow the stage: it trains in a workspace, or its result has headlines."""
+        trains = any(one is not None and one.argument("Workspace") is not None for one in (self, self.fit))
+        return trains or self.headline is not None
 
 
 AnyStage: TypeAlias = Stage[..., Any]

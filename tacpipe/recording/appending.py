@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from tacpipe.datasets import directory
+from tacpipe.datasets import directory, recording_names
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
 from tacpipe.engine import keys, provenance
@@ -124,20 +124,27 @@ def existing(output: Path) -> Manifest | None:
 
 
 def refuse_taken(output: Path, names: Sequence[str]) -> None:
-    """Raise `UsageError` if a recording at ``output`` has one of these names, or if another command made what is there."""
+    """Raise `UsageError` if a recording at ``output`` has one of these names but for case, which some file systems fold.
+
+    Raises it too if another command made what is there.
+    """
     before = existing(output)
-    taken = [] if before is None else sorted(set(names) & set(before.recordings))
+    there = {} if before is None else {recording_names.folded(name): name for name in before.recordings}
+    taken = sorted(there[folded] for name in names if (folded := recording_names.folded(name)) in there)
     if taken:
         raise UsageError(
-            f"{output} has recordings of these names already: {', '.join(taken[:5])}. Give another --name, or -o another "
-            f"directory."
+            f"{output} has recordings of these names already: {', '.join(map(plain, taken[:5]))}. Give another --name, in "
+            f"more than upper and lower case, or -o another directory."
         )
 
 
 def _free(wanted: str, taken: Mapping[str, Any]) -> str:
-    """Return ``wanted``, with a number behind it if another process took that name since: what is recorded is kept."""
-    name, number = wanted, 2
-    while name in taken:
+    """Return ``wanted``, with a number behind it if another process took that name since: what is recorded is kept.
+
+    Names that differ only in case are one, as on some file systems.
+    """
+    name, number, folded = wanted, 2, {recording_names.folded(one) for one in taken}
+    while recording_names.folded(name) in folded:
         name, number = f"{wanted}-{number}", number + 1
     return name
 

@@ -7,12 +7,14 @@ columns of the geometric Jacobian (Siciliano et al., Robotics, 2009, section 3.1
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Times
 
+BLOCK_ROWS = 1 << 14  # whose frames are computed at once
 TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
 
 
@@ -71,7 +73,9 @@ def carries(chain: Chain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
     Rows that are not finite do not state.
     """
     known = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
-    last, hand_m = joint_frames(chain, joint_rad[known])[:, -1], hand_m[known]
+    joint_rad, hand_m = joint_rad[known], hand_m[known]
+    lasts = [joint_frames(chain, joint_rad[some])[:, -1].copy() for some in _blocks(len(joint_rad))]
+    last = np.concatenate([np.zeros((0, 4, 4)), *lasts])  # (time, 4, 4)
     tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])  # (time, 3), in the last link's frame
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
@@ -81,11 +85,19 @@ def hand_velocity(chain: Chain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, ha
 
     ``joint_rad`` and ``joint_rad_s`` are (time, joint), ``hand_m`` (time, 3).
     """
-    frames = joint_frames(chain, joint_rad)
-    axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
-    linear = np.einsum("tja,tj->ta", np.cross(axes, hand_m[:, None] - places), joint_rad_s)
-    angular = np.einsum("tja,tj->ta", axes, joint_rad_s)
-    return np.hstack([linear, angular])
+    velocity = np.empty((len(joint_rad), 6))
+    for some in _blocks(len(joint_rad)):
+        frames = joint_frames(chain, joint_rad[some])
+        axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
+        levers = np.cross(axes, hand_m[some, None] - places)
+        velocity[some, :3] = np.einsum("tja,tj->ta", levers, joint_rad_s[some])
+        velocity[some, 3:] = np.einsum("tja,tj->ta", axes, joint_rad_s[some])
+    return velocity
+
+
+def _blocks(rows: int) -> Iterator[slice]:
+    """Yield slices of `BLOCK_ROWS` rows: the frames of a row take 900 bytes, and those of an hour would not fit."""
+    return (slice(first, first + BLOCK_ROWS) for first in range(0, rows, BLOCK_ROWS))
 
 
 def differences(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloats) -> AnyFloats:

@@ -24,12 +24,23 @@ def uniform_grid(first_ns: int, last_ns: int, rate_hz: float) -> Times:
     >>> uniform_grid(0, 70_000_000, 30.0).tolist()
     [0, 33333333, 66666667]
     """
+    span_ns = int(last_ns) - int(first_ns)
+    offsets_ns = uniform_offsets(0, max(0, int(span_ns * rate_hz / 1e9) + 2) if np.isfinite(rate_hz) else 0, rate_hz)
+    return np.int64(first_ns) + offsets_ns[offsets_ns <= span_ns]
+
+
+def uniform_offsets(first: int, count: int, rate_hz: float) -> Times:
+    """Return ``round(k * 1e9 / rate_hz)`` for the ``count`` whole numbers k from ``first``, int64 (time,).
+
+    Raises `TacpipeError` for a rate that is not positive.
+
+    >>> uniform_offsets(1, 2, 30.0).tolist()
+    [33333333, 66666667]
+    """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 1e9):
         raise TacpipeError(f"A rate of {rate_hz} Hz gives no grid; it must lie above 0 and at most at 1e9 Hz.")
-    span_ns = int(last_ns) - int(first_ns)
-    steps = np.arange(max(0, int(span_ns * rate_hz / 1e9) + 2), dtype=np.float64)
-    offsets_ns = np.rint(steps * 1e9 / rate_hz).astype(np.int64)  # (time,)
-    return np.int64(first_ns) + offsets_ns[offsets_ns <= span_ns]
+    offsets_ns: Times = np.rint(np.arange(first, first + count, dtype=np.float64) * 1e9 / rate_hz).astype(np.int64)
+    return offsets_ns
 
 
 def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:

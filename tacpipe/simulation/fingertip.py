@@ -14,31 +14,9 @@ from __future__ import annotations
 import numpy as np
 
 from tacpipe.arrays import Counts, Floats
-from tacpipe.channels import schema
+from tacpipe.channels import places, schema
 
-PLACES_M = 0.001 * np.array(  # (electrode, axis); x along the finger to its tip, z from the pad into the finger
-    [
-        [0.993, -4.855, -1.116],
-        [-2.700, -3.513, -3.670],
-        [-6.200, -3.513, -3.670],
-        [-8.000, -4.956, -1.116],
-        [-10.500, -3.513, -3.670],
-        [-13.400, -4.956, -1.116],
-        [4.763, 0.000, -2.330],
-        [3.031, -1.950, -3.330],
-        [3.031, 1.950, -3.330],
-        [1.299, 0.000, -4.330],
-        [0.993, 4.855, -1.116],
-        [-2.700, 3.513, -3.670],
-        [-6.200, 3.513, -3.670],
-        [-8.000, 4.956, -1.116],
-        [-10.500, 3.513, -3.670],
-        [-13.400, 4.956, -1.116],
-        [-2.800, 0.000, -5.080],
-        [-9.800, 0.000, -5.080],
-        [-13.600, 0.000, -5.080],
-    ]
-)
+PLACES_M = places.BIOTAC_M  # (electrode, axis); x along the finger to its tip, z from the pad into the finger
 ALONG_M = PLACES_M[:, 0]  # (electrode,), xi: by which an electrode measures the surface earlier
 APERTURE_M = 0.0006
 CENTRE_M = 0.001 * np.array([-1.0, 0.0, -5.08])  # where the finger touches

@@ -4,8 +4,7 @@ The compensated readings of the iCub are floats, 0 where nothing presses, clippe
 wanders over the triangles as the curved forearm rolls on it; taxels outside are idle: a dead zone hides their noise. In
 the published slides 51 % of the readings are zero.
 
-The layout is an assumption after the iCub's documentation: triangles of 30 mm side, in a strip, of which every other one
-points the other way; in each, taxels in rows of 4, 3, 2 and 1, the fourth being the one in the centre.
+The layout is that of `tacpipe.channels.places.roboskin_m`.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from tacpipe.arrays import Float32s, Floats
-from tacpipe.channels import schema
+from tacpipe.channels import places, schema
 
 TAXELS = schema.TRIANGLES * schema.TRIANGLE_TAXELS
-PITCH_M = 0.0067  # of the taxels of a triangle
-SIDE_M = 0.030
 APERTURE_M = 0.0018
 SIGMA_M = 0.0085  # of the Gaussian by which the patch presses
 GAIN_COUNT_N = 170.0  # of a taxel at the centre of the patch
@@ -31,20 +28,7 @@ START_M = ((-0.018, -0.010), (-0.003, 0.003))  # of the patch's centre along the
 ROLL_M = ((0.012, 0.022), (-0.003, 0.003))  # its way during a slide
 
 
-def _places() -> Floats:
-    """Return where the taxels lie (taxel, axis): along the strip and across it, around its centre."""
-    rows = [(row, place) for row, width in enumerate((4, 3, 2, 1)) for place in range(width)]
-    module = np.array([[place - (3 - row) / 2, (row - 1) * np.sqrt(3) / 2] for row, place in rows]) * PITCH_M
-    module[[3, 5]] = module[[5, 3]]  # the fourth is the one in the centre
-    triangles = []
-    for triangle in range(schema.TRIANGLES):
-        sign = 1 - 2 * (triangle % 2)
-        along = (triangle - (schema.TRIANGLES - 1) / 2) * SIDE_M / 2
-        triangles.append(module * sign + [along, -sign * SIDE_M / 12 * np.sqrt(3)])
-    return np.concatenate(triangles)
-
-
-PLACES_M = _places()  # (taxel, axis)
+PLACES_M = places.roboskin_m()  # (taxel, axis): along the strip and across it, around its centre
 ALONG_M = PLACES_M[:, 0]  # (taxel,), xi: by which a taxel measures the surface earlier
 
 

@@ -19,13 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import Counts, Floats
-from tacpipe.channels import schema
+from tacpipe.channels import places, schema
 
-PITCH_M = 0.0047  # of the taxels; an assumption
+PITCH_M = places.USKIN_PITCH_M  # of the taxels
 PAD_M = 2 * PITCH_M  # half the width of a pad: the centre of what presses on it stays within
-PLACES_M = np.stack(np.meshgrid(*[(np.arange(4) - 1.5) * PITCH_M] * 2, indexing="ij"), axis=-1).reshape(
-    -1, 2
-)  # (taxel, 2)
+PLACES_M = places.uskin_m()  # (taxel, axis)
 SIGMA_M = (0.004, 0.006)  # of the Gaussian that shares the pressure
 CENTRE_M = 0.003  # largest distance of its centre from the pad's, along either axis
 TWIST_M_NM = 0.02  # by which a torque shifts it

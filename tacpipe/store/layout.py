@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def check(root: Path) -> bool:
                 f"the tacpipe that wrote it, or name another store in TACPIPE_STORE."
             )
         for name in _FORMS:
-            if os.path.islink(root / name):  # noqa: PTH114
+            if _is_link(root / name):
                 raise UsageError(
                     f"{root / name} is a symbolic link, and none is followed within a store. To keep a store on another "
                     f"disk, move the whole of {root} there and make that a link, or name it in TACPIPE_STORE."
@@ -89,7 +90,16 @@ def foreign(root: Path) -> list[str]:
 def is_linked(root: str, path: str | Path) -> bool:
     """Return whether a file of the store lies in a folder that is a symbolic link; the store itself may be one."""
     folder = os.path.dirname(path)  # noqa: PTH120
-    return folder != root and os.path.islink(folder)  # noqa: PTH114
+    with readable_errors(Path(root)):
+        return folder != root and _is_link(folder)
+
+
+def _is_link(path: str | Path) -> bool:
+    """Return whether a symbolic link lies at a path. Raises `OSError` where the system fails to look."""
+    try:
+        return stat.S_ISLNK(os.lstat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
 
 
 def _found(root: Path, name: str) -> Iterator[tuple[Path, bool]]:

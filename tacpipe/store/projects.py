@@ -48,7 +48,7 @@ def known(store: Store, folder: Path) -> Project | None:
     """
     file = _file(store, folder)
     try:
-        with readable_errors(store.root):
+        with readable_errors(store.root, reading=True):
             value = regular.json_value(file, _FILE_BYTES)
     except FileNotFoundError:
         return None

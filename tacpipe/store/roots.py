@@ -95,7 +95,7 @@ class Roots:
     def at(self, file: Path) -> Root | None:
         """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
         try:
-            with readable_errors(self.store.root):
+            with readable_errors(self.store.root, reading=True):
                 value = regular.json_value(file, ROOT_BYTES)
         except FileNotFoundError:
             return None

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
 import stat
+import sys
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import memory, places, regular
-from tacpipe.io.files import listed, readable_errors, sentence, sync_folders, write_whole
+from tacpipe.io import drafts, memory, places, regular
+from tacpipe.io.drafts import Draft
+from tacpipe.io.files import listed, move, present, readable_errors, sentence, sync_folders, unread, write_whole
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.store import layout
 from tacpipe.store.leases import Announcing, Leases
@@ -97,7 +100,15 @@ class Store:
             try:
                 yield
             finally:
+                self._sweep_drafts()
                 self._run = None
+
+    def _sweep_drafts(self) -> None:
+        """Remove what this run left in ``tmp/``."""
+        with contextlib.suppress(TacpipeError, OSError):  # a collection does it later
+            for path in layout.entries(self.root, "tmp"):
+                if path.name.startswith(f"{Path(self.run).stem}."):
+                    path.unlink(missing_ok=True)
 
     @property
     def run(self) -> str:
@@ -145,6 +156,25 @@ class Store:
             self.sync(path)
         return Object(name, len(content))
 
+    def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
+        """Store what ``write`` writes to the file that it is given, and return its digest and size.
+
+        For content that memory need not hold; else as `put`. Where ``write`` raises, nothing of it is kept.
+        """
+        path = self.draft()
+        with drafts.begun(path, self.root, mode=0o444) as draft:
+            write(draft)
+            draft.sync()
+            name = draft.digest
+            self.announce([name])
+            if durable or not self.has(name, draft.bytes):  # a copy that is there may be damaged
+                self._refuse_linked(self.object_path(name))
+                with readable_errors(self.root):
+                    move(path, self.object_path(name))
+        if durable:
+            self.sync(self.object_path(name))
+        return Object(name, draft.bytes)
+
     def take(self, name: str, blocks: Iterable[bytes]) -> None:
         """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
 
@@ -159,7 +189,8 @@ class Store:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
 
         Raises `MissingError` if it is not there, if it is so much larger than declared that it is not read, or if its bytes
-        do not hash to its name: those are then moved to ``quarantine/``.
+        do not hash to its name: those are then moved to ``quarantine/``. Raises `StorageError` where the system fails to
+        read it (EIO, EMFILE, EACCES, …) or memory is short, which states nothing of the object.
         """
         path = self.object_path(name)
         try:
@@ -168,36 +199,40 @@ class Store:
             if self._put_back(name):
                 return self.read(name, size)
             raise self._missing(name) from None
-        except (OSError, regular.IrregularError, StorageError) as error:
-            raise self._unreadable(name, error) from error
+        except regular.IrregularError as error:
+            raise self._irregular(name, error) from error
+        except OSError as error:
+            raise unread(path, error) from error
         if bytes_digest(content) != name:
             raise self._damaged(name)
         return content
 
-    def blocks(self, name: str, size: int) -> Iterator[bytes]:
+    def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
         """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
         hashed = hashlib.sha256()
         try:
             self.has(name)  # puts back what a collection moved aside
-            for block in regular.blocks(self.object_path(name), _most(size), follow=False):
+            most = sys.maxsize if size is None else _most(size)
+            for block in regular.blocks(self.object_path(name), most, follow=False):
                 hashed.update(block)
                 yield block
         except FileNotFoundError:
             raise self._missing(name) from None
-        except (OSError, regular.IrregularError) as error:
-            raise self._unreadable(name, error) from error
+        except regular.IrregularError as error:
+            raise self._irregular(name, error) from error
+        except OSError as error:
+            raise unread(self.object_path(name), error) from error
         if hashed.hexdigest() != name:
             raise self._damaged(name)
 
     def _missing(self, name: str) -> AbsentError:
         return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
 
-    def _unreadable(self, name: str, error: Exception) -> MissingError:
-        """Return what to state of an object that cannot be read; what is not a regular file is moved to quarantine."""
+    def _irregular(self, name: str, error: regular.IrregularError) -> MissingError:
+        """Return what to state of an object that is not one; what is not a regular file is moved to quarantine."""
         with contextlib.suppress(TacpipeError):
             self.has(name)
-        why = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {why.rstrip('.')}.")
+        return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {str(error).rstrip('.')}.")
 
     def _damaged(self, name: str) -> MissingError:
         moved = self.quarantine(self.object_path(name))
@@ -228,14 +263,22 @@ class Store:
         return f"{self._root}/tmp/{layout.ASIDE}{name}"
 
     def _put_back(self, name: str) -> bool:
-        """Return whether an object was aside, of a collection that runs or was killed; it is back in its place then."""
+        """Return whether an object was aside, of a collection that runs or was killed; it is back in its place then.
+
+        Raises `StorageError` for one that is aside and cannot be put back: it is not gone.
+        """
         path = self.object_path(name)
         if layout.is_linked(self._root, path):
             return False
-        try:
-            os.rename(self.aside(name), path)  # noqa: PTH104
-        except OSError:
-            return False
+        with readable_errors(self.root):
+            try:
+                os.rename(self.aside(name), path)  # noqa: PTH104
+            except FileNotFoundError:
+                return False
+            except OSError:  # of a store that may only be read, whether or not anything is aside
+                if present(self.aside(name)):
+                    raise
+                return False
         return True
 
     def sync(self, path: str | Path) -> None:
@@ -258,13 +301,22 @@ class Store:
 
         Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
         """
+        self._refuse_linked(path)
+        with readable_errors(self.root):
+            return write_whole(str(path), content, self.draft(), mode=mode, exclusive=exclusive)
+
+    def draft(self, name: str = "") -> str:
+        """Return a path in ``tmp/``, of a new name or of this one (32 hex digits), that begins with the run's.
+
+        From that a collection sees whether the run that wrote there is over.
+        """
+        return f"{self._root}/tmp/{Path(self.run).stem}.{name or uuid.uuid4().hex}"
+
+    def _refuse_linked(self, path: Path | str) -> None:
         if layout.is_linked(self._root, path):
             raise StorageError(
                 f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."
             )
-        with readable_errors(self.root):
-            draft = f"{self._root}/tmp/{Path(self.run).stem}.{uuid.uuid4().hex}"
-            return write_whole(str(path), content, draft, mode=mode, exclusive=exclusive)
 
     # ---- records
 
@@ -282,7 +334,7 @@ class Store:
         """
         path = self.record_path(key)
         try:
-            with readable_errors(self.root):
+            with readable_errors(self.root, reading=True):
                 record: dict[str, Any] = regular.json_value(path)
             if _sound(record, key):
                 return record
@@ -367,6 +419,21 @@ def marked(here: Path) -> Path | None:
     """Return the nearest folder upwards that has the mark of a project, None where none has."""
     for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
         for folder in (here, *here.parents):
-            if os.path.lexists(folder / mark):  # a link to a disk that is not mounted counts
+            if _marks(folder / mark):
                 return folder
     return None
+
+
+def _marks(path: Path) -> bool:
+    """Return whether a mark is there; a link to a disk that is not mounted counts.
+
+    Raises `StorageError` where the system fails to look: without the mark another store would be used.
+    """
+    try:
+        return present(path)
+    except ValueError:  # of a path that nothing can have
+        return False
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            return False
+        raise unread(path, error) from error

@@ -8,6 +8,7 @@ gives the same bits as one that was not, on a CPU; a GPU adds in another order e
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,44 +20,13 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io.progress import bar
 from tacpipe.models.tensors import under
-from tacpipe.training import checkpoint
+from tacpipe.training import checkpoint, following
+from tacpipe.training.following import Followers, Network
+from tacpipe.training.following import Line as Line
+from tacpipe.training.schedule import Schedule as Schedule
 
-RISE = 0.3  # fraction of all epochs over which the learning rate of a cycle rises
 Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
-Line = dict[str, Any]  # of the history: what became of an epoch, as JSON holds it
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How long and how fast to train."""
-
-    epochs: int
-    batch: int
-    learning_rate: float
-    patience: int  # epochs without a better validation loss after which training ends
-    gradient_clip: float  # largest norm of the gradient
-    seed: int
-    cycle: bool = False  # whether the rate rises over the first part of all epochs and falls over the rest
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be trained with."""
-        for name in ("epochs", "batch", "patience", "learning_rate", "gradient_clip"):
-            if not getattr(self, name) > 0:
-                raise TacpipeError(f"{name} is {getattr(self, name)}; it must be above 0.")
-
-    def rate(self, progress: float) -> float:
-        """Return the learning rate when ``progress`` of all epochs has passed, from 0 to 1.
-
-        With ``cycle`` it rises from a 25th to its peak and falls to nothing, both along a cosine (Smith and Topin,
-        Super-convergence, 2018): the fall makes up for stopping early on few validation recordings.
-        """
-        if not self.cycle:
-            return self.learning_rate
-        if progress < RISE:
-            return self.learning_rate * (1 / 25 + (1 - 1 / 25) * (1 - math.cos(math.pi * progress / RISE)) / 2)
-        return self.learning_rate * (1 + math.cos(math.pi * (progress - RISE) / (1 - RISE))) / 2
 
 
 @dataclass(frozen=True)
@@ -176,12 +146,21 @@ class _Run:
 
 
 def train(
-    build: Callable[[], nn.Module], work: Work, schedule: Schedule, workspace: Path, *, weight_decay: float = 0.0
+    build: Callable[[], nn.Module],
+    work: Work,
+    schedule: Schedule,
+    workspace: Path,
+    *,
+    weight_decay: float = 0.0,
+    number: int = 1,
+    count: int = 1,
+    labels: Mapping[str, Any] | None = None,
 ) -> Trained:
     """Return the best weights of the model that ``build`` makes, trained to lower the loss of ``work``.
 
     ``weight_decay`` is Adam's: this fraction of each weight is added to its gradient. Weights that need no gradient stay.
-    Goes on from the checkpoint in ``workspace`` if there is one. Leaves torch's own generator as it was.
+    Resumes from the checkpoint in ``workspace`` if there is one. Leaves torch's own generator as it was.
+    ``number`` of ``count`` and ``labels`` are what followers are given of one of several networks.
     Raises `TacpipeError` where the loss is no longer finite.
     """
     with torch.random.fork_rng(devices=[]):
@@ -191,12 +170,7 @@ def train(
         optimiser = torch.optim.Adam(learned, lr=schedule.learning_rate, weight_decay=weight_decay, fused=True)
         run = _Run(model, optimiser, {}, [])
         run.resume(workspace)
-        with bar("train", schedule.epochs) as advance:
-            advance(len(run.history))
-            while not run.over(schedule):
-                line = _epoch(run, work, schedule)
-                run.save(workspace)
-                advance(1, f"validation {line['val_loss']:.5f}")
+        _follow(run, work, schedule, workspace, Network(schedule.epochs, number, count, labels or {}))
     return Trained(
         {name: value.cpu() for name, value in run.best.items()},
         run.history,
@@ -204,7 +178,21 @@ def train(
     )
 
 
-def _epoch(run: _Run, work: Work, schedule: Schedule) -> Line:
+def _follow(run: _Run, work: Work, schedule: Schedule, workspace: Path, network: Network) -> None:
+    """Train all epochs that are left, each reported to the followers."""
+    random = torch.get_rng_state()
+    with following.network(network, list(run.history)) as followers:
+        torch.set_rng_state(random)  # whatever a tracker drew
+        while not run.over(schedule):
+            done = len(run.history)
+            with following.resumable(network, done):
+                line = _epoch(run, work, schedule, followers)
+                run.save(workspace)
+            with torch.random.fork_rng(devices=[]):
+                followers.line(line, schedule.of_epoch(done + 1))
+
+
+def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> Line:
     """Train for one epoch, add its line to the history and return it."""
     run.model.train()
     epoch = len(run.history)
@@ -222,10 +210,11 @@ def _epoch(run: _Run, work: Work, schedule: Schedule) -> Line:
         run.optimiser.step()
         total = total + loss.detach().double() * weight
         count += weight
+        followers.batch((step + 1) / len(batches), functools.partial(_mean, total, count))
     run.model.eval()
     with torch.no_grad():
         watched = work.watch(run.model)
-    line: Line = {"epoch": epoch + 1, "train_loss": float(total) / count, **watched}
+    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched}
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."
@@ -237,6 +226,10 @@ def _epoch(run: _Run, work: Work, schedule: Schedule) -> Line:
         run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(better))}
     run.history.append(line)
     return line
+
+
+def _mean(total: Tensor | float, count: int) -> float:
+    return float(total) / count
 
 
 def _better(ranks: Mapping[str, Sequence[float]], before: Iterable[Mapping[str, Sequence[float]]]) -> list[str]:

@@ -107,4 +107,4 @@ def test_seeds_are_drawn_as_recordings_are() -> None:
 
 
 def test_a_model_without_recordings_has_no_headline() -> None:
-    assert pairing.headline("t", "net", forward._measure((1,)), {}, {}) is None
+    assert pairing.headline("t", "net", forward.measure((1,)), {}, {}) is None

@@ -40,6 +40,7 @@ CLOUDS = ("candidates box.pcd",)
 DEVICES = ("sensors probe",)
 SILENT = 5  # where the computer has a serial port, and nothing answers there
 HDF5 = ("export hdf5 data/recordings -o hdf5", "ingest hdf5 hdf5 --guess")
+VIEW = ("view data/segments --limit 1 --save one.rrd",)
 ROS = ("export mcap data/recordings -o mcap", "ingest mcap mcap -o data/from-mcap")
 ZARR = ("export zarr data/synced -o zarr", "ingest zarr zarr --guess")
 EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not without
@@ -49,7 +50,12 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "frames": (),
     "hdf5": HDF5,
     "lsl": (),
+    "mlflow": (),
+    "view": VIEW,
     "ros": ROS,
+    "tensorboard": (),
+    "track": (),
+    "wandb": (),
     "zarr": ZARR,
     "all": (*LEARN, *CLOUDS, *DEVICES, *HDF5, *ROS, *ZARR),
 }

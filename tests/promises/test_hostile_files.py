@@ -18,7 +18,7 @@ import pytest
 
 from tacpipe.clouds import files as cloud_files
 from tacpipe.clouds import pcd, ply
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.formats import csv_table
 from tacpipe.io import memory, parquet_claims
 from tacpipe.io.parquet import from_parquet, to_parquet
@@ -98,7 +98,7 @@ def test_a_page_that_claims_to_unpack_to_gigabytes_is_held_against_the_memory(
     assert told in footer_of(content)
     bomb = with_footer(bomb, footer_of(content).replace(told, b"\x16" + varint(_size(content) + shift)))
     monkeypatch.setattr(memory, "available", lambda: 10**8)
-    refused(lambda: from_parquet(bomb), "declares", DamagedError)
+    refused(lambda: from_parquet(bomb), "declares", ShortageError)
 
 
 def _size(content: bytes) -> int:
@@ -121,7 +121,7 @@ def bomb() -> bytes:
 
 def test_a_file_that_unpacks_to_more_than_the_memory_is_refused_before_it_is_unpacked(bomb: bytes) -> None:
     assert len(bomb) < 800_000
-    refused(lambda: from_parquet(bomb), r"declares 0\.6 GB of data.*do not use it", DamagedError)
+    refused(lambda: from_parquet(bomb), r"declares 0\.6 GB of data.*do not use it", ShortageError)
 
 
 def test_a_long_recording_that_held_still_is_read_where_there_is_memory_for_it(bomb: bytes) -> None:
@@ -143,7 +143,7 @@ def test_texts_that_stand_for_a_million_long_ones_are_refused(encoding: str) -> 
             for _ in range(8):
                 writer.write_table(short)
     assert len(sink.getvalue()) < 40_000_000
-    refused(lambda: from_parquet(sink.getvalue()), "declares", DamagedError)
+    refused(lambda: from_parquet(sink.getvalue()), "declares", ShortageError)
 
 
 @pytest.mark.parametrize(

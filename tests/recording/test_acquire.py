@@ -90,8 +90,10 @@ def test_a_name_that_a_recording_has_already_is_refused_before_anything_is_recor
     before = lab.manifest("rec")
     single = lab.call("acquire rig.toml -o rec --duration 0.3 --name same")
     several = lab.call("acquire rig.toml -o rec --duration 0.3 --name press --trials 3")
+    folded = lab.call("acquire rig.toml -o rec --duration 0.3 --name Same")  # one to a file system without case
 
-    assert (single.code, several.code) == (2, 2)
+    assert (single.code, several.code, folded.code) == (2, 2, 2)
+    assert "names already: same." in folded.err
     assert "names already: same." in single.err and "names already: press-001, press-002." in several.err
     assert lab.manifest("rec") == before and not live.spools(lab.folder)
 
@@ -100,10 +102,10 @@ def test_a_name_that_was_taken_while_it_was_recorded_gets_a_number_and_loses_not
     lab: Lab, rig: Emulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tacpipe.recording.appending.refuse_taken", lambda output, names: None)
-    for _ in range(2):
-        lab.run("acquire rig.toml -o rec --duration 0.3 --name same")
+    for name in ("same", "Same"):
+        lab.run(f"acquire rig.toml -o rec --duration 0.3 --name {name}")
 
-    assert list(live.shards(lab.folder)) == ["same", "same-2"]
+    assert sorted(live.shards(lab.folder)) == ["Same-2", "same"]
 
 
 def test_the_rig_file_goes_along(lab: Lab, rig: Emulator) -> None:

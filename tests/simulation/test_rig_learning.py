@@ -197,7 +197,7 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     ahead = np.full_like(track.tactile, np.nan)
     for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
         ahead[some.now] = some.predictions[MODEL].count[:, -1]
-    felt = pull_over_pressure(track.tactile)
+    felt = pull_over_pressure(track.tactile[:])
     pull = np.hypot(floats(shard, "gt_force_x_n"), floats(shard, "gt_force_z_n"))
     pressure = floats(shard, "gt_finger1_normal_n") + floats(shard, "gt_finger2_normal_n")
     held = (floats(shard, "gt_slip") == 0) & (pressure > 2) & (pull > 0.1 * pressure)

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import gzip
+import itertools
+import math
+import re
 import zipfile
-from collections.abc import Iterator, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.json as pj
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table.layout import GZIP
+from tacpipe.formats.table import compressed
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned
 from tacpipe.printable import plain
 
-BATCH_ROWS = 1 << 18
+BATCH_ROWS = 1 << 18  # of Parquet, at most
+BLOCK_BYTES = 1 << 24  # of JSON lines, or of a block of arrays
+READ_BYTES = 1 << 20  # of a column of Parquet at once, however large its groups of rows are
+LONGEST_LINE = 1 << 26  # bytes of one JSON object
+_BEGUN = re.compile(rb"\S")
+_ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
 
 
 @dataclass(frozen=True)
@@ -41,7 +52,9 @@ class ParquetFile:
         """Yield the columns that ``types`` names, some rows at a time, with the types that the file has."""
         try:
             with regular.opened(self.path) as file:
-                for batch in pq.ParquetFile(file).iter_batches(BATCH_ROWS, columns=list(types)):
+                opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False)
+                rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
+                for batch in opened.iter_batches(rows, columns=list(types)):
                     yield _flat(self.path, pa.Table.from_batches([batch]))
         except BROKEN as error:
             raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
@@ -59,41 +72,41 @@ class NumpyArchive:
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
-        return list(self._columns)
+        return list(self._places)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield all rows of the columns that ``types`` names."""
-        columns = self._columns
-        yield pa.table({name: pa.array(columns[name]) for name in types})
+        """Yield the columns that ``types`` names, some rows at a time."""
+        wanted = {self._places[name][0] for name in types}
+        arrays = {name: array for name, array in self._arrays.items() if name in wanted}
+        rows = max(1, BLOCK_BYTES // max(1, sum(array.row_bytes for array in arrays.values())))
+        with contextlib.ExitStack() as stack, self._reading():
+            archive = stack.enter_context(_archive(self.path))
+            readers = {name: stack.enter_context(array.reading(archive)) for name, array in arrays.items()}
+            count = next((array.rows for array in arrays.values()), 0)
+            for start in range(0, count, rows) if count else (0,):
+                blocks = {name: read(min(rows, count - start)) for name, read in readers.items()}
+                yield pa.table({name: _column(blocks, *self._places[name]) for name in types})
 
     def place(self, index: int) -> str:
         """Return how the data row ``index`` (from 0) is named in errors."""
         return f"row {index + 1}"
 
     @functools.cached_property
-    def _columns(self) -> dict[str, np.ndarray]:
-        found: dict[str, np.ndarray] = {}
-        try:
-            with regular.opened(self.path) as file, zipfile.ZipFile(file) as archive:
-                memory.require(sum(one.file_size for one in archive.infolist()), str(self.path))
-                file.seek(0)
-                with np.load(file, allow_pickle=False) as arrays:
-                    for name in arrays.files:
-                        array = arrays[name]
-                        if array.ndim == 0:
-                            continue
-                        flat = array.reshape(len(array), -1)
-                        found |= (
-                            {name: array}
-                            if array.ndim == 1
-                            else {
-                                f"{name}_{column}": np.ascontiguousarray(flat[:, column])
-                                for column in range(flat.shape[1])
-                            }
-                        )
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-            raise TacpipeError(f"{self.path} is not an archive of arrays: {plain(str(error), 200)}.") from error
-        lengths = {name: len(array) for name, array in found.items()}
+    def _places(self) -> dict[str, tuple[str, int | None]]:
+        """The array that each column is of, and its position within a row of that."""
+        found: dict[str, tuple[str, int | None]] = {}
+        for name, array in self._arrays.items():
+            alone = {name: (name, None)}
+            found |= alone if array.width is None else {f"{name}_{one}": (name, one) for one in range(array.width)}
+        return found
+
+    @functools.cached_property
+    def _arrays(self) -> dict[str, ArrayMember]:
+        """The arrays that have rows, all of one length, by name."""
+        with self._reading(), _archive(self.path) as archive:
+            members = [ArrayMember.of(archive, one) for one in archive.infolist() if one.filename.endswith(".npy")]
+        found = {one.name: one for one in members if one.shape}
+        lengths = {name: one.rows for name, one in found.items()}
         if len(set(lengths.values())) > 1:
             first, other = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
             raise TacpipeError(
@@ -101,6 +114,89 @@ class NumpyArchive:
                 f"one stream have one length. Write those of each rate into a file of their own."
             )
         return found
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except _ZIP_ERRORS as error:
+            raise TacpipeError(f"{self.path} is not an archive of arrays: {plain(str(error), 200)}.") from error
+
+
+@dataclass(frozen=True)
+class ArrayMember:
+    """An array within an archive: what its header declares."""
+
+    name: str
+    member: str  # of the archive
+    shape: tuple[int, ...]
+    columnwise: bool  # Fortran's order: its rows are not one after another
+    dtype: np.dtype[Any]
+
+    @classmethod
+    def of(cls, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ArrayMember:
+        """Return what the header declares. Raises `ValueError` for what is not an array, or holds Python objects."""
+        with archive.open(member) as file:
+            shape, columnwise, dtype = _header(file)
+        if dtype.hasobject:
+            raise ValueError(f"{member.filename} holds Python objects, which are not read: they can run programs")
+        if max(1, math.prod(shape)) * dtype.itemsize > member.file_size:
+            raise ValueError(f"{member.filename} declares more values than it has bytes for")
+        return cls(member.filename.removesuffix(".npy"), member.filename, shape, columnwise and len(shape) > 1, dtype)
+
+    @property
+    def rows(self) -> int:
+        """How many rows it has."""
+        return self.shape[0]
+
+    @property
+    def width(self) -> int | None:
+        """How many values a row has, None where it is one value and no list of one."""
+        return math.prod(self.shape[1:]) if len(self.shape) > 1 else None
+
+    @property
+    def row_bytes(self) -> int:
+        """How many bytes a row takes."""
+        return math.prod(self.shape[1:]) * self.dtype.itemsize
+
+    @contextlib.contextmanager
+    def reading(self, archive: zipfile.ZipFile) -> Iterator[Callable[[int], np.ndarray]]:
+        """Yield a function that returns the next rows (time, value); raises `ValueError` where there are fewer."""
+        with archive.open(self.member) as file:
+            _header(file)
+            if self.columnwise:
+                memory.require(self.rows * self.row_bytes, f"{self.member}, which is in Fortran's order,")
+                whole = np.frombuffer(self._exactly(file, self.rows), self.dtype).reshape(self.shape, order="F")
+                flat, ends = whole.reshape(self.rows, -1), itertools.count()
+                yield lambda rows: flat[[next(ends) for _ in range(rows)]]
+            else:
+                yield lambda rows: np.frombuffer(self._exactly(file, rows), self.dtype).reshape(rows, -1)
+
+    def _exactly(self, file: IO[bytes], rows: int) -> bytes:
+        content = file.read(rows * self.row_bytes)
+        if len(content) < rows * self.row_bytes:
+            raise ValueError(f"{self.member} ends before its last row")
+        return content
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in read:
+        raise ValueError(f"an array of format {version} is not known")
+    shape, columnwise, dtype = read[version](file)
+    return tuple(map(int, shape)), bool(columnwise), dtype
+
+
+@contextlib.contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    with regular.opened(path) as file, zipfile.ZipFile(file) as archive:
+        yield archive
+
+
+def _column(blocks: Mapping[str, np.ndarray], array: str, position: int | None) -> pa.Array:
+    values = blocks[array][:, position or 0]
+    return pa.array(np.ascontiguousarray(values, values.dtype.newbyteorder("=")))
 
 
 @dataclass(frozen=True)
@@ -110,47 +206,89 @@ class JsonLines:
     path: Path
 
     def names(self) -> list[str]:
-        """Return the names of the columns."""
-        return list(self._table.column_names)
+        """Return the names of the columns: all that any line has."""
+        return list(self._kinds)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield all rows of the columns that ``types`` names."""
-        yield _flat(self.path, self._table.select(list(types)))
+        """Yield the columns that ``types`` names, some lines at a time; of the same types in each block."""
+        for block in map(self._unfolded, self._blocks()):
+            made = {
+                name: block.column(name).cast(self._kinds[name], safe=False)  # whole numbers of a column of floats too
+                if name in block.column_names
+                else pa.nulls(block.num_rows, self._kinds[name])
+                for name in types
+            }
+            yield _flat(self.path, pa.table(made))
+
+    def head(self) -> pa.Table:
+        """Return the first lines."""
+        return self._unfolded(next(self._blocks(), pa.table({})))
 
     def place(self, index: int) -> str:
         """Return how the data row ``index`` (from 0) is named in errors."""
         return f"line {index + 1}"
 
     @functools.cached_property
-    def _table(self) -> pa.Table:
-        with regular.failing(self.path):
-            content = regular.source(self.path)
-            if self.path.suffix.lower() == GZIP:
-                content = gzip.decompress(content)
+    def _kinds(self) -> dict[str, pa.DataType]:
+        """The type of each column that holds the values of all lines, in the order of their first coming."""
+        schemas: list[pa.Schema] = []
+        widths: dict[str, int] = {}
+        for block in self._blocks():
+            self._widths(block, widths)
+            schemas.append(self._unfolded(block.slice(0, 1)).schema)
         try:
-            table = pj.read_json(pa.BufferReader(owned(content)), pj.ReadOptions(use_threads=False))
+            whole = pa.unify_schemas(schemas, promote_options="permissive") if schemas else pa.schema([])
+        except pa.ArrowException as error:
+            raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
+        return {one.name: one.type for one in whole}
+
+    def _blocks(self) -> Iterator[pa.Table]:
+        with compressed.opened(self.path) as file:
+            rest = b""
+            while new := file.read(BLOCK_BYTES):
+                end = new.rfind(b"\n") + 1
+                if end:
+                    yield from self._parsed(rest, memoryview(new)[:end])
+                rest = new[end:] if end else rest + new
+                if len(rest) > LONGEST_LINE:
+                    raise TacpipeError(f"{self.path} is not JSON lines: a line has over {LONGEST_LINE} bytes.")
+            yield from self._parsed(rest)
+
+    def _parsed(self, *pieces: bytes | memoryview) -> Iterator[pa.Table]:
+        if not any(_BEGUN.search(piece) for piece in pieces):
+            return
+        try:
+            table = pj.read_json(pa.BufferReader(owned(*pieces)), pj.ReadOptions(use_threads=False))
         except (pa.ArrowInvalid, OSError) as error:
             raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
-        return _unfolded(self.path, table.flatten())
+        yield table.flatten()
 
+    def _widths(self, block: pa.Table, found: dict[str, int]) -> None:
+        """Add the length that the lists of each column have. Raises `TacpipeError` where they differ."""
+        for field in block.schema:
+            if pa.types.is_list(field.type):
+                lengths = set(pc.list_value_length(block.column(field.name)).to_pylist())
+                lengths |= {found[field.name]} if field.name in found else set()
+                if len(lengths) != 1 or None in lengths:
+                    raise TacpipeError(
+                        f"{self.path}: lists of {plain(field.name)} have {len(lengths)} lengths; a column holds one value a "
+                        f"row."
+                    )
+                (found[field.name],) = lengths
 
-def _unfolded(path: Path, table: pa.Table) -> pa.Table:
-    """Return a table whose columns of lists of one length are columns of their own."""
-    columns: dict[str, pa.ChunkedArray] = {}
-    for name in table.column_names:
-        column = table.column(name).combine_chunks()
-        if not pa.types.is_list(column.type):
-            columns[name] = column
-            continue
-        lengths = set(pa.compute.list_value_length(column).to_pylist())
-        if len(lengths) != 1 or None in lengths:
-            raise TacpipeError(
-                f"{path}: lists of {plain(name)} have {len(lengths)} lengths; a column holds one value a row."
+    def _unfolded(self, block: pa.Table) -> pa.Table:
+        """Return a table whose columns of lists of one length are columns of their own."""
+        made: dict[str, pa.ChunkedArray] = {}
+        widths: dict[str, int] = {}
+        self._widths(block, widths)
+        for name, column in zip(block.column_names, block.columns, strict=True):
+            alone = {name: column}
+            made |= (
+                {f"{name}_{one}": pc.list_element(column, one) for one in range(widths[name])}
+                if name in widths
+                else alone
             )
-        (width,) = lengths
-        for position in range(width):
-            columns[f"{name}_{position}"] = pa.compute.list_element(column, position)
-    return pa.table(columns)
+        return pa.table(made)
 
 
 def _flat(path: Path, table: pa.Table) -> pa.Table:

@@ -103,7 +103,9 @@ def _field(rule: Column, name: str, values: dict[str, str], declared: pa.Field |
     return pa.field(made, kind, metadata={**own, **about})
 
 
-def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool, inf_allowed: bool = False) -> pa.Array:
+def converted(
+    column: pa.ChunkedArray, one: Chosen, nan_allowed: bool, inf_allowed: bool = False
+) -> pa.Array | pa.ChunkedArray:
     """Return a parsed column as its declared type, scaled; a missing value is NaN in floats and empty in text.
 
     Raises `CellError` for a value that is missing where there is no NaN, infinite, or beyond the type; and for NaN unless
@@ -111,6 +113,8 @@ def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool, inf_allow
     """
     kind = one.field.type
     if column.type == kind and pa.types.is_binary(kind):  # of chunks, since an array of bytes has 2 GiB at most
+        return column
+    if column.type == kind == pa.float64() and one.rule.scale == 1.0 and _finite(column):
         return column
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_string(kind) or pa.types.is_binary(kind):
@@ -133,6 +137,12 @@ def converted(column: pa.ChunkedArray, one: Chosen, nan_allowed: bool, inf_allow
     scaled = values if one.rule.scale == 1.0 else values * one.rule.scale
     with np.errstate(over="ignore"):
         return pa.array(scaled.astype(kind.to_pandas_dtype()))
+
+
+def _finite(column: pa.ChunkedArray) -> bool:
+    """Return whether a column of floats holds numbers alone, as nearly all do: such a one is never copied."""
+    chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
+    return not column.null_count and all(np.isfinite(chunk.to_numpy()).all() for chunk in chunks)
 
 
 def _fits(value: pa.Scalar, kind: pa.DataType) -> bool:

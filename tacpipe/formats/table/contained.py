@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
 from tacpipe.formats.table import layout as layouts
 from tacpipe.plugins.constraints import TomlFile
-from tacpipe.plugins.stage import Files, RecordingOutput, Source, Values
+from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values
 
 if TYPE_CHECKING:
     from tacpipe.formats.containers.container import Share
@@ -140,14 +140,19 @@ class _Shares:
             return None  # reading it says what is wrong, of this recording alone
 
 
-def recording(layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values) -> RecordingOutput:
-    """Return one recording of ``files``, as `sources` found it; without streams in the layout all of a container."""
+def recording(
+    layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values, shared: Shared | None = None
+) -> RecordingOutput:
+    """Return one recording of ``files``, as `sources` found it; without streams in the layout all of a container.
+
+    With ``shared`` a table of many recordings is cut into these once.
+    """
     from tacpipe.formats.table import reading
     from tacpipe.formats.table.recordings import CONTAINER
 
     paths = containers(files)
     if layout.streams:
-        made = reading.recorded(layout.streams, paths, values.get(WITHIN))
+        made = reading.recorded(layout.streams, paths, values.get(WITHIN), shared)
     else:
         made = reading.all_of(str(kind), paths[CONTAINER], values.get(WITHIN))
     return RecordingOutput(made.streams, {**made.attributes, **values[LABELS]}, made.notes)

@@ -6,6 +6,7 @@ refused until somebody who knows has replaced it.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import re
@@ -14,11 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.errors import UsageError
 from tacpipe.formats.table import binary, compressed, dialect
 from tacpipe.formats.table.dialect import Dialect
 from tacpipe.formats.table.layout import EXTENSIONS, UNKNOWN, extension
+from tacpipe.formats.table.text import LONGEST_LINE
 from tacpipe.io import files as file_system
 from tacpipe.printable import plain
 
@@ -176,14 +179,18 @@ def _look(path: Path) -> Looked:
         }
         return Looked(found.names, values, found)
     file = binary.opened(path, kind)
-    names = file.names()
-    block = next(iter(file.batches(dict.fromkeys(names)))).slice(0, LINES)
+    if isinstance(file, binary.JsonLines):
+        block = file.head()
+    else:
+        block = next(iter(file.batches(dict.fromkeys(file.names()))), pa.table({}))
+    block, names = block.slice(0, LINES), block.column_names
     return Looked(tuple(names), {name: tuple(block.column(name).to_pylist()) for name in names}, None)
 
 
 def _lines(path: Path) -> list[str]:
     with compressed.opened(path) as file:
-        return [line.decode(errors="replace") for line in itertools.islice(file, LINES)]
+        lines = iter(functools.partial(file.readline, LONGEST_LINE), b"")
+        return [line.decode(errors="replace") for line in itertools.islice(lines, LINES)]
 
 
 def _value(cell: str, found: Dialect) -> float | str | None:

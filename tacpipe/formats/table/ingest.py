@@ -16,7 +16,7 @@ from typing import Annotated
 from tacpipe.errors import UsageError
 from tacpipe.formats.table import layout as layouts
 from tacpipe.plugins.constraints import TomlFile
-from tacpipe.plugins.stage import Files, RecordingOutput, Source, Values, stage
+from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values, stage
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def guess(source: Path) -> str:
 
 
 @stage(version=1, discover=discover, preview=preview, guess=guess)
-def table(params: Params, files: Files, values: Values) -> RecordingOutput:
+def table(params: Params, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
     """Read a lab's own tables (CSV, Parquet, NPZ, JSON lines).
 
     A layout file names the files of each recording, their columns with quantity and unit, where time stamps and labels
@@ -70,4 +70,4 @@ def table(params: Params, files: Files, values: Values) -> RecordingOutput:
     """
     from tacpipe.formats.table import contained
 
-    return contained.recording(params.parsed(), None, files, values)
+    return contained.recording(params.parsed(), None, files, values, shared)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +16,7 @@ from tacpipe.formats.table import labels, reading
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
 from tacpipe.formats.table.recordings import CONTAINER, Source
+from tacpipe.formats.table.steps import Steps
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed
 
@@ -33,40 +36,54 @@ class Read:
     gaps: int  # steps of more than `GAP` times the usual one
     longest_s: float  # the longest step
     columns: Mapping[str, tuple[str, str, str, float, float]]  # quantity, unit, type, least, most
+    first: pa.Table  # the first rows
 
 
-def of(table: pa.Table) -> Read:
-    """Return what a stream's table holds.
+def of(rows: pa.Table | pa.RecordBatchReader) -> Read:
+    """Return what a stream holds, of batches without holding them.
 
     >>> found = of(pa.table({"t_ns": [0, 10**7, 2 * 10**7, 9 * 10**7], "a": [1, 5, 2, 3]}))
     >>> found.rows, found.rate_hz, found.gaps, found.columns["a"][3:]
     (4, 100.0, 1, (1, 5))
     """
-    t_ns = table.column(TIME).to_numpy()
-    steps_ns = np.diff(t_ns)
-    usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
-    columns = {}
-    for field in table.schema:
-        if field.name == TIME or pa.types.is_string(field.type):
+    first: pa.Table = rows.schema.empty_table()
+    ends: dict[str, list[Any]] = {}
+    stamps: list[int] = []  # of the first row, and of the last one so far
+    count, steps = 0, Steps()
+    for batch in rows.to_batches() if isinstance(rows, pa.Table) else rows:
+        if not batch.num_rows:
             continue
-        column = table.column(field.name)
-        ends = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
+        count += batch.num_rows
+        if first.num_rows < ROWS:
+            first = pa.concat_tables([first, pa.Table.from_batches([batch.slice(0, ROWS)])]).slice(0, ROWS)
+        t_ns = batch.column(TIME).to_numpy()
+        steps.add(np.diff(t_ns, prepend=stamps[-1]) if stamps else np.diff(t_ns))
+        stamps = [stamps[0] if stamps else int(t_ns[0]), int(t_ns[-1])]
+        for field in _measured(rows.schema):
+            column = batch.column(field.name)
+            found = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
+            both = [*ends.get(field.name, []), *(one for one in found.values() if one is not None and one == one)]
+            ends[field.name] = [min(both), max(both)] if both else []
+    usual_ns = steps.median_ns()
+    columns = {}
+    for field in _measured(rows.schema):
         about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        columns[field.name] = (
-            about.get("quantity", ""),
-            about.get("unit", ""),
-            _KINDS.get(field.type, str(field.type)),
-            ends["min"],
-            ends["max"],
-        )
+        kind = _KINDS.get(field.type, str(field.type))
+        least, most = ends.get(field.name) or (math.nan, math.nan)
+        columns[field.name] = about.get("quantity", ""), about.get("unit", ""), kind, least, most
     return Read(
-        table.num_rows,
-        int(t_ns[0]),
+        count,
+        stamps[0] if stamps else 0,
         1e9 / usual_ns if usual_ns else 0.0,
-        int((steps_ns > GAP * usual_ns).sum()),
-        float(steps_ns.max(initial=0)) / 1e9,
+        steps.longer(GAP * usual_ns),
+        steps.longest_ns() / 1e9,
         columns,
+        first,
     )
+
+
+def _measured(schema: pa.Schema) -> list[pa.Field]:
+    return [field for field in schema if field.name != TIME and not pa.types.is_string(field.type)]
 
 
 def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | None = None) -> str:
@@ -102,8 +119,8 @@ def _labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:
     return lines
 
 
-def _stream(name: str, table: pa.Table, path: Path) -> list[str]:
-    found = of(table)
+def _stream(name: str, rows: pa.Table | pa.RecordBatchReader, path: Path) -> list[str]:
+    found = of(rows)
     start = np.datetime64(found.first_ns, "ns")
     lines = [
         f"  {name}: {found.rows} rows from {path}, {found.rate_hz:.6g} Hz, first stamp {start} UTC, {found.gaps} gaps, "
@@ -120,9 +137,8 @@ def _stream(name: str, table: pa.Table, path: Path) -> list[str]:
         lines.append(
             f"    {len(columns)} x {about}, from {least:.6g} to {most:.6g}{measure}: {listed(columns, COLUMNS)}"
         )
-    shown = table.column_names[: COLUMNS + 1]
-    rows = table.slice(0, ROWS).select(shown).to_pylist()
-    return lines + ["    " + "  ".join(map(_cell, row.values())) for row in rows]
+    shown = found.first.select(found.first.column_names[: COLUMNS + 1]).to_pylist()
+    return lines + ["    " + "  ".join(map(_cell, row.values())) for row in shown]
 
 
 def _cell(value: object) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,17 +17,19 @@ from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream
-from tacpipe.formats.table import binary, columns, stamps
+from tacpipe.formats.table import ahead, binary, columns, parted, stamps
 from tacpipe.formats.table.columns import TIME, CellError, Chosen, Declared
 from tacpipe.formats.table.layout import Stream
 from tacpipe.formats.table.text import TextTable
 from tacpipe.io import parquet
-from tacpipe.plugins.stage import Attribute
+from tacpipe.io.drafts import Draft
+from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import excerpt, listed, plain
-from tacpipe.signals.resampling import uniform_grid
+from tacpipe.signals import resampling
 
 SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
 Place = Callable[[int], str]  # of a row in a block: how errors name it
+Block = tuple[Times | None, list[pa.Array]]  # stamps, if rows have some, and columns
 
 
 class Rows(Protocol):
@@ -76,13 +78,22 @@ def opened(path: Path, stream: Stream) -> Rows:
     return binary.opened(path, kind)
 
 
-def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
-    """Return the stream as a table with ``t_ns``; ``recording`` is the one to pick where the file holds many.
+def batches(
+    file: Rows, stream: Stream, recording: str | None = None, shared: Shared | None = None
+) -> pa.RecordBatchReader:
+    """Return the rows of the stream with ``t_ns`` as they are read; ``recording`` is the one to pick where there are many.
+
+    With ``shared`` the file is then cut into its recordings once, and not read for each.
 
     Raises `TacpipeError`, naming file, row and column, for what is not as the layout says, for stamps that run backwards,
-    and for a file without rows.
+    and for a file without rows; also as batches are taken. Of a wide table one block is in memory.
     """
-    return _table(opened(path, stream), stream, recording, columns.NOTHING)
+    return _batches(file, stream, recording, columns.NOTHING, shared)
+
+
+def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
+    """Return `batches` of a file as one table."""
+    return batches(opened(path, stream), stream, recording).read_all()
 
 
 def contained(path: Path, found: SourceStream, stream: Stream) -> pa.Table:
@@ -104,7 +115,7 @@ def contained(path: Path, found: SourceStream, stream: Stream) -> pa.Table:
     rows = found.table
     if stream.time.column in rows.column_names and stream.time.column != found.time.column:
         rows = _in_order(rows, stream.time.column)
-    made = _table(ContainedRows(path, found.source, rows), stream, None, declared)
+    made = _batches(ContainedRows(path, found.source, rows), stream, None, declared).read_all()
     stamped = declared.get(stream.time.column)
     about = {key.decode(): value.decode() for key, value in (stamped.metadata or {}).items()} if stamped else {}
     return parquet.with_metadata(made, {TIME: {k: v for k, v in about.items() if k not in ("unit", "quantity")}})
@@ -124,18 +135,20 @@ def _in_order(table: pa.Table, column: str) -> pa.Table:
 class Recorded:
     """What was read of one recording."""
 
-    streams: Mapping[str, pa.Table]
+    streams: Mapping[str, pa.Table | pa.RecordBatchReader]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)  # that containers state
     notes: Sequence[str] = ()  # what was left out or is missing
 
 
-def recorded(streams: Sequence[Stream], paths: Mapping[str, Path], within: str | None) -> Recorded:
+def recorded(
+    streams: Sequence[Stream], paths: Mapping[str, Path], within: str | None, shared: Shared | None = None
+) -> Recorded:
     """Return the recording whose files are ``paths`` by stream; ``within`` is its name where a file holds many.
 
     Streams of one container are read in one pass. Raises as `table` does, and for a stream that its container lacks,
     unless it is optional.
     """
-    tables: dict[str, pa.Table] = {}
+    tables: dict[str, pa.Table | pa.RecordBatchReader] = {}
     attributes: dict[str, Attribute] = {}
     notes: list[str] = []
     together: dict[tuple[str, Path], list[Stream]] = {}
@@ -145,7 +158,7 @@ def recorded(streams: Sequence[Stream], paths: Mapping[str, Path], within: str |
         if stream.contained:
             together.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
         else:
-            tables[stream.name] = table(paths[stream.name], stream, within)
+            tables[stream.name] = batches(opened(paths[stream.name], stream), stream, within, shared)
     for (kind, path), several in together.items():
         contents = kinds.opened(kind, path).read([one.source for one in several], within)
         there = {one.source: one for one in contents.streams}
@@ -187,7 +200,9 @@ def _lacking(path: Path, stream: Stream, contents: Contents, look: Contents) -> 
     )
 
 
-def _table(file: Rows, stream: Stream, recording: str | None, declared: Declared) -> pa.Table:
+def _batches(
+    file: Rows, stream: Stream, recording: str | None, declared: Declared, shared: Shared | None = None
+) -> pa.RecordBatchReader:
     path, names = file.path, file.names()
     apart = [name for name in (stream.time.column, stream.recording) if name]
     if stream.long is not None:
@@ -197,15 +212,70 @@ def _table(file: Rows, stream: Stream, recording: str | None, declared: Declared
         raise TacpipeError(
             f"{path} has no column {listed(missing, 3)}, which [streams.{stream.name}] names; it has {listed(names, 6)}."
         )
+    blocks: Iterable[Block]
+    start_ns = _start_ns(stream) if stream.time.origin == "start" or not stream.time.column else 0
     if stream.long is not None:
-        return _long(file, stream, recording)
-    wanted = columns.chosen(stream, [name for name in names if name not in apart], path, declared)
-    types = {**_types(file, stream), **{one.name: one.read_as for one in wanted}}
-    as_is = bool(declared)  # a container's own NaN and infinity are values
-    blocks = [
-        _converted(stream, block, wanted, place, as_is) for block, place in _blocks(file, stream, types, recording)
-    ]
-    return _finished(pa.concat_tables(blocks) if blocks else None, file, stream, recording)
+        fields, blocks = _long(file, stream, recording, shared)
+    else:
+        wanted = columns.chosen(stream, [name for name in names if name not in apart], path, declared)
+        types = {**_types(file, stream), **{one.name: one.read_as for one in wanted}}
+        as_is = bool(declared)  # a container's own NaN and infinity are values
+        fields = [one.field for one in wanted]
+        blocks = (
+            _converted(stream, block, wanted, place, as_is)
+            for block, place in _blocks(file, stream, types, recording, shared)
+        )
+    made = pa.schema([_time_field(stream), *fields])
+    stamped = _stamps_checked(blocks, file, stream, recording, start_ns)
+    return pa.RecordBatchReader.from_batches(
+        made, (batch for columns_of in stamped for batch in pa.table(columns_of, made).to_batches())
+    )
+
+
+def _time_field(stream: Stream) -> pa.Field:
+    if not stream.time.column:
+        return schema.time_field("from rate")
+    return (
+        schema.time_field("from the start of the recording") if stream.time.origin == "start" else schema.time_field()
+    )
+
+
+def _stamps_checked(
+    blocks: Iterable[Block], file: Rows, stream: Stream, recording: str | None, start_ns: int
+) -> Iterator[list[pa.Array]]:
+    """Yield the columns of blocks behind their stamps, which must not run backwards, and must be there."""
+    rows, last_ns = 0, None
+    for t_ns, arrays in blocks:
+        count = len(arrays[0])
+        if not count:
+            continue
+        if t_ns is None:
+            assert stream.time.rate_hz is not None
+            t_ns = resampling.uniform_offsets(rows, count, stream.time.rate_hz)
+        else:
+            _expect_rising(t_ns, last_ns, rows, file, recording)
+            last_ns = int(t_ns[-1])
+        rows += count
+        yield [pa.array(t_ns + start_ns if start_ns else t_ns), *arrays]
+    if not rows:
+        of = f" of recording {plain(recording)}" if recording else ""
+        raise TacpipeError(f"{file.path} holds no row{of}. Take it away, or record it again.")
+
+
+def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: Rows, recording: str | None) -> None:
+    """Raise `TacpipeError` where stamps run backwards; ``last_ns`` is that above them, after ``before`` rows."""
+    steps_ns = np.diff(t_ns, prepend=t_ns[0] if last_ns is None else last_ns)
+    backwards = np.flatnonzero(steps_ns < 0)
+    if not len(backwards):
+        return
+    row = before + int(backwards[0])
+    where = (
+        f"{file.path}, {file.place(row)}" if recording is None else f"{file.path}, row {row + 1} of {plain(recording)}"
+    )
+    raise TacpipeError(
+        f"{where}: the stamp is {-steps_ns[backwards[0]] / 1e9:g} s before that of the row above. Sort the rows, or "
+        f"cut the file where its clock was set."
+    )
 
 
 def _types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:
@@ -219,39 +289,49 @@ def _types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:
 
 
 def _blocks(
-    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None
+    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None, shared: Shared | None
 ) -> Iterator[tuple[pa.Table, Place]]:
     """Yield the blocks of a file, of one recording alone where it holds many, and what names a row of each in errors."""
-    begun = 0
-    for block in file.batches(types):
-        rows = np.arange(block.num_rows)
-        if stream.recording:
-            rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
-        in_file = rows + begun  # (row,), counted from the first row of the file
-        begun += block.num_rows
+    for block, in_file in _picked(file, stream, types, recording, shared):
 
         def place(row: int, in_file: Indices = in_file) -> str:
             return f"{file.path}, {file.place(int(in_file[row]))}"
 
-        yield (block.take(pa.array(rows)) if stream.recording else block), place
+        yield block, place
 
 
-def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place, as_is: bool) -> pa.Table:
-    """Return a block with stamps and declared types."""
-    made = {}
-    if stream.time.column:
-        made[TIME] = pa.array(_stamped(block.column(stream.time.column), stream, place))
+def _picked(
+    file: Rows, stream: Stream, types: Mapping[str, pa.DataType], recording: str | None, shared: Shared | None
+) -> Iterator[tuple[pa.Table, Indices]]:
+    """Yield the blocks of a file, or of a recording in it, and which rows of the file they are."""
+    if stream.recording and shared is not None:
+
+        def cut(draft: Draft) -> None:
+            parted.cut(ahead.of(file.batches(types)), stream.recording, draft)
+
+        yield from parted.rows(shared.file([str(file.path), stream.name], cut), str(recording))
+        return
+    begun = 0
+    for block in ahead.of(file.batches(types)):
+        rows = np.arange(block.num_rows)
+        if stream.recording:
+            rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
+        yield (block.take(pa.array(rows)) if stream.recording else block), rows + begun
+        begun += block.num_rows
+
+
+def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place, as_is: bool) -> Block:
+    """Return the stamps of a block, where it has some, and its columns as their declared types."""
+    t_ns = _stamped(block.column(stream.time.column), stream, place) if stream.time.column else None
+    made = []
     for one in wanted:
         try:
-            made[one.field.name] = columns.converted(
-                block.column(one.name), one, as_is or "nan" in map(str.lower, stream.missing), as_is
+            made.append(
+                columns.converted(block.column(one.name), one, as_is or "nan" in map(str.lower, stream.missing), as_is)
             )
         except CellError as error:
             raise TacpipeError(f"{place(error.row)}, column {plain(one.name)} {error}.") from error
-    fields = [one.field for one in wanted]
-    if TIME in made:
-        fields = [schema.time_field(), *fields]
-    return pa.table(list(made.values()), pa.schema(fields))
+    return t_ns, made
 
 
 def _stamped(column: pa.ChunkedArray, stream: Stream, place: Place) -> Times:
@@ -262,35 +342,6 @@ def _stamped(column: pa.ChunkedArray, stream: Stream, place: Place) -> Times:
             f"{place(error.row)}, column {plain(stream.time.column)} holds {excerpt(error.found)}; it must be "
             f"{error.wanted}."
         ) from error
-
-
-def _finished(made: pa.Table | None, file: Rows, stream: Stream, recording: str | None) -> pa.Table:
-    if made is None or not made.num_rows:
-        of = f" of recording {plain(recording)}" if recording else ""
-        raise TacpipeError(f"{file.path} holds no row{of}. Take it away, or record it again.")
-    start_ns = _start_ns(stream)
-    if not stream.time.column:
-        assert stream.time.rate_hz is not None
-        last_ns = round((made.num_rows - 1) * 1e9 / stream.time.rate_hz)
-        t_ns = start_ns + uniform_grid(0, last_ns, stream.time.rate_hz)[: made.num_rows]
-        return made.add_column(0, schema.time_field("from rate"), pa.array(t_ns))
-    t_ns = made.column(TIME).to_numpy()
-    backwards = np.flatnonzero(np.diff(t_ns) < 0)
-    if len(backwards):
-        row = int(backwards[0]) + 1
-        where = (
-            f"{file.path}, {file.place(row)}"
-            if recording is None
-            else f"{file.path}, row {row + 1} of {plain(recording)}"
-        )
-        raise TacpipeError(
-            f"{where}: the stamp is {(t_ns[row - 1] - t_ns[row]) / 1e9:g} s before that of the row above. Sort the rows, or "
-            f"cut the file where its clock was set."
-        )
-    if stream.time.origin == "start":
-        counted = schema.time_field("from the start of the recording")
-        return made.set_column(0, counted, pa.array(t_ns + start_ns))
-    return made
 
 
 def _start_ns(stream: Stream) -> int:
@@ -307,8 +358,13 @@ def _start_ns(stream: Stream) -> int:
     return int(seconds.timestamp()) * 10**9 + at.microsecond * 1000
 
 
-def _long(file: Rows, stream: Stream, recording: str | None) -> pa.Table:
-    """Return a table in long form (a row a channel and moment) as one with a column a channel, NaN where none was."""
+def _long(
+    file: Rows, stream: Stream, recording: str | None, shared: Shared | None
+) -> tuple[list[pa.Field], list[Block]]:
+    """Return a table in long form (a row a channel and moment) as a column a channel, NaN where none was; with stamps.
+
+    All of it is in memory: rows of a moment may be anywhere.
+    """
     assert stream.long is not None
     if not stream.time.column:
         raise UsageError(
@@ -316,12 +372,12 @@ def _long(file: Rows, stream: Stream, recording: str | None) -> pa.Table:
         )
     types = {**_types(file, stream), stream.long.channel: pa.string(), stream.long.value: pa.float64()}
     times, channels, values = [], [], []
-    for block, place in _blocks(file, stream, types, recording):
+    for block, place in _blocks(file, stream, types, recording, shared):
         times.append(_stamped(block.column(stream.time.column), stream, place))
         channels.append(block.column(stream.long.channel).cast(pa.string()).combine_chunks())
         values.append(block.column(stream.long.value).cast(pa.float64()).to_numpy())
     if not sum(map(len, times)):
-        return _finished(None, file, stream, recording)
+        return [], []
     t_ns, at = np.unique(np.concatenate(times), return_inverse=True)
     coded = pa.chunked_array(channels).dictionary_encode().combine_chunks()
     names, codes = coded.dictionary.to_pylist(), coded.indices.to_numpy(zero_copy_only=False)
@@ -336,13 +392,11 @@ def _long(file: Rows, stream: Stream, recording: str | None) -> pa.Table:
     grid = np.full((len(t_ns), len(names)), np.nan)
     grid.flat[flat] = np.concatenate(values)
     wanted = columns.chosen(stream, names, file.path)
-    made = [pa.array(t_ns)]
+    made = []
     for one in wanted:
         column = pa.chunked_array([pa.array(grid[:, names.index(one.name)])])
         try:
             made.append(columns.converted(column, one, nan_allowed=True))
         except CellError as error:
             raise TacpipeError(f"{file.path}, channel {plain(one.name)}, moment {error.row + 1} {error}.") from error
-    return _finished(
-        pa.table(made, pa.schema([schema.time_field(), *(one.field for one in wanted)])), file, stream, recording
-    )
+    return [one.field for one in wanted], [(t_ns, made)]

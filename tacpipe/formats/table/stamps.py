@@ -18,6 +18,8 @@ from tacpipe.formats.containers.container import TimeUnit
 IN_RANGE = "a time before the year 2262"  # where 64 bits of nanoseconds end
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
 DECIMAL = pa.decimal128(38, 18)  # as which text is read
+_UNIT = 10**9  # a nanosecond, in the last digit of seconds as `DECIMAL` has them
+_USUAL = 450_000_000  # of the high word of seconds: before the year 2233, and no product below is beyond 64 bits
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
 _LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # as Python's logging writes seconds
 
@@ -70,6 +72,10 @@ def _of_text(column: pa.Array, zone: str) -> Int64s:
 
 
 def _of_decimals(column: pa.Array, digits: int) -> Int64s:
+    if column.type == DECIMAL and digits == DIGITS["s"]:
+        high, low = _words(column)
+        if (np.abs(high) < _USUAL).all():
+            return _of_seconds(high, low)
     t_ns, fits = last_digits(
         pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))
     )
@@ -83,10 +89,25 @@ def last_digits(column: pa.Array) -> tuple[Int64s, Bools]:
     >>> last_digits(pa.array(["1.25", "-3"]).cast(pa.decimal128(19, 2)))[0]
     array([ 125, -300])
     """
-    # A decimal128 is such a number in two words of eight bytes, the low one first.
+    high, low = _words(column)
+    found: Int64s = low.astype(np.int64)
+    return found, high == found >> 63
+
+
+def _words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:
+    """Return the two words of eight bytes that a decimal128 is as a whole number of its last digit."""
     words = np.frombuffer(column.buffers()[1], dtype="<i8").reshape(-1, 2)[column.offset :][: len(column)]
-    found: Int64s = words[:, 0].astype(np.int64)
-    return found, words[:, 1] == found >> 63
+    return words[:, 1], words[:, 0].view(np.uint64)
+
+
+def _of_seconds(high: Int64s, low: np.ndarray[Any, np.dtype[np.uint64]]) -> Int64s:
+    """Return seconds with 18 decimals, in two words, as nanoseconds, rounded half to even."""
+    whole, left = divmod(1 << 64, _UNIT)  # the high word counts 2^64
+    low_whole, low_left = np.divmod(low, np.uint64(_UNIT))
+    carried, rest = np.divmod(high * left + low_left.astype(np.int64), _UNIT)
+    t_ns: Int64s = high * whole + low_whole.astype(np.int64) + carried
+    t_ns += (rest > _UNIT // 2) | ((rest == _UNIT // 2) & (t_ns & 1 == 1))
+    return t_ns
 
 
 def _of_integers(column: pa.Array, factor: int) -> Int64s:

@@ -7,11 +7,14 @@ name the line and the cell. Lines are counted from 1, as an editor shows them.
 from __future__ import annotations
 
 import csv
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import IO
 
 import pyarrow as pa
 import pyarrow.csv as pc
@@ -22,9 +25,10 @@ from tacpipe.formats.table.layout import Stream
 from tacpipe.io.parquet import owned
 from tacpipe.printable import excerpt, listed, plain
 
-BLOCK_BYTES = 1 << 25
+BLOCK_BYTES = 1 << 24  # below what the C library gives back to the system each time
 BOM = b"\xef\xbb\xbf"  # before the text of some editors
 LONGEST_LINE = 1 << 24  # bytes; a file without line ends is none
+_BEGUN = re.compile(rb"\S")
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class TextTable:
         read = pc.ReadOptions(column_names=names, use_threads=True)
         for block in self._blocks():
             try:
-                yield pc.read_csv(pa.BufferReader(owned(block)), read, parse, options)
+                yield pc.read_csv(pa.BufferReader(owned(*block)), read, parse, options)
             except (pa.ArrowInvalid, UnicodeDecodeError) as error:
                 fault = self._fault(names, types)
                 raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
@@ -78,36 +82,47 @@ class TextTable:
                 return f"line {line}"
         raise IndexError(f"{self.path} has no row {index}.")
 
-    def _blocks(self) -> Iterator[bytes]:
-        """Yield the bytes below the header, whole lines at a time, without comments."""
+    def _blocks(self) -> Iterator[tuple[bytes | memoryview, ...]]:
+        """Yield the bytes below the header, whole lines at a time, without comments; each in pieces."""
         comment = self.stream.comment.encode()
         drop = re.compile(rb"^[ \t]*" + re.escape(comment) + rb".*(?:\n|\Z)", re.MULTILINE) if comment else None
-        header = int(self.stream.header)
         with compressed.opened(self.path) as file:
-            for _ in range(self.stream.skip_lines):
-                file.readline(LONGEST_LINE)
-            rest, first = b"", True
-            while True:
-                new = file.read(BLOCK_BYTES)
-                block = rest + new
-                if first:
-                    block, first = block.removeprefix(BOM), False
-                if new:
-                    end = block.rfind(b"\n") + 1
-                    block, rest = block[:end], block[end:]
-                    if len(rest) > LONGEST_LINE:
-                        raise TacpipeError(
-                            f"{self.path} has a line of over {LONGEST_LINE} bytes; it is not a text table."
-                        )
-                if drop is not None:
-                    block = drop.sub(b"", block)
-                while header and block:
-                    line, _, block = block.partition(b"\n")
-                    header -= bool(line.strip())
-                if block.strip():
-                    yield block
-                if not new:
-                    return
+            self._skip_header(file)
+            rest = b""
+            while new := file.read(BLOCK_BYTES):
+                end = new.rfind(b"\n") + 1
+                if end:
+                    yield from self._without(drop, rest, memoryview(new)[:end])
+                rest = new[end:] if end else rest + new
+                if len(rest) > LONGEST_LINE:
+                    raise self._endless()
+            yield from self._without(drop, rest)
+
+    def _without(
+        self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
+    ) -> Iterator[tuple[bytes | memoryview, ...]]:
+        """Yield pieces that end with a line without what matches ``drop``; nothing where no line holds anything."""
+        if drop is not None:
+            pieces = (drop.sub(b"", b"".join(pieces)),)
+        if any(_BEGUN.search(piece) for piece in pieces):
+            yield pieces
+
+    def _skip_header(self, file: IO[bytes]) -> None:
+        """Read up to the first line below the header."""
+        if not (self.stream.header or self.stream.skip_lines):
+            if file.read(len(BOM)) != BOM:
+                file.seek(0)
+            return
+        comment, header = self.stream.comment.encode(), self.stream.header
+        for number in itertools.count():
+            if number >= self.stream.skip_lines and not header:
+                return
+            line = file.readline(LONGEST_LINE)
+            if not line:
+                return
+            text = (line.removeprefix(BOM) if not number else line).strip()
+            commented = bool(comment) and text.startswith(comment)
+            header &= number < self.stream.skip_lines or not text or commented
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield the number and the cells of each line that holds some, the header among them."""
@@ -115,7 +130,9 @@ class TextTable:
         separator = self.stream.separator_of(self.path)
         with compressed.opened(self.path) as file:
             try:
-                for number, line in enumerate(file, 1):
+                for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
+                    if len(line) > LONGEST_LINE:
+                        raise self._endless()
                     text = line.removeprefix(BOM if number == 1 else b"").decode(errors="replace").strip("\r\n")
                     if number <= self.stream.skip_lines or not text.strip():
                         continue
@@ -124,6 +141,9 @@ class TextTable:
                     yield number, next(csv.reader([text], delimiter=separator))
             except csv.Error as error:
                 raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
+
+    def _endless(self) -> TacpipeError:
+        return TacpipeError(f"{self.path} has a line of over {LONGEST_LINE} bytes; it is not a text table.")
 
     def _fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
         """Return a sentence about the first row that is not as declared, or None."""

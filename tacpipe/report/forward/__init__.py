@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING
 from tacpipe.report import markup, provenance
 from tacpipe.report.forward import methods, overview, representations, section, sweep
 from tacpipe.report.forward.overview import Overview
+from tacpipe.report.forward.reading import called, kind, read
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 IN_FULL = 2  # results that are given in full where there are no more
+
+__all__ = ["TITLE", "called", "kind", "read", "reads", "report"]
 
 TITLE = "forecasts of tactile signals"
 
@@ -28,8 +31,8 @@ def report(results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -
     Several results that can be compared are, and of more than two only a few are given in full. ``others`` are datasets
     that `reads` takes: they report on their codecs.
     """
-    read = [methods.Run.read(one) for one in results if methods.comparable(one)]
-    runs = [run for run in read if run.errors.recordings]  # others have nothing to compare
+    every = [methods.Run.read(one) for one in results if methods.comparable(one)]
+    runs = [run for run in every if run.errors.recordings]  # others have nothing to compare
     described, parts = list(results), []
     if len(runs) > 1:
         found = Overview(runs)

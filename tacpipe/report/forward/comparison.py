@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Int64s
+from tacpipe.comparison.spread import Spread, spread
 from tacpipe.metrics import forecast
 from tacpipe.metrics.forecast import Interval
 from tacpipe.metrics.headline import Headline
@@ -20,7 +21,6 @@ from tacpipe.metrics.pairing import Sums
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.error_sums import BASELINE, MODEL
 from tacpipe.report.forward.methods import Method, Run
-from tacpipe.report.spread import Spread, spread
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward import units
 

@@ -61,12 +61,12 @@ class Method:
     @property
     def actions(self) -> str:
         """What the model is informed of the motion to come: ``planned``, ``none`` or ``shuffled``."""
-        return _actions(self.config)
+        return actions(self.config)
 
     @property
     def timeline(self) -> str:
         """What rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
-        return _timeline(self.config)
+        return timeline(self.config)
 
     @property
     def recurrent(self) -> bool:
@@ -100,13 +100,13 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
     for same in found.values():
         config = same[0].config
         described = _differing(_params(config), alike[_key(config, params=False)])
-        made.append(Method(_name(config, usual, described), tuple(same)))
+        made.append(Method(name(config, usual, described), tuple(same)))
     return sorted(made, key=lambda method: method.name)
 
 
 def main_timeline(runs: Sequence[Run]) -> str:
     """Return the timeline of most runs; where two have as many, the last in the alphabet, which puts uniform first."""
-    count = Counter(_timeline(run.config) for run in runs)
+    count = Counter(timeline(run.config) for run in runs)
     return max(count, key=lambda name: (count[name], name))
 
 
@@ -151,11 +151,13 @@ def _distance(method: Method) -> tuple[int, int, int, str]:
     return _PREFERRED.index(kind), off, -len(method.runs), method.name
 
 
-def _actions(config: Tree) -> str:
+def actions(config: Tree) -> str:
+    """Return what a model is informed of the motion to come: one of `ACTIONS`."""
     return str(config["params"].get("actions", "planned"))
 
 
-def _timeline(config: Tree) -> str:
+def timeline(config: Tree) -> str:
+    """Return what rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
     return str(config.get("timeline", "uniform"))
 
 
@@ -170,8 +172,8 @@ def _key(config: Tree, *, params: bool, without: str = "") -> str:
     described = {
         "architecture": config["architecture"],
         "codec": config["codec"]["name"],
-        "actions": _actions(config),
-        "timeline": _timeline(config),
+        "actions": actions(config),
+        "timeline": timeline(config),
         "params": _params(config) if params else {},
     }
     return json.dumps({name: value for name, value in described.items() if name != without}, sort_keys=True)
@@ -182,10 +184,17 @@ def _differing(params: Tree, alike: Sequence[Tree]) -> dict[str, Any]:
     return {name: value for name, value in sorted(params.items()) if any(one.get(name) != value for one in alike)}
 
 
-def _name(config: Tree, usual: str, params: Tree) -> str:
+def settings(config: Tree) -> dict[str, Any]:
+    """Return all that makes a method, without seed and split."""
+    codec = config["codec"]["name"]
+    return {**_params(config), "codec": codec, "actions": actions(config), "timeline": timeline(config)}
+
+
+def name(config: Tree, usual: str, params: Tree) -> str:
+    """Return what a method is called, with a timeline that is not the ``usual`` one and some ``params``."""
     parts = [str(config["architecture"]).replace("_", " "), str(config["codec"]["name"])]
-    if _actions(config) != "planned":
-        parts.append("no actions" if _actions(config) == "none" else f"{_actions(config)} actions")
-    if _timeline(config) != usual:
-        parts.append(_timeline(config))
+    if actions(config) != "planned":
+        parts.append("no actions" if actions(config) == "none" else f"{actions(config)} actions")
+    if timeline(config) != usual:
+        parts.append(timeline(config))
     return " · ".join([*parts, *(f"{name} {value}" for name, value in params.items())])

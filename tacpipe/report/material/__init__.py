@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 from tacpipe.report import plain
 from tacpipe.report.material import grouping, overview, profiles
 from tacpipe.report.material.methods import Run
+from tacpipe.report.material.reading import USUAL, called, kind, read
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+
+__all__ = ["TITLE", "USUAL", "called", "kind", "read", "reads", "report"]
 
 TITLE = "recognition of materials by touch"
 

@@ -6,8 +6,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tacpipe.comparison.naming import distinct_names
 from tacpipe.report.material.methods import Method, Run, Tree, base_name, ordered, shown
-from tacpipe.report.naming import distinct_names
 
 # In these, runs of one method may differ; run_label and quantities are shown as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "run_label", "quantities")
@@ -17,7 +17,7 @@ _CLOSED = {  # all that has an effect on what is fitted in closed form
 }
 _RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
 _PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # of no effect where sensors learn alone
-_USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be said
+USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be said
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
@@ -36,7 +36,7 @@ def grouped(runs: Sequence[Run]) -> list[Method]:
         whole = _whole([one for one, other in zip(runs, places, strict=True) if other == place])
         settings: Tree = {**_settings(run), "elsewhere": place != main, **_few(run, whole, few)}
         found.setdefault(json.dumps(settings, sort_keys=True), (settings, []))[1].append(run)
-    names = distinct_names([(base_name(settings), settings) for settings, _ in found.values()], _USUAL)
+    names = distinct_names([(base_name(settings), settings) for settings, _ in found.values()], USUAL)
     made = [
         Method(name, settings, marks, tuple(same))
         for (name, marks), (settings, same) in zip(names, found.values(), strict=True)

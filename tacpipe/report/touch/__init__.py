@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING
 from tacpipe.report import plain
 from tacpipe.report.touch import clouds, overview
 from tacpipe.report.touch.methods import Run, grouped
+from tacpipe.report.touch.reading import called, read
 from tacpipe.tasks.touch.result_names import PREDICTIONS
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+
+__all__ = ["TITLE", "called", "read", "reads", "report"]
 
 TITLE = "prediction of fingertip readings from point clouds"
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
+from tacpipe.comparison.spread import Spread
 from tacpipe.report.drawing import COLOURS, FAINT, INK, hue, legend_below, svg
-from tacpipe.report.spread import Spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,10 +9,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels import biotac_sp
+from tacpipe.comparison.naming import distinct_names
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import contents, provenance
-from tacpipe.report.naming import distinct_names
 from tacpipe.report.touch import predictions
 from tacpipe.report.touch.predictions import Predictions
 from tacpipe.tasks.touch.result_names import PREDICTIONS

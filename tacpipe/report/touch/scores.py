@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
+from tacpipe.comparison.spread import Spread, spread
 from tacpipe.metrics import regression
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.regression import Interval
-from tacpipe.report.spread import Spread, spread
 from tacpipe.report.touch.methods import Method, Run
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL

@@ -11,7 +11,8 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.signals import anticipation, holds
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Predicted
+from tacpipe.tasks.forward.levels import Levels
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 
 Layout = Sequence[Mapping[str, str]]
@@ -44,8 +45,12 @@ class Loads:
     def add(self, some: Predicted) -> None:
         """Add the predictions for some windows of the recording that was begun last."""
         for name, prediction in some.predictions.items():
-            if name in WATCHED:
-                self.ahead[name][-1][some.now] = self._loads(prediction.count[:, -1])
+            self.add_one(name, some.now, prediction)
+
+    def add_one(self, name: str, now: Int64s, prediction: Prediction) -> None:
+        """Add the predictions of one predictor for windows whose last rows are ``now``, as `add` does."""
+        if name in WATCHED:
+            self.ahead[name][-1][now] = self._loads(prediction.count[:, -1])
 
     def calibrated(self) -> dict[str, Any]:
         """Return each load's usual change and, by predictor, the alarm levels that give a false alarm a minute."""
@@ -93,7 +98,7 @@ class Loads:
     def _rate_hz(self) -> float:
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
 
-    def _loads(self, counts: AnyFloats) -> AnyFloats:
+    def _loads(self, counts: AnyFloats | Levels) -> AnyFloats:
         """Return the mean of each sensor's axes (time, feature) of ``counts`` (time, channel)."""
         places = [(one.get("stream", ""), one.get("axis", "")) for one in self.layout]
         return np.stack(

@@ -46,22 +46,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
         check_rate(track, forecaster)
         trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
-        starts = track.starts(forecaster.context, forecaster.horizon)
-        steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
-        stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
-        if not trial.seen:
-            loads.begin(track)
-        begins = 0
-        for some in predicted(forecaster, track, starts):
-            trial.add(some.predictions, some.truth, forecaster.feature_half)
-            ends = begins + len(some.now)
-            stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
-            begins = ends
-            if not trial.seen:
-                loads.add(some)
         attributes = {**shard.attributes, "seen": trial.seen}
-        kept[name] = RecordingOutput(_prediction_table(forecaster, track, starts, steps, stored), attributes)
+        kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads), attributes)
         trials.append(trial)
+        del track
     groups = metrics.channel_groups(forecaster.codec.layout)
     tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):
@@ -78,6 +66,31 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
     return Result(kept, files)
+
+
+def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Loads) -> pa.Table:
+    """Return the predictions for all windows of a recording; its errors are added to ``trial``.
+
+    Its loads are added to ``loads`` where the model has not seen it. Some windows are in memory at a time, and of each one
+    of the predictors.
+    """
+    starts = track.starts(forecaster.context, forecaster.horizon)
+    steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
+    stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
+    if not trial.seen:
+        loads.begin(track)
+    begins = 0
+    for some in predicted(forecaster, track, starts):
+        trial.windows += len(some.now)
+        for name, prediction in some.predictions.items():
+            trial.add_errors(name, prediction, some.truth, forecaster.feature_half)
+            if not trial.seen:
+                loads.add_one(name, some.now, prediction)
+        ends = begins + len(some.now)
+        stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
+        begins = ends
+        del some  # before the next one is made
+    return _prediction_table(forecaster, track, starts, steps, stored)
 
 
 def _prediction_table(

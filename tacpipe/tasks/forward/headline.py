@@ -57,10 +57,11 @@ def headline(
     ``unit`` is that of the mean absolute errors.
     """
     compared = {name: one for name, one in baselines.items() if legitimate(name)}
-    return pairing.headline(TASK, method, _measure(steps, unit), model, compared, part=PARTS[part], runs=runs)
+    return pairing.headline(TASK, method, measure(steps, unit), model, compared, part=PARTS[part], runs=runs)
 
 
-def _measure(steps: Sequence[int], unit: str = COUNTS) -> Measure:
+def measure(steps: Sequence[int], unit: str = COUNTS) -> Measure:
+    """Return how `sums` at some steps become errors; ``unit`` is that of the mean absolute ones."""
     count, ahead = len(steps), [f"t+{step}" for step in steps]
 
     def error(found: AnyFloats) -> AnyFloats:
@@ -87,4 +88,7 @@ def _measure(steps: Sequence[int], unit: str = COUNTS) -> Measure:
         error,
         gain,
         values,
+        lambda found: 1 - found,
+        "skill over persistence",
+        rises=True,
     )

@@ -88,8 +88,12 @@ class Trial:
         """Count some more windows of the recording."""
         self.windows += len(truth.count)
         for name, predicted in predictions.items():
-            found = Errors.of(predicted, truth, feature_half)
-            self.errors[name] = self.errors[name] + found if name in self.errors else found
+            self.add_errors(name, predicted, truth, feature_half)
+
+    def add_errors(self, name: str, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> None:
+        """Add the errors of one predictor on some windows, which are counted apart."""
+        found = Errors.of(predicted, truth, feature_half)
+        self.errors[name] = self.errors[name] + found if name in self.errors else found
 
 
 def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:

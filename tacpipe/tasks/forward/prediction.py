@@ -51,6 +51,7 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
             ends = begins + len(some.count)
             counts[..., begins:ends] = some.count[:, wanted].transpose(1, 2, 0)
             begins = ends
+            del some  # before the next one is made
         t_ns = track.t_ns[starts + forecaster.context - 1]
         found[name] = _table(forecaster, t_ns, counts, steps)
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import ItemsView, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,7 +39,7 @@ class Predicted:
     now: Int64s  # (window,), the last row that is read
     features: AnyFloats  # (window, step, feature) of the model
     truth: Prediction
-    predictions: dict[str, Prediction]
+    predictions: Mapping[str, Prediction]  # `items` makes one after another, so that not all are in memory at once
 
 
 @dataclass(frozen=True)
@@ -60,64 +60,103 @@ class Forecast:
 
 def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Forecast]:
     """Yield the model's predictions for the windows of ``track`` that begin at ``starts``, some windows at a time."""
-    context, horizon = forecaster.context, forecaster.horizon
     track = replace(track, arm=tracks.aligned(track.arm, forecaster.orientation))
-    found = rows([track], [starts], context, horizon)
     for first in range(0, len(starts), CHUNK):
-        some = starts[first : first + CHUNK]
-        past, future = (some[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
-        windows = found.pick(torch.from_numpy(some))[0]
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
-            features = forecaster.features(windows)
-        count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
-        yield Forecast(windows, past, future, features, count)
+        yield _forecast(forecaster, track, starts[first : first + CHUNK])
+
+
+def _forecast(forecaster: Forecaster, track: Track, some: Int64s) -> Forecast:
+    """Return the model's predictions for some windows, those that begin at ``some``, in order."""
+    context, horizon = forecaster.context, forecaster.horizon
+    past, future = (some[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
+    begins = int(some[0])
+    block = track.between(begins, int(some[-1]) + context + horizon)
+    found = rows([block], [some - begins], context, horizon)
+    windows = found.pick(found.starts)[0]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
+        features = forecaster.features(windows)
+    count = forecaster.decoded(features, track.tactile[past[:, -1]], track.latent[past[:, -1]])
+    return Forecast(windows, past, future, features, count)
 
 
 def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
     """Yield what all predictors predict for the windows of ``track`` that begin at ``starts``, some windows at a time."""
     for some in forecasts(forecaster, track, starts):
-        last, last_feature = track.tactile[some.now], track.latent[some.now]
         truth = Prediction(track.latent[some.future], track.tactile[some.future])
-        predictions = _of_model(forecaster, some, last, last_feature)
-        predictions |= _of_codec(forecaster, track.latent[some.future], last, last_feature)
+        yield Predicted(some.now, some.features, truth, _Predictions(forecaster, track, some))
+        del some, truth  # before the next ones are made
+
+
+class _Predictions(Mapping[str, Prediction]):
+    """The predictions of each predictor for some windows, made anew each time that they are asked for."""
+
+    def __init__(self, forecaster: Forecaster, track: Track, some: Forecast) -> None:
+        self._forecaster, self._track, self._some = forecaster, track, some
+
+    def items(self) -> ItemsView[str, Prediction]:
+        """Return names and predictions, each made when the iteration arrives at it."""
+        return _Items(self)
+
+    def __getitem__(self, name: str) -> Prediction:
+        for one, prediction in self.made():
+            if one == name:
+                return prediction
+        raise KeyError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name, _ in self.made())
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def made(self) -> Iterator[tuple[str, Prediction]]:
+        """Yield what each predictor predicts."""
+        forecaster, track, some = self._forecaster, self._track, self._some
+        yield from _of_model(forecaster, track, some)
+        yield from _of_codec(forecaster, track, some)
         past = track.tactile[some.past]
-        predictions["context_mean"] = Prediction(None, _held(past.mean(axis=1), forecaster.horizon))
+        yield "context_mean", Prediction(None, _held(past.mean(axis=1), forecaster.horizon))
         if forecaster.baselines is not None:
             moved = motion(some.windows)[0].transpose(0, 1).numpy()
-            for name, counts in forecaster.baselines.predict(past.astype(np.float32), moved).items():
-                predictions[name] = Prediction(None, counts)
-        yield Predicted(some.now, some.features, truth, predictions)
+            past = past.astype(np.float32)
+            for name, counts in forecaster.baselines.each(past, moved):
+                yield name, Prediction(None, counts)
 
 
-def _of_model(
-    forecaster: Forecaster, some: Forecast, last: AnyFloats, last_feature: AnyFloats
-) -> dict[str, Prediction]:
-    """Return the model's prediction, and persistence; ``last`` (window, channel) is the last row that is read."""
+class _Items(ItemsView[str, Prediction]):
+    """Names and predictions of `_Predictions`, without finding each by its name."""
+
+    def __init__(self, predictions: _Predictions) -> None:
+        super().__init__(predictions)
+        self._made = predictions.made
+
+    def __iter__(self) -> Iterator[tuple[str, Prediction]]:
+        return self._made()
+
+
+def _of_model(forecaster: Forecaster, track: Track, some: Forecast) -> Iterator[tuple[str, Prediction]]:
+    """Yield the model's prediction, and persistence."""
     codec, horizon = forecaster.codec, forecaster.horizon
+    last, last_feature = track.tactile[some.now], track.latent[some.now]
     still = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
-    found = {
-        MODEL: Prediction(some.features, some.count),
-        BASELINE: Prediction(_held(still, horizon), _held(last, horizon)),
-    }
+    yield MODEL, Prediction(some.features, some.count)
+    yield BASELINE, Prediction(_held(still, horizon), _held(last, horizon))
     if forecaster.lossy and not forecaster.predicts_change:
-        found["model_anchored"] = Prediction(None, forecaster.anchored(some.count, last, last_feature))
-    return found
+        yield "model_anchored", Prediction(None, forecaster.anchored(some.count, last, last_feature))
 
 
-def _of_codec(
-    forecaster: Forecaster, ahead: AnyFloats, last: AnyFloats, last_feature: AnyFloats
-) -> dict[str, Prediction]:
-    """Return what the codec alone loses of the true features to come, ``ahead`` (window, horizon, feature)."""
+def _of_codec(forecaster: Forecaster, track: Track, some: Forecast) -> Iterator[tuple[str, Prediction]]:
+    """Yield what the codec alone loses of the true features to come."""
     codec = forecaster.codec
     if codec.kind == "raw":
-        return {}
+        return
+    last, last_feature, ahead = track.tactile[some.now], track.latent[some.now], track.latent[some.future]
     decoded = codecs.decode_ahead(codec, ahead, last)
-    found = {"codec": Prediction(ahead, decoded)}
+    yield "codec", Prediction(ahead, decoded)
     if forecaster.lossy:
-        found["codec_persistence"] = Prediction(None, _held(codec.decode(last_feature), forecaster.horizon))
-        found["codec_anchored"] = Prediction(None, forecaster.anchored(decoded, last, last_feature))
-    return found
+        yield "codec_persistence", Prediction(None, _held(codec.decode(last_feature), forecaster.horizon))
+        yield "codec_anchored", Prediction(None, forecaster.anchored(decoded, last, last_feature))
 
 
 def _held(values: AnyFloats, horizon: int) -> AnyFloats:

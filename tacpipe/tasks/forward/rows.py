@@ -26,7 +26,7 @@ class Rows:
     touch: Tensor  # (time, feature)
     arm: Tensor  # (time, 13)
     finger: Tensor  # (time,)
-    tactile: AnyFloats  # (time, channel), counts above rest
+    tracks: Sequence[Track]  # that they are the rows of
     starts: Tensor  # (window,)
     context: int
     horizon: int
@@ -52,6 +52,16 @@ class Rows:
         lost: Tensor = model.loss(acted(picked, self.actions), ahead)  # type: ignore[operator]
         return lost
 
+    def tactile(self, rows: Int64s) -> AnyFloats:
+        """Return the counts above rest (window, row, channel) of windows of ``rows`` (window, row), each of one track."""
+        ends = np.cumsum([len(one.t_ns) for one in self.tracks])
+        among = np.searchsorted(ends, rows[:, 0], side="right")  # (window,)
+        found = np.empty((*rows.shape, self.tracks[0].tactile.shape[1] if self.tracks else 0))
+        for number in np.unique(among):
+            track, of_track = self.tracks[number], among == number
+            found[of_track] = track.tactile[rows[of_track] - (ends[number] - len(track.t_ns))]
+        return found
+
     def some(self, most: int) -> Tensor:
         """Return at most ``most`` starts, evenly spread."""
         return self.starts[:: max(1, -(-len(self.starts) // most))]
@@ -72,17 +82,17 @@ def rows(
     offsets = np.cumsum([0] + [len(one.t_ns) for one in tracks])
 
     def stacked(name: str, width: tuple[int, ...]) -> AnyFloats:
-        return np.concatenate([np.zeros((0, *width), np.float32)] + [getattr(one, name) for one in tracks])
+        parts = [getattr(one, name)[:] for one in tracks]
+        return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, *width), np.float32), *parts])
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)
-    channels = tracks[0].tactile.shape[1:] if tracks else (0,)
     begins = [one + offset for one, offset in zip(starts, offsets, strict=False)]
     touch, arm, finger = (
         torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)).to(device)
         for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
     )
     first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
-    return Rows(touch, arm, finger, stacked("tactile", channels), first, context, horizon, actions)
+    return Rows(touch, arm, finger, tracks, first, context, horizon, actions)
 
 
 def acted(windows: Windows, actions: str) -> Windows:

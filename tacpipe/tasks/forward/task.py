@@ -11,10 +11,12 @@ from tacpipe.tasks.forward.prediction import predict
 from tacpipe.tasks.forward.training import notes, train
 from tacpipe.tasks.opened import Chain
 
+SHORT_NAMES = {"known objects": "known", "unseen objects": "unseen"}  # of parts, in summary.json
+
 
 def load(files: Mapping[str, bytes], chain: Chain | None = None) -> ForwardModel:
     """Return the model among these files, trained behind the stages ``chain``: what `tacpipe.load` returns."""
     return ForwardModel.load(files, chain)
 
 
-__all__ = ["TASK", "ForwardModel", "evaluate", "load", "notes", "predict", "train"]
+__all__ = ["SHORT_NAMES", "TASK", "ForwardModel", "evaluate", "load", "notes", "predict", "train"]

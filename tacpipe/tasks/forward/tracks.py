@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,14 +17,18 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored, tactile
 from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import columns
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.signals.windows import window_starts
+from tacpipe.tasks.forward import levels
+from tacpipe.tasks.forward.levels import Levels
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
 
 
 POSE = poses.NAMED.columns
@@ -46,16 +50,27 @@ class Track:
     contact: Int64s  # (time,), below 0 where nothing is touched
     groups: Int64s  # (time,), equal where rows follow one another without a gap
     usable: Bools  # (time,)
-    latent: AnyFloats  # (time, latent)
+    latent: AnyFloats | Levels  # (time, latent), float32
     arm: AnyFloats  # (time, 13): `ARM`
     finger: AnyFloats  # (time,), m; 0 where it is not recorded
-    tactile: AnyFloats  # (time, channel)
+    tactile: AnyFloats | Levels  # (time, channel), float64
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
     object: str | None = None  # the grasped object, where a label names it
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
         return window_starts(self.groups, self.usable, context, horizon, stride)
+
+    def between(self, first: int, last: int) -> Track:
+        """Return the rows from ``first`` to before ``last``."""
+
+        def of(values: AnyFloats | Levels) -> AnyFloats | Levels:
+            return values.between(first, last) if isinstance(values, Levels) else values[first:last]
+
+        cut = {
+            name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
+        }
+        return replace(self, latent=of(self.latent), tactile=of(self.tactile), **cut)
 
     def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
         """Return the first rows of the windows that lie within one contact (window,)."""
@@ -90,7 +105,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> cod
     return codecs.Raw(channels, tuple(tactile.layout(table.schema, channels)))
 
 
-def inputs(table: pa.Table, names: Sequence[str]) -> AnyFloats:
+def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
     """Return the named columns as float64, shape (time, column).
 
     Raises `TacpipeError` for a column that is absent, and for the simulator's ground truth.
@@ -113,7 +128,7 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
     ``actions`` and ``arm`` are the params of these names. Raises `TacpipeError`, naming the recording, where there is
     no arm to plan with, and what `tacpipe.channels.pose.pose` raises.
     """
-    schema = shard.table().schema
+    schema = shard.columns().schema
     try:
         found = poses.pose(schema, arm, needed=actions != "none")
     except UsageError as error:
@@ -132,18 +147,27 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
     Rows in a gap of any stream or with a value that is not finite are unusable. Raises `TacpipeError` naming the
     recording where a column is absent or its channels are not the codec's.
     """
-    table = shard.table()
+    table = shard.columns()
     try:
         codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"))
-        above_rest = tactile.above_rest(table, codec.channels)
-        latent = above_rest if codec.kind == "raw" else inputs(table, codec.latents)
+        above_rest = levels.above_rest(table, codec.channels)
+        finite = above_rest.finite()
+        if codec.kind == "raw":
+            latent: AnyFloats | Levels = above_rest.of_type(np.float32)
+        else:
+            read = inputs(table, codec.latents)
+            finite &= np.isfinite(read).all(axis=1)
+            latent = read.astype(np.float32)
         placed = np.hstack([_position(table, pose), _orientation(table, pose)])
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
         finger = _opening(table)
+        gaps = tactile.gaps(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     arm = np.hstack([placed, _velocity(table, pose, t_ns, placed)]).astype(np.float32)
-    finite = np.isfinite(latent).all(axis=1) & np.isfinite(arm).all(axis=1) & np.isfinite(above_rest).all(axis=1)
+    del table
+    columns.release()
+    finite &= np.isfinite(arm).all(axis=1)
     timeline = str(shard.attributes.get("grid", "uniform"))
     held = shard.attributes.get("object")
     return Track(
@@ -151,8 +175,8 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         t_ns,
         contact,
         np.cumsum(breaks(t_ns, masks.apart(shard.attributes))),
-        finite & np.isfinite(finger) & ~tactile.gaps(table),
-        latent.astype(np.float32),
+        finite & np.isfinite(finger) & ~gaps,
+        latent,
         arm,
         finger.astype(np.float32),
         above_rest,
@@ -161,7 +185,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
     )
 
 
-def _position(table: pa.Table, pose: Pose) -> AnyFloats:
+def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
     """Return where the arm is (time, 3), m; the origin without an arm."""
     if not pose.position:
         return np.zeros((table.num_rows, 3))
@@ -170,7 +194,7 @@ def _position(table: pa.Table, pose: Pose) -> AnyFloats:
     return found if (scale == 1.0).all() else found * scale
 
 
-def _orientation(table: pa.Table, pose: Pose) -> AnyFloats:
+def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
     """Return unit quaternions (time, 4) of continuous sign; those that cannot be normalised become NaN.
 
     Without a quaternion the arm is not turned.
@@ -181,7 +205,7 @@ def _orientation(table: pa.Table, pose: Pose) -> AnyFloats:
         return continuous(inputs(table, pose.orientation).astype(np.float64))
 
 
-def _opening(table: pa.Table) -> AnyFloats:
+def _opening(table: pa.Table | Columns) -> AnyFloats:
     """Return the width between the fingers (time,), m; 0 where none is recorded, or several."""
     found = (FINGER,) if FINGER in table.column_names else tactile.columns(table.schema, poses.WIDTH)
     if len(found) != 1:
@@ -191,7 +215,7 @@ def _opening(table: pa.Table) -> AnyFloats:
     return width if scale == 1.0 else width * scale
 
 
-def _velocity(table: pa.Table, pose: Pose, t_ns: Times, placed: AnyFloats) -> AnyFloats:
+def _velocity(table: pa.Table | Columns, pose: Pose, t_ns: Times, placed: AnyFloats) -> AnyFloats:
     """Return the hand's linear and angular velocity (time, 6): from the joints where they are those of a known arm."""
     names, speeds = _joints(table.schema, pose)
     if len(names) == len(speeds) == JOINTS:
@@ -221,7 +245,7 @@ def _joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, 
     return angles, speeds
 
 
-def whole_numbers(table: pa.Table, name: str) -> Int64s:
+def whole_numbers(table: pa.Table | Columns, name: str) -> Int64s:
     """Return an integer column, shape (time,). Raises `TacpipeError` where it is absent."""
     if name not in table.column_names:
         raise TacpipeError(f"There is no column {name}. Run `tacpipe segment contacts` on the synchronized recordings.")

@@ -153,6 +153,7 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
         loads.begin(track)
         for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add(some)
+            del some  # before the next one is made
     return loads.calibrated()
 
 
@@ -183,7 +184,7 @@ def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     at = starts.cpu().numpy()[:, None]
     past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)
     moved = motion(part.pick(starts)[0])[0].transpose(0, 1).cpu().numpy()
-    return part.tactile[past], moved, part.tactile[ahead]
+    return part.tactile(past), moved, part.tactile(ahead)
 
 
 def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:

@@ -35,7 +35,7 @@ def headline(
     baselines = {name: _sums(right[predictor]) for predictor, name in BASELINES.items() if right.get(predictor)}
     if classes:
         baselines[CHANCE] = {key: np.array([one[1] / classes, one[1]]) for key, one in own.items()}
-    return pairing.headline(TASK, method, _MEASURE, own, baselines, part=sensor, runs=runs)
+    return pairing.headline(TASK, method, MEASURE, own, baselines, part=sensor, runs=runs)
 
 
 def _sums(right: Mapping[tuple[Any, str], tuple[int, int]]) -> Sums:
@@ -46,7 +46,7 @@ def _wrong(found: AnyFloats) -> AnyFloats:
     return np.where(found[:, 1] > 0, 1 - found[:, 0] / np.maximum(found[:, 1], 1), np.nan)
 
 
-_MEASURE = Measure(
+MEASURE = Measure(
     ("accuracy (%)",),
     "percent of slides",
     "accuracy",
@@ -55,4 +55,7 @@ _MEASURE = Measure(
     _wrong,
     lambda one, other: 100 * (other - one),
     lambda found: (100 * (1 - float(_wrong(found[None])[0])),),
+    lambda wrong: 100 * (1 - wrong),
+    "accuracy (%)",
+    rises=True,
 )

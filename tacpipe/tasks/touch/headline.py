@@ -44,11 +44,11 @@ def headline(
     """
     drawn = None if known else objects
     compared = {BASELINES.get(name, name.replace("_", " ")): _sums(one) for name, one in baselines.items() if one}
-    measure = _measure(range_counts, "grasps" if known else "objects")
+    made = measure(range_counts, "grasps" if known else "objects")
     return pairing.headline(
         TASK,
         method,
-        measure,
+        made,
         _sums(model),
         compared,
         part=PARTS[known],
@@ -62,7 +62,9 @@ def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
     return {key: np.array([squared, float(count)]) for key, (squared, count) in errors.items()}
 
 
-def _measure(range_counts: float, cluster: str) -> Measure:
+def measure(range_counts: float, cluster: str) -> Measure:
+    """Return how sums of squares and numbers of values become errors on a target whose range is ``range_counts`` wide."""
+
     def rmse(found: AnyFloats) -> AnyFloats:
         return np.sqrt(np.where(found[:, 1] > 0, found[:, 0] / np.maximum(found[:, 1], 1), np.nan))
 
@@ -74,6 +76,7 @@ def _measure(range_counts: float, cluster: str) -> Measure:
         return share, share * range_counts
 
     columns = ("RMSE", "RMSE (counts)")
+    unit = "shares of the target's range, and counts"
     return Measure(
-        columns, "shares of the target's range, and counts", "the RMSE", "skill", cluster, rmse, gain, values
+        columns, unit, "the RMSE", "skill", cluster, rmse, gain, values, scored="RMSE (fraction of the range)"
     )

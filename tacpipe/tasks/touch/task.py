@@ -8,10 +8,16 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch.evaluation import evaluate
+from tacpipe.tasks.touch.headline import PARTS, TARGETS
 from tacpipe.tasks.touch.model import TouchModel
 from tacpipe.tasks.touch.prediction import predict
 from tacpipe.tasks.touch.predictor import TASK, Touch
 from tacpipe.tasks.touch.training import train
+
+SHORT_NAMES = {  # of parts and targets, in summary.json
+    **{text: name for name, text in TARGETS.items()},
+    **{text: text.partition(" ")[0] for text in PARTS.values()},
+}
 
 
 def load(files: Mapping[str, bytes], chain: Chain | None = None) -> TouchModel:
@@ -30,4 +36,4 @@ def predict_grasp(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, fl
     return values
 
 
-__all__ = ["TASK", "Touch", "TouchModel", "evaluate", "load", "predict", "predict_grasp", "train"]
+__all__ = ["SHORT_NAMES", "TASK", "Touch", "TouchModel", "evaluate", "load", "predict", "predict_grasp", "train"]

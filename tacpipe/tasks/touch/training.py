@@ -154,14 +154,25 @@ def _learn(
     learned = (members.sources(params, known), known)
     followed = (members.sources(params, watched), watched) if watched else learned  # without any, what was learned
     parameters = 0
-    for group in [tuple(targets)] if params.multi_target else [(target,) for target in targets]:
+    groups = [tuple(targets)] if params.multi_target else [(target,) for target in targets]
+    for at, group in enumerate(groups):
         scale = _scale(known, group, params.loss)
         work = _work(params, scale, (learned, followed), group, device)
         for number in range(params.networks):
             place = workspace / f"{'-'.join(group)}-{number}"
             schedule = _schedule(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
-            trained = loop.train(build, work, schedule, place, weight_decay=params.weight_decay)
+            whose = {"target": "all" if params.multi_target else group[0], "network": number}
+            trained = loop.train(
+                build,
+                work,
+                schedule,
+                place,
+                weight_decay=params.weight_decay,
+                number=at * params.networks + number + 1,
+                count=len(groups) * params.networks,
+                labels=whose,
+            )
             kept = trained.weights if params.select == "best" else trained.last
             parameters += _weights_learned(params, group)
             about = {"kind": NETWORK, "targets": list(group)}
@@ -170,7 +181,6 @@ def _learn(
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
             }
             _add(config, tensors, about, named)
-            whose = {"target": "all" if params.multi_target else group[0], "network": number}
             history += [{**line, **whose} for line in trained.history]
     config["parameters"] = parameters
 

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
 import pytest
 
 import tacpipe
+from tacpipe.formats.table import text
 from tests.conftest import Lab, Ran
 from tests.formats.table import labs
 
@@ -99,6 +101,74 @@ def test_many_recordings_in_one_file_are_recordings_each(lab: Lab) -> None:
     found = tacpipe.open("data/rec")
     assert [one.name for one in found] == ["t0", "t1", "t2"]
     assert found["t2"].table("skin").column("taxel1").to_pylist() == labs.frame(seed=2)["taxel1"].tolist()
+
+
+MANY = """
+[streams.skin]
+files = "all.csv"
+recording = "trial"
+time = { column = "time" }
+columns = [{ match = "fx" }, { match = "taxel{taxel}", type = "uint16" }]
+"""
+
+
+def many(lab: Lab, recordings: int, *, mixed: bool) -> dict[str, pd.DataFrame]:
+    """Write one file of many recordings, one after another or with their rows mixed; return these by name."""
+    frames = {f"t{number:02d}": labs.frame(20 + number, seed=number) for number in range(recordings)}
+    whole = pd.concat([frame.assign(trial=name) for name, frame in frames.items()], ignore_index=True)
+    (lab.folder / "own").mkdir()
+    whole = whole.sort_values("time", kind="stable") if mixed else whole
+    whole.to_csv(lab.folder / "own" / "all.csv", index=False)
+    (lab.folder / "layout.toml").write_text(MANY)
+    return frames
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_file_of_many_recordings_is_read_as_often_for_many_as_for_one(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, mixed: bool
+) -> None:
+    times: list[Path] = []
+    read = text.TextTable.batches
+
+    def counted(file: text.TextTable, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
+        times.append(file.path)
+        return read(file, types)
+
+    monkeypatch.setattr(text.TextTable, "batches", counted)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 1000)
+    frames = many(lab, 5, mixed=mixed)
+    lab.run(INGEST)
+    assert len(times) == 2  # for the names of the recordings, and for their rows
+    found = tacpipe.open("data/rec")
+    assert {one.name: one.table("skin").column("fx").to_pylist() for one in found} == {
+        name: frame["fx"].tolist() for name, frame in frames.items()
+    }
+    assert not list((lab.store.root / "tmp").iterdir())
+
+
+def test_workers_share_one_cut_of_a_file_and_leave_nothing(lab: Lab) -> None:
+    frames = many(lab, 9, mixed=True)
+    assert counts(lab.run(f"{INGEST} --json --jobs 2")) == (9, 0)
+    found = tacpipe.open("data/rec")
+    assert {one.name: one.table("skin").column("taxel2").to_pylist() for one in found} == {
+        name: frame["taxel2"].tolist() for name, frame in frames.items()
+    }
+    assert not list((lab.store.root / "tmp").iterdir())
+
+
+def test_a_wrong_cell_of_one_recording_of_many_is_named_by_its_line(lab: Lab) -> None:
+    many(lab, 3, mixed=False)
+    path = lab.folder / "own" / "all.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[30].split(",")
+    lines[30] = ",".join(["oops", *cells[1:]])
+    path.write_text("\n".join(lines))
+    assert "line 31, column time holds 'oops'" in lab.call(INGEST).err
+    lines[30] = ",".join([str(labs.START_S - 5), *cells[1:]])
+    path.write_text("\n".join(lines))
+    ran = lab.call(INGEST)
+    assert "row 10 of t01" in ran.err and "t00" not in ran.err
+    assert not list((lab.store.root / "tmp").iterdir())
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
+import zipfile
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -11,7 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table import reading
+from tacpipe.formats.table import binary, reading, text
+from tacpipe.formats.table.layout import Stream
+from tacpipe.io.parquet import to_parquet
 from tests.formats.table import labs
 
 T_NS = labs.START_S * 10**9 + np.arange(50) * 10_000_000
@@ -191,6 +196,99 @@ def test_a_wrong_stamp_of_one_recording_in_long_form_is_named_by_its_line(
     extra = 'recording = "trial"\nmissing = ["NA"]\nlong = { channel = "sensor", value = "reading" }'
     with pytest.raises(TacpipeError, match="line 82"):
         reading.table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "fx" }'), "a")
+
+
+def same_in_blocks(
+    monkeypatch: pytest.MonkeyPatch, path: Path, stream: Stream, recording: str | None = None
+) -> pa.Table:
+    """Return what a file holds, which is read to the same bytes in one block and in many."""
+    whole = reading.table(path, stream, recording)
+    for module in (text, binary):
+        monkeypatch.setattr(module, "BLOCK_BYTES", 200)
+    batches = list(reading.batches(reading.opened(path, stream), stream, recording))
+    assert len(batches) > 1 and to_parquet(pa.Table.from_batches(batches)) == to_parquet(whole)
+    return whole
+
+
+@pytest.mark.parametrize("name", ["skin.csv", "skin.csv.gz", "skin.parquet", "skin.npz", "skin.jsonl", "skin.jsonl.gz"])
+def test_a_file_is_read_block_by_block_to_the_same_bytes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    frame, path = labs.frame(), tmp_path / name
+    frame.loc[7, "fx"] = np.nan
+    if "csv" in name:
+        frame.to_csv(path, index=False, na_rep="NA", lineterminator="\r\n")
+    elif "jsonl" in name:
+        frame.to_json(path, orient="records", lines=True, double_precision=15)
+    elif name == "skin.npz":
+        np.savez_compressed(path, allow_pickle=False, **{str(one): frame[one].to_numpy() for one in frame})
+    else:
+        pq.write_table(pa.Table.from_pandas(frame), path)
+    given = labs.stream('missing = ["NA", "nan"]')
+    found = same_in_blocks(monkeypatch, path, given)
+    assert found.column("taxel3").to_pylist() == frame["taxel3"].tolist()
+    assert np.array_equal(found.column("force_x_n").to_numpy(), frame["fx"].to_numpy(), equal_nan=True)
+
+
+def test_the_stamps_of_a_rate_go_on_from_block_to_block(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    labs.frame().drop(columns="time").to_csv(tmp_path / "skin.csv", index=False)
+    given = labs.stream('time = { rate_hz = 30, start = "2024-02-29T12:00:00Z" }')
+    t_ns = same_in_blocks(monkeypatch, tmp_path / "skin.csv", given).column("t_ns").to_numpy()
+    assert (t_ns - t_ns[0]).tolist() == [round(row * 1e9 / 30) for row in range(50)]
+
+
+def test_stamps_that_run_backwards_between_two_blocks_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    frame = labs.frame()
+    frame.loc[30:, "time"] -= 1
+    frame.to_csv(tmp_path / "skin.csv", index=False)
+    monkeypatch.setattr(text, "BLOCK_BYTES", len(frame[:30].to_csv(index=False)) - len(frame[:0].to_csv(index=False)))
+    with pytest.raises(TacpipeError, match=r"line 32: the stamp is 0\.99"):
+        reading.table(tmp_path / "skin.csv", labs.stream())
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_arrays_of_an_archive_are_read_in_either_order(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, order: Literal["C", "F"]
+) -> None:
+    values = np.arange(600, dtype=">u2").reshape(200, 3)
+    np.savez(tmp_path / "skin.npz", allow_pickle=False, time=np.arange(200), taxel=np.array(values, order=order))
+    columns = '{ match = "taxel_{taxel}", type = "uint16" }'
+    found = same_in_blocks(monkeypatch, tmp_path / "skin.npz", labs.stream("", columns))
+    assert [found.column(f"taxel_{one}").to_pylist() for one in range(3)] == values.T.tolist()
+
+
+def test_an_archive_that_declares_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (3, 10**9)})
+    with zipfile.ZipFile(tmp_path / "skin.npz", "w") as archive:
+        archive.writestr("time.npy", header.getvalue())
+    with pytest.raises(TacpipeError, match="more values than it has bytes for"):
+        reading.table(tmp_path / "skin.npz", labs.stream())
+
+
+def test_a_key_that_only_later_lines_have_is_a_column_and_lists_of_two_lengths_are_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(binary, "BLOCK_BYTES", 30)
+    lines = [{"time": row, **({"fx": row / 2} if row > 30 else {})} for row in range(50)]
+    (tmp_path / "skin.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    found = reading.table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "fx" }')).column("fx").to_numpy()
+    assert np.isnan(found[:31]).all() and found[31:].tolist() == [row / 2 for row in range(31, 50)]
+    uneven = [{"time": row, "x": [1] * (2 + row // 30)} for row in range(50)]
+    (tmp_path / "skin.jsonl").write_text("\n".join(map(json.dumps, uneven)))
+    with pytest.raises(TacpipeError, match="lists of x have 2 lengths"):
+        reading.table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "x_*" }'))
+
+
+def test_a_file_that_is_one_endless_line_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(text, "LONGEST_LINE", 1000)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 400)
+    for start in ("", "time,fx\n1,2\n"):
+        (tmp_path / "skin.csv").write_text(start + "1" * 3000)
+        with pytest.raises(TacpipeError, match="a line of over 1000 bytes"):
+            reading.table(tmp_path / "skin.csv", labs.stream("", '{ match = "fx" }'))
 
 
 def test_pickles_in_an_archive_are_refused(tmp_path: Path) -> None:

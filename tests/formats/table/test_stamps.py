@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import datetime
-from decimal import Decimal
+from decimal import ROUND_HALF_EVEN, Decimal
 
 import numpy as np
 import pyarrow as pa
@@ -25,6 +25,22 @@ def test_text_of_any_unit_is_read_to_the_nanosecond(t_ns: int, unit: TimeUnit) -
 def test_more_decimals_than_nanoseconds_are_rounded() -> None:
     column = pa.array(["1.0000000004999", "1.0000000005001"]).cast(stamps.DECIMAL)
     assert stamps.nanoseconds(column, "s").tolist() == [1_000_000_000, 1_000_000_001]
+
+
+@given(
+    st.integers(-(10**10) + 1, 10**10 - 1),
+    st.integers(0, 10**9 - 1),
+    st.sampled_from([0, 1, 499_999_999, 500_000_000, 500_000_001, 999_999_999]) | st.integers(0, 10**9 - 1),
+)
+def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(whole: int, ns: int, beyond: int) -> None:
+    text = f"{whole}.{ns:09d}{beyond:09d}"
+    wanted = int((Decimal(text) * 10**9).quantize(Decimal(1), ROUND_HALF_EVEN))
+    column = pa.array(["0", text, "1.5"]).cast(stamps.DECIMAL).slice(1, 1)
+    if abs(wanted) <= YEAR_2262_NS:
+        assert stamps.nanoseconds(column, "s").tolist() == [wanted]
+    else:
+        with pytest.raises(stamps.StampError):
+            stamps.nanoseconds(column, "s")
 
 
 @given(st.integers(0, 2**33), st.integers(0, 2**20 - 1))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tacpipe.channels import biotac_sp
-from tacpipe.report.spread import Spread
+from tacpipe.comparison.spread import Spread
 from tacpipe.report.touch import clouds, curves, electrodes, figures, fingertip, pressure
 from tacpipe.report.touch.figures import Scattered
 from tacpipe.report.touch.fingertip import Fingertip

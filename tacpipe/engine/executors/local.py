@@ -1,4 +1,4 @@
-"""Where shards are computed: in this process, or by workers on this machine."""
+"""The executor that is used unless another is asked for: this process, or workers on this computer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from tacpipe.errors import TacpipeError
+from tacpipe.engine.executors import chunks
+from tacpipe.engine.processor import usable_cores
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory, termination
 
 if TYPE_CHECKING:
@@ -18,42 +20,47 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Done = TypeVar("Done")
 _POOL_FROM = 8  # starting workers costs more than a few shards
-_CHUNKS_A_JOB = 8  # how often a worker comes back for more: progress against overhead
 
 
-def jobs_wanted(jobs: int) -> int:
-    """Return the number of processes to use: ``jobs``, or one a usable core for 0."""
-    return jobs if jobs > 0 else usable_cores()
+class Local:
+    """Processes of this computer."""
+
+    elsewhere = False
+
+    def __init__(self, jobs: int, pool_from: int = _POOL_FROM) -> None:
+        """Take the number of processes, 0 for one a usable core, and how many tasks are worth starting them."""
+        self.jobs, self._pool_from = jobs or usable_cores(), pool_from
+
+    def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
+        """Yield ``compute(task)`` of every task, in any order.
+
+        Raises `TacpipeError` if a worker dies (out of memory, killed); what the others finished is in the store by then.
+        """
+        jobs = min(self.jobs, len(tasks))
+        alone = jobs <= 1 or len(tasks) < self._pool_from
+        return map(compute, tasks) if alone else _run(compute, tasks, jobs, preload)
 
 
-def usable_cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1  # macOS
+@contextlib.contextmanager
+def connected(address: str, jobs: int) -> Iterator[Local]:
+    """Yield the executor of this computer, with ``jobs`` processes, or one a usable core for 0; it has no ``address``."""
+    if address:
+        raise UsageError(f"The executor local runs on this computer and has no address: leave {address} out.")
+    yield Local(jobs)
 
 
-def run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
-    """Yield ``compute(task)`` of every task, in any order.
-
-    Raises `TacpipeError` if a worker dies (out of memory, killed); what the others finished is in the store by then.
-    """
-    jobs = min(jobs_wanted(jobs), len(tasks))
-    if jobs <= 1 or len(tasks) < _POOL_FROM:
-        yield from map(compute, tasks)
-        return
+def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
     from multiprocessing.connection import wait  # 10 ms that a hit does not pay
 
-    size = max(1, len(tasks) // (jobs * _CHUNKS_A_JOB))
-    chunks = [tasks[start : start + size] for start in range(0, len(tasks), size)]
+    left = chunks.of(tasks, jobs)
     workers: dict[Connection, Connection] = {}
     try:
         _start(jobs, preload, workers)
         busy: list[Connection] = []
         idle = list(workers)
-        while chunks or busy:
-            while chunks and idle:
-                _give(idle[-1], compute, chunks.pop(0))
+        while left or busy:
+            while left and idle:
+                _give(idle[-1], compute, left.pop(0))
                 busy.append(idle.pop())
             ready = wait(busy)
             for worker in [one for one in busy if one in ready]:
@@ -126,26 +133,9 @@ def _work(tasks: Connection, alive: Connection) -> None:
     while True:
         try:
             compute, chunk = tasks.recv()
-            tasks.send(_computed(compute, chunk))
+            tasks.send(chunks.computed(compute, chunk))
         except (EOFError, OSError):
             return
-
-
-def _computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
-    try:
-        with memory.raising_shortage():
-            return [compute(task) for task in chunk]
-    except Exception as error:  # a mistake in a stage, which is raised again where the stage was asked for
-        import pickle
-        import traceback
-
-        text = traceback.format_exc()
-        try:
-            portable: Exception = pickle.loads(pickle.dumps(error))
-        except Exception:
-            portable = RuntimeError(f"{type(error).__name__}: {error}")
-        portable.add_note(f"in a worker process:\n{text}")
-        return portable
 
 
 def _give(worker: Connection, compute: Callable[[Task], Done], chunk: Sequence[Task]) -> None:

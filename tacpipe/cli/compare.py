@@ -1,0 +1,240 @@
+"""Results of evaluations next to each other: a table a task and question, as text, JSON or CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.comparison import engine
+from tacpipe.engine import pipeline
+from tacpipe.errors import UsageError
+from tacpipe.io import terminal
+from tacpipe.io.tables import Group, Row, Table
+from tacpipe.metrics import headline
+
+if TYPE_CHECKING:
+    from tacpipe.comparison.engine import Comparison
+    from tacpipe.datasets.dataset import Dataset
+
+METRICS = "metrics.json"
+_LISTED = 3  # values of a column that a cell names
+_DIGITS = 9  # as headlines are kept
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Results by the paths that they were given by, and how they compare."""
+
+    results: Mapping[str, Dataset]
+    comparisons: Sequence[Comparison]
+    pooled: bool
+
+    def paths(self, row: engine.Row) -> list[str]:
+        """Return where the results of a row lie."""
+        places = {id(one): path for path, one in self.results.items()}
+        return [places[id(run.dataset)] for run in row.method.runs]
+
+    def unused(self) -> list[str]:
+        """Return the paths of results that hold nothing to compare."""
+        used = {path for one in self.comparisons for row in one.rows for path in self.paths(row)}
+        return [path for path in self.results if path not in used]
+
+    def differing(self, rows: Iterable[engine.Row]) -> dict[str, list[str]]:
+        """Return the columns in which rows of methods differ, by name: settings, data, and without pooling the result."""
+        every = list(rows)
+        names = dict.fromkeys(name for row in every for name in row.differing)
+        found = {name: [_text(row.differing.get(name, "")) for row in every] for name in names}
+        found["data"] = [_listed(_data(run.dataset) for run in row.method.runs) for row in every]
+        if not self.pooled:
+            found["result"] = [_below(self.paths(row)[0], list(self.results)) for row in every]
+        return {name: cells for name, cells in found.items() if len(set(cells)) > 1}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything, what is not defined as null."""
+        return {"schema_version": 1, "comparisons": [self._json(one) for one in self.comparisons]}
+
+    def _json(self, one: Comparison) -> dict[str, Any]:
+        return {
+            "task": one.task,
+            "part": one.question.part,
+            "target": one.question.target,
+            "columns": list(one.measure.columns),
+            "unit": one.measure.unit,
+            "ranked_by": one.measure.ranked_by,
+            "measure": one.measure.name,
+            "cluster": one.measure.cluster,
+            "rows": [self._row(one, row) for row in one.rows],
+        }
+
+    def _row(self, one: Comparison, row: engine.Row) -> dict[str, Any]:
+        model = row.kind in ("model", "variant", "control") and row.predictor.startswith("model")
+        return {
+            "name": row.name,
+            "kind": row.kind,
+            "settings": dict(row.differing),
+            "errors": dict(zip(one.measure.columns, map(_number, row.values), strict=True)),
+            "baseline": row.baseline or None,
+            "gain": _number(row.gain.mean),
+            "low": _number(row.gain.low),
+            "high": _number(row.gain.high),
+            "p": _number(row.p),
+            "n": row.n,
+            "recordings": row.recordings,
+            "runs": row.runs,
+            "seeds": row.seeds,
+            "results": self.paths(row) if model else [],
+        }
+
+    def to_csv(self) -> str:
+        """Return a line a predictor and question; settings and errors are columns of their own."""
+        flat = [
+            {
+                **{name: one[name] for name in ("task", "part", "target", "measure")},
+                **{name: value for name, value in row.items() if name not in ("settings", "errors", "results")},
+                **row["settings"],
+                **row["errors"],
+                "results": " ".join(row["results"]),
+            }
+            for one in self.to_json()["comparisons"]
+            for row in one["rows"]
+        ]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(dict.fromkeys(name for row in flat for name in row)), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(flat)
+        return text.getvalue().rstrip("\n")
+
+    def tables(self) -> list[Table]:
+        """Return a table a task and kind of errors: methods the best first, below them their best baseline."""
+        same: dict[tuple[str, tuple[str, ...], str], list[Comparison]] = {}
+        for one in self.comparisons:
+            same.setdefault((one.task, one.measure.columns, one.measure.name), []).append(one)
+        return [self._table(several) for several in same.values()]
+
+    def _table(self, several: Sequence[Comparison]) -> Table:
+        measure = several[0].measure
+        shown = [[row for row in one.rows if _competes(row)] for one in several]
+        every = [row for rows in shown for row in rows]
+        differing, names = self.differing(every), [_first_name(row) for row in every]
+        if len(set(names)) == 1 and "result" in differing:  # each row is of the same method, and named by its result
+            names = differing.pop("result")
+        against = [row.baseline for row in every]
+        named = len({*against}) > len(several)  # of one question, methods have other best baselines
+        pooled = any(row.runs > 1 for row in every)
+        heads = ["", *differing, *measure.columns, measure.name, "95 % interval"]
+        heads += [*(["vs"] if named else []), "n", *(["runs"] if pooled else [])]
+        groups, at = [], 0
+        for one, rows in zip(several, shown, strict=True):
+            lines = []
+            for row in rows:
+                cells = [names[at], *(cells[at] for cells in differing.values())]
+                cells += [*map(headline.number, row.values), *_gain(row, measure.name)]
+                cells += [*([row.baseline] if named else []), f"{row.n:,}", *([str(row.runs)] if pooled else [])]
+                lines.append(Row(cells, _style(row)))
+                at += 1
+            best = one.best_baseline
+            if best is not None:
+                empty = [""] * (len(heads) - 1 - len(differing) - len(measure.columns))
+                cells = [f"vs {best.name}", *[""] * len(differing), *map(headline.number, best.values), *empty]
+                lines.append(Row(cells, "dim"))
+            groups.append(Group(one.question.where if len(several) > 1 or one.question.where else "", lines))
+        first = 1 + len(differing)
+        errors = list(range(first, first + len(measure.columns)))
+        spare = [*errors[1:-2], *errors[-2:-1], *errors[:1]] if len(errors) > 2 else errors[:1] * (len(errors) > 1)
+        texts = [0, *range(1, first), *([heads.index("vs")] if named else [])]
+        return Table(heads, groups, self._caption(several), spare=list(dict.fromkeys(spare)), left=texts)
+
+    def _caption(self, several: Sequence[Comparison]) -> str:
+        measure = several[0].measure
+        clusters = ", ".join(dict.fromkeys(one.measure.cluster for one in several))
+        skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
+        points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
+        least = min(row.n for one in several for row in one.rows)
+        few = f" With n below {headline.FEWEST} no interval proves a difference." if least < headline.FEWEST else ""
+        pooled = "Runs that differ in seed or fold alone are pooled (--each lists them). " if self.pooled else ""
+        return (
+            f"n: {clusters}. Units: {measure.unit}. {points if measure.name == 'points' else skill} {pooled}Intervals: "
+            f"bootstrap over {clusters} and over seeds where there are several, method and baseline on the same ones.{few}"
+        )
+
+
+def run(paths: Sequence[Path], *, pool: bool) -> Compared:
+    """Return the comparison of results; a warning names those that hold nothing to compare.
+
+    Raises `UsageError` for a dataset that is not a result, and where none holds anything to compare.
+    """
+    results = {str(path): pipeline.open_dataset(path) for path in paths}
+    for path, one in results.items():
+        if METRICS not in one.files:
+            raise UsageError(f"{path} was made by {one.source.stage}; give results of `tacpipe evaluate`.")
+    found = Compared(results, engine.compare(list(results.values()), pool=pool), pool)
+    if not found.comparisons:
+        raise UsageError(
+            "None of these results holds the errors of single recordings. Run `tacpipe evaluate` again, or give "
+            "results of recordings that the model has not seen."
+        )
+    for left in found.unused():
+        terminal.note(f"tacpipe: left out {left}: it holds no errors of single recordings that the model has not seen.")
+    return found
+
+
+def _competes(row: engine.Row) -> bool:
+    """Return whether a row is of a method: what it was trained for, or a control that was trained too."""
+    return row.kind == "model" or (row.kind == "control" and row.predictor == "model")
+
+
+def _first_name(row: engine.Row) -> str:
+    name = row.method.runs[0].method
+    return f"{name} (control)" if row.kind == "control" else name
+
+
+def _gain(row: engine.Row, measure: str) -> list[str]:
+    if not row.baseline:
+        return [headline.NONE, headline.NONE]
+    low, high = (headline.signed(value, measure) for value in (row.gain.low, row.gain.high))
+    interval = headline.NONE if math.isnan(row.gain.low) else f"{low} to {high}"
+    return [headline.signed(row.gain.mean, measure), interval]
+
+
+def _style(row: engine.Row) -> str:
+    if row.n < headline.FEWEST or math.isnan(row.gain.low):
+        return ""
+    return "green" if row.gain.low > 0 else "red" if row.gain.high < 0 else ""
+
+
+def _data(result: Dataset) -> str:
+    """Return the digests of the datasets that a result was evaluated on, each cut."""
+    return " ".join(one["dataset"][:8] for one in result.source.inputs.get("datasets", ()))
+
+
+def _below(path: str, paths: Sequence[str]) -> str:
+    """Return a path without the folders that all paths begin with.
+
+    >>> _below("results/a/0", ["results/a/0", "results/b/0"]), _below("results/a", ["results/a"])
+    ('a/0', 'results/a')
+    """
+    folders = [Path(one).parent for one in paths]
+    common = next(
+        one for one in (folders[0], *folders[0].parents) if all(other.is_relative_to(one) for other in folders)
+    )
+    return str(Path(path).relative_to(common)) if len(paths) > 1 else path
+
+
+def _listed(values: Iterable[str]) -> str:
+    every = sorted(set(values))
+    return ", ".join(every) if len(every) <= _LISTED else f"{len(every)} datasets"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _number(value: float) -> float | None:
+    return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None

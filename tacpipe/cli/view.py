@@ -1,0 +1,188 @@
+"""The command ``tacpipe view``: recordings in Rerun's viewer, as a file for it, or in a browser."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import terminal
+from tacpipe.plugins import extras
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.plugins.stage import Attribute
+    from tacpipe.viewer.contents import Contents
+
+EXAMPLE = (
+    "\n\nTaxels at the cursor, streams, contacts, labels, gaps, the arm, clouds and cameras on one time axis. Several "
+    "recordings are in the viewer's own list. Nothing is sent over the network."
+    "\n\nExample: tacpipe view data/recordings trial-003 --predictions data/predictions"
+)
+MAGIC, ENDING = b"RRF", ".rrd"  # of a file of Rerun's
+LIMIT = 8
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the command ``view`` to ``program``."""
+    program.command("view", help=summary + EXAMPLE)(view)
+
+
+def view(
+    dataset: Annotated[Path, typer.Argument(help="A dataset of recordings.")],
+    recording: Annotated[
+        list[str] | None, typer.Argument(help="Names of recordings; * and ? match any letters. All by default.")
+    ] = None,
+    where: Annotated[
+        list[str] | None, typer.Option("--where", help="Only recordings with this label, as name=value.")
+    ] = None,
+    split: Annotated[Path | None, typer.Option("--split", help="Only recordings of this split.")] = None,
+    role: Annotated[str | None, typer.Option("--role", help="Only those with this role: train, val or test.")] = None,
+    fold: Annotated[int, typer.Option("--fold", help="Fold of the split.")] = 0,
+    predictions: Annotated[
+        Path | None, typer.Option("--predictions", help="What `tacpipe predict` or `tacpipe evaluate` wrote of them.")
+    ] = None,
+    limit: Annotated[int, typer.Option("--limit", min=1, help="Maximum number of recordings, by name.")] = LIMIT,
+    all_rows: Annotated[
+        bool, typer.Option("--all-rows", help="All rows of streams over 30,000 rows, not their envelope; slower.")
+    ] = False,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write a file (.rrd) for the viewer instead of opening it.")
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="Open in the browser instead, until Ctrl-C.")] = False,
+    port: Annotated[int | None, typer.Option("--port", help="Port of --web; 9090 or a free one by default.")] = None,
+) -> None:
+    """Show recordings on one time axis."""
+    _require(save, web=web, port=port)
+    extras.require("tacpipe view", "rerun", "rerun_cli")
+    chosen = _chosen(dataset, recording or [], where or [], split, role, fold)
+    shown = list(chosen)[:limit]
+    if len(shown) < len(chosen):
+        terminal.note(f"{len(shown)} of {len(chosen)} recordings; --limit {len(chosen)} shows all.")
+    with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.named("tacpipe view"):
+        from tacpipe.viewer import session
+
+        drawn = _drawn(shown, _predictions(predictions))
+        files = session.write(drawn, Path(folder), str(dataset), several=len(shown) > 1, all_rows=all_rows)
+        if save is not None:
+            session.merge(files, save)
+            terminal.result(save)
+        elif web:
+            _in_browser(files, port)
+        else:
+            _in_window(files)
+
+
+def _require(save: Path | None, *, web: bool, port: int | None) -> None:
+    """Raise `UsageError` before anything is read for options that contradict each other, or a file of another program."""
+    from tacpipe.datasets import replacing
+
+    if save is not None and web:
+        raise UsageError("--save and --web contradict each other; give one.")
+    if port is not None and not web:
+        raise UsageError(f"--port {port} is the port of --web; give --web too.")
+    if save is not None:
+        if save.suffix.lower() != ENDING:
+            raise UsageError(f"{save} must end in {ENDING}, by which Rerun's viewer knows its files.")
+        replacing.refuse_foreign(save, MAGIC)
+
+
+def conditions(where: Sequence[str]) -> dict[str, Attribute]:
+    """Return the labels of texts ``name=value``; numbers and true, false, null are read as YAML does.
+
+    Raises `UsageError` for another form.
+
+    >>> conditions(["object=cup", "trial=3"])
+    {'object': 'cup', 'trial': 3}
+    """
+    from tacpipe.datasets import labels
+
+    found = {}
+    for text in where:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise UsageError(f"--where {text} should read name=value, as in --where object=cup.")
+        found[name] = labels.of_text(value)
+    return found
+
+
+def _chosen(
+    path: Path, names: Sequence[str], where: Sequence[str], split: Path | None, role: str | None, fold: int
+) -> Dataset:
+    import tacpipe
+
+    wanted = conditions(where)
+    opened = tacpipe.open(path)
+    if not len(opened):
+        raise UsageError(f"{path} has no recordings; `tacpipe view` shows those of a dataset of recordings.")
+    return opened.select(*names, split=split, role=role, fold=fold, labels=wanted)
+
+
+def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iterator[Contents]:
+    """Yield what is drawn of each recording. Raises `UsageError` where one has nothing that can be drawn."""
+    from tacpipe.viewer import contents
+
+    for one in recordings:
+        table, row = None, None
+        if predictions is not None:
+            table, row = predicted(predictions, one.name)
+            if table is None and row is None:
+                terminal.note(f"There are no predictions of {one.name} in {predictions.path}.")
+        found = contents.of(one, table, row)
+        if found.empty:
+            raise UsageError(
+                f"Recording {one.name} has no stream with times and no cloud, so there is nothing to draw; "
+                f"its streams are {', '.join(map(repr, one.streams))}. Give a dataset of recordings."
+            )
+        yield found
+
+
+def _predictions(path: Path | None) -> Dataset | None:
+    import tacpipe
+
+    return None if path is None else tacpipe.open(path)
+
+
+def predicted(predictions: Dataset, name: str) -> tuple[Any, dict[str, Any] | None]:
+    """Return the predictions of one recording: the table of its own, or its row in a table that has one for each."""
+    if name in predictions:
+        return predictions[name].table(), None
+    for one in predictions:
+        if one.streams != ("",):
+            continue
+        table = one.table()
+        if "recording" in table.column_names:
+            rows = [row for row in table.to_pylist() if row["recording"] == name]
+            if rows:
+                return None, {key: value for key, value in rows[0].items() if key != "recording"}
+    return None, None
+
+
+def _in_window(files: Sequence[Path]) -> None:
+    from tacpipe.viewer import session
+
+    terminal.note("The viewer is open; close it or press Ctrl-C to end.")
+    code = session.show(files)
+    if code:
+        raise TacpipeError(
+            f"The viewer ended with {code}. It needs a screen and Vulkan or OpenGL; without them give --web, or "
+            f"--save FILE.rrd and open that on another computer."
+        )
+
+
+def _in_browser(files: Sequence[Path], port: int | None) -> None:
+    import time
+    import webbrowser
+
+    from tacpipe.viewer import web
+
+    with web.served(files, port) as address:
+        terminal.result(address)
+        webbrowser.open(address)
+        terminal.note("The viewer is served on this computer; press Ctrl-C to end.")
+        while True:
+            time.sleep(1)

@@ -1,0 +1,279 @@
+"""Workers of Dask: those of a running scheduler, or processes of this computer that are started for one command.
+
+``dask`` starts workers here, ``dask://localhost:8786`` and ``tls://host:8786`` name a scheduler. Whoever reaches a scheduler
+without TLS can run programs as its user: one on another computer must have it. Certificates come from Dask's own
+configuration.
+
+A worker needs tacpipe and the store: it reads and writes there, and what it is sent are keys. Where it dies, Dask gives
+its tasks to another one; what it had finished is in the store and is found there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from queue import Queue
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.engine import provenance
+from tacpipe.engine.execution import Done, Task
+from tacpipe.engine.executors import agreement, chunks
+from tacpipe.engine.processor import usable_cores
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import progress, termination
+from tacpipe.plugins import extras
+from tacpipe.store.store import Store
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+_MOST = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
+_CONNECT_S = 10
+_POLL_S = 1.0
+
+
+@contextlib.contextmanager
+def connected(address: str, jobs: int) -> Iterator[Dask]:
+    """Yield workers: of the scheduler at ``address`` (``host:port``, this computer's), or ``jobs`` that are started here.
+
+    Raises `UsageError` for another computer's scheduler, `TacpipeError` where none answers, and `MissingModuleError`
+    without Dask.
+    """
+    if not address:
+        with _started(jobs or usable_cores()) as found:
+            yield found
+        return
+    if not _is_here(address):
+        raise UsageError(
+            f"dask://{address} is another computer's scheduler without TLS, and whoever reaches such a one can run "
+            f"programs as its user. Start it with TLS and give tls://{address}, or give dask://localhost:PORT of an SSH "
+            f"tunnel to it."
+        )
+    with _client(f"tcp://{address}") as client:
+        yield Dask(client)
+
+
+@contextlib.contextmanager
+def encrypted(address: str, jobs: int) -> Iterator[Dask]:
+    """Yield the workers of the scheduler at ``address``, reached with TLS; raises as `connected`."""
+    if not address:
+        raise UsageError("The executor tls needs the address of a scheduler: give tls://HOST:PORT.")
+    with _client(f"tls://{address}") as client:
+        yield Dask(client)
+
+
+class Dask:
+    """The workers that a client of Dask reaches."""
+
+    elsewhere = True
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+
+    def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
+        """Yield ``compute(task)`` of every task, in any order.
+
+        Raises `TacpipeError` where there is no worker, where one is unlike this process or cannot reach the store, where
+        workers die over a task again and again, and where the scheduler is gone.
+        """
+        if not tasks:
+            return
+        wanted = agreement.here(tasks[0].name)
+        workers = len(self._workers())
+        given = [[_absolute(task) for task in chunk] for chunk in chunks.of(tasks, workers, _MOST)]
+        futures = [self.client.submit(_work, wanted, compute, chunk, pure=False) for chunk in given]
+        what = f"{len(tasks)} tasks were given to {workers} workers"
+        with termination.reporting(f"tacpipe: interrupted; {what}: those that wait are cancelled, those at work end."):
+            try:
+                yield from self._results(futures, tasks[0].name)
+            finally:
+                with contextlib.suppress(Exception):  # the scheduler forgets them in any case when the client goes
+                    self.client.cancel(futures)
+
+    def _workers(self) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
+        if not found:
+            raise TacpipeError(
+                f"The scheduler at {self.client.scheduler.address} has no worker. Start some, as with `dask worker "
+                f"{self.client.scheduler.address} --nthreads 1`."
+            )
+        return found
+
+    def _results(self, futures: Sequence[Future], stage: str) -> Iterator[Done]:
+        from concurrent.futures import CancelledError
+
+        from distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        try:
+            for future in as_completed(futures, loop=self.client.loop):
+                if future.status == "error":
+                    raise future.exception()
+                made = future.result()
+                if isinstance(made, Exception):
+                    raise made
+                yield from made
+                future.release()
+        except KilledWorker as error:
+            raise TacpipeError(
+                f"{error.allowed_failures + 1} workers died one after another over the same recordings of {stage}, most "
+                f"likely for lack of memory. What was finished is kept: run the same command again on workers with more."
+            ) from error
+        except CancelledError as error:
+            raise TacpipeError(
+                f"The scheduler at {self.client.scheduler.address} is gone. What was finished is kept: run the same command "
+                f"again."
+            ) from error
+        except ModuleNotFoundError as error:
+            raise TacpipeError(
+                f"A worker cannot import {error.name}: install tacpipe and the plug-ins of {stage} there, as here."
+            ) from error
+
+
+@contextlib.contextmanager
+def _started(workers: int) -> Iterator[Dask]:
+    """Yield workers of this computer, each a process of one thread, that end with the block or with this process."""
+    with extras.named("The executor dask"):
+        import cryptography  # noqa: F401  (TLS of one command's own: other users of this computer reach its port)
+        import dask
+        from distributed import Client, LocalCluster, Security
+
+    security = Security.temporary()
+    with (
+        _quiet(),
+        dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
+        LocalCluster(  # type: ignore[no-untyped-call]
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            protocol="tls",
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,
+            scheduler_kwargs={"dashboard": False},
+            silence_logs=logging.CRITICAL,
+            security=security,
+        ) as cluster,
+        Client(cluster, security=security, set_as_default=False) as client,
+    ):
+        yield Dask(client)
+
+
+@contextlib.contextmanager
+def _client(address: str) -> Iterator[Client]:
+    with extras.named("The executor dask"):
+        from distributed import Client
+
+    with _quiet():
+        try:
+            client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="tacpipe")
+        except (OSError, TimeoutError, ValueError, RuntimeError, TypeError) as error:
+            raise TacpipeError(f"No scheduler of Dask answers at {address}: {error}") from error
+        with client:
+            yield client
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Have Dask log nothing in the block: a worker or scheduler that is gone is a sentence of ours."""
+    loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *_dask_loggers())]
+    before = [one.level for one in loggers]
+    for one in loggers:
+        one.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for one, level in zip(loggers, before, strict=True):
+            one.setLevel(level)
+
+
+def _dask_loggers() -> list[str]:
+    return [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+
+
+def _is_here(address: str) -> bool:
+    """Return whether a scheduler's address is of this computer.
+
+    >>> _is_here("localhost:8786"), _is_here("127.0.0.1:8786"), _is_here("[::1]:8786"), _is_here("10.0.0.7:8786")
+    (True, True, True, False)
+    """
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _absolute(task: Task) -> Task:
+    """Return the task with paths that hold in another process's folder."""
+    if task.files is None:
+        return task
+    return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
+
+
+# ---- in a worker
+
+_alone = threading.Lock()  # tasks are computed one at a time in a process, whatever number of threads it was given
+_leases: dict[str, str] = {}  # of this worker, by the lease of the run that they are for
+
+
+def _work(wanted: Mapping[str, Any], compute: Callable[[Task], Done], tasks: Sequence[Task]) -> list[Done] | Exception:
+    """Return ``compute`` of each task, or what kept this worker from it."""
+    from distributed import get_worker
+
+    name = str(get_worker().name)
+    with _alone, progress.shown(False), provenance.worker(name):
+        try:
+            _check(name, wanted, tasks[0])
+            lease = _lease(tasks[0])
+        except TacpipeError as error:
+            return error
+        return chunks.computed(compute, [replace(task, run=lease) for task in tasks])
+
+
+def _check(name: str, wanted: Mapping[str, Any], task: Task) -> None:
+    other = agreement.unlike(wanted, agreement.here(task.name))
+    if other:
+        raise UsageError(
+            f"Worker {name} would not compute what this computer does: {'; '.join(other)}. Install the same there."
+        )
+    if task.run and not _at_work(task.run):
+        raise TacpipeError(
+            f"Worker {name} does not find the store {task.store} as this command sees it, or the command has ended: workers "
+            f"need the store at the same path, as on a shared file system."
+        )
+
+
+def _at_work(run: str) -> bool:
+    """Return whether the command that began a run goes on, as far as its lease shows."""
+    return os.path.exists(run)  # noqa: PTH110
+
+
+def _lease(task: Task) -> str:
+    """Return a lease of this worker's own, which announces the objects it makes for as long as the task's run goes on.
+
+    Two computers do not write to one lease: on a network file system one would overwrite what the other announces.
+    """
+    if not task.run or task.run in _leases:
+        return _leases.get(task.run, "")
+    begun: Queue[str] = Queue()
+    threading.Thread(target=_keep, args=(Store(task.store), task.run, begun), daemon=True).start()
+    _leases[task.run] = begun.get()
+    return _leases[task.run]
+
+
+def _keep(store: Store, run: str, begun: Queue[str]) -> None:
+    """Hold a lease until a run has ended; put its path into ``begun``."""
+    ended = threading.Event()
+    with store.leases.running() as announcing:
+        begun.put(announcing.path)
+        while _at_work(run):
+            ended.wait(_POLL_S)
+        with _alone:
+            del _leases[run]

@@ -1,0 +1,46 @@
+"""Files that the recordings of a run share: each is made once, and gone with the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.io import drafts, regular
+from tacpipe.io.drafts import Draft
+from tacpipe.io.files import move, present
+from tacpipe.io.hashing import digest
+from tacpipe.store.store import Store
+
+_MOST_BYTES = 1 << 20  # of a sentence
+
+
+@dataclass(frozen=True)
+class SharedFiles:
+    """The shared files of the run that a store works for, among its drafts: a collection sweeps those of dead runs."""
+
+    store: Store
+
+    def file(self, of: Any, make: Callable[[Draft], None]) -> Path:
+        """Return the file that ``make`` wrote for ``of``, a value of JSON: now, or before in any process of the run.
+
+        Raises what ``make`` raises, and where that is a mistake in what it reads the same for each who asks.
+        """
+        key = digest({"run": self.store.run, "of": of})
+        path, failed = (self.store.draft(digest([key, part])[:32]) for part in ("made", "failed"))
+        with self.store.leases.hold(key, "the recordings of a file"):
+            if present(failed):
+                raise TacpipeError(regular.content(failed, _MOST_BYTES, follow=False).decode())
+            if not present(path):
+                name = self.store.draft()
+                with drafts.begun(name, self.store.root) as draft:
+                    try:
+                        make(draft)
+                    except TacpipeError as error:
+                        if error.exit_code == FAILED and not isinstance(error, StorageError | MissingModuleError):
+                            self.store.write_file(failed, str(error).encode())
+                        raise
+                    move(name, path)
+        return Path(path)

@@ -1,0 +1,61 @@
+"""The headlines of a result as a few numbers with short names, which DVC shows in a table and trackers beside a run."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+from tacpipe.metrics.headline import Headline
+
+FILE = "summary.json"
+MOST = 30  # numbers: those of headlines that would be more are left out
+Names = Mapping[str, str]
+
+
+def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> dict[str, float | int]:
+    """Return the least gain over the best baseline with its interval and clusters, and an error a part and target.
+
+    ``gain``, ``low``, ``high`` and ``n`` are of the headline whose gain is least: a model is better than its baselines only
+    where each of its headlines is. Errors are of the last column of each, and named by the target where there are several.
+    ``names`` are short names of parts and targets. What is not defined is left out.
+    """
+    if not headlines:
+        return {}
+    least = min(headlines, key=lambda one: math.inf if math.isnan(one.gain) else one.gain)
+    found: dict[str, float | int] = {"gain": least.gain, "low": least.low, "high": least.high, "n": least.clusters}
+    targets = len({one.target for one in headlines}) > 1  # their errors are of one measure, which no name repeats
+    for one, place in zip(headlines, _places(headlines, names), strict=True):
+        found["_".join(place if targets else [*place, _short(one.columns[-1])])] = one.model.values[-1]
+    known = {name: value for name, value in found.items() if math.isfinite(value)}
+    return {name: _rounded(value) for name, value in list(known.items())[: MOST - 1]}
+
+
+def write(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> bytes:
+    """Return the content of ``summary.json``."""
+    return (json.dumps(of(headlines, names), indent=1, allow_nan=False) + "\n").encode()
+
+
+def _places(headlines: Sequence[Headline], names: Names) -> list[list[str]]:
+    """Return the short names of target and part of each headline, without what is the same for all."""
+    found: list[list[str]] = [[] for _ in headlines]
+    for texts in ([one.target for one in headlines], [one.part for one in headlines]):
+        if len(set(texts)) > 1:
+            for place, text in zip(found, texts, strict=True):
+                place.append(names.get(text) or _short(text))
+    return found
+
+
+def _short(text: str) -> str:
+    """Return text as a name.
+
+    >>> [_short(one) for one in ("vs persistence", "accuracy (%)", "RMSE (counts)", "unseen objects")]
+    ['vs_persistence', 'accuracy', 'rmse', 'unseen_objects']
+    """
+    return "_".join(re.findall(r"[a-z0-9]+", re.sub(r"\(.*?\)", "", text.lower())))
+
+
+def _rounded(value: float | int) -> float | int:
+    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -1,0 +1,79 @@
+"""Results on touch as runs of the comparison engine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.channels import biotac_sp
+from tacpipe.comparison.runs import Errors, Question
+from tacpipe.comparison.runs import Run as Compared
+from tacpipe.metrics import regression
+from tacpipe.report.touch import methods, wording
+from tacpipe.report.touch.methods import Method, Run
+from tacpipe.tasks.touch import headline
+from tacpipe.tasks.touch.result_names import PREDICTIONS
+
+if TYPE_CHECKING:
+    from tacpipe.arrays import Floats
+    from tacpipe.datasets.dataset import Dataset
+
+
+def read(results: Sequence[Dataset]) -> list[Compared]:
+    """Return the runs of results that hold predictions of grasps which the model has not seen."""
+    every = [Run.read(one) for one in results if PREDICTIONS in one.recordings]
+    named = methods.grouped([one for one in every if len(one.predictions.recordings)])
+    several = len({(one.split, one.simulated) for one in named}) > 1
+    found = {id(run.dataset): _run(run, method, several) for method in named for run in method.runs}
+    return [found[id(one)] for one in results if id(one) in found]
+
+
+def called(predictor: str) -> str:
+    """Return what tables call a predictor.
+
+    >>> called("object_mean"), called("nearest_neighbours")
+    ('mean of the object', 'nearest neighbours')
+    """
+    return headline.BASELINES.get(predictor, predictor.replace("_", " "))
+
+
+def _run(run: Run, method: Method, several: bool) -> Compared:
+    questions = {}
+    for known in (True, False):
+        rows = run.predictions.of(known)
+        if not len(rows.recordings):
+            continue
+        objects = dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
+        for target in rows.targets:
+            low, high = biotac_sp.RANGES[target]
+            sums = {
+                name: _squared(target, rows.true[target], one[target], rows.recordings.tolist())
+                for name, one in rows.predicted.items()
+                if target in one
+            }
+            measure = headline.measure(high - low, "grasps" if known else "objects")
+            part = headline.PARTS[known]
+            if several:
+                part += f", {wording.place(method.split, method.simulated)}"
+            questions[Question(part, headline.TARGETS[target])] = Errors(measure, sums, None if known else objects)
+    return Compared(
+        run.dataset,
+        headline.TASK,
+        method.name,
+        method.settings,
+        questions,
+        family=methods.NAMES.get(method.architecture, method.architecture),
+        seed=run.params.get("seed"),
+        simulated=run.simulated,
+        published=run.published,
+        details=run,
+    )
+
+
+def _squared(target: str, true: Floats, predicted: Floats, names: Sequence[str]) -> dict[str, Floats]:
+    """Return the sum of squares in fractions of the target's range and the number of values, by grasp."""
+    one, other = (biotac_sp.normalised(target, values) for values in (true, predicted))
+    squared = regression.squared_sums(one, other)
+    return {name: np.array([value, float(one.shape[1])]) for name, value in zip(names, squared, strict=True)}

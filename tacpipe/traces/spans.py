@@ -1,0 +1,161 @@
+"""What lasts from one moment to another: contacts, slides, slips and other labels of rows, gaps, and events."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, Times
+from tacpipe.channels.masks import GAP
+from tacpipe.channels.streams import gaps_before
+from tacpipe.traces.curves import TIME, described
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_NAMED = {"phase": {-1: "", 0: "slide", 1: ""}}  # values of label columns that have names of their own
+_NOTHING = ("", "0", "-1", "False", "None", "nan")  # values of a label of rows that nothing is drawn for
+_SWITCHES = ({"0", "1"}, {"1"}, {"0"}, {"False", "True"}, {"True"}, {"False"})
+
+
+class Span(NamedTuple):
+    """A time during which something holds, in one lane of a diagram."""
+
+    lane: str
+    text: str
+    start_ns: int
+    stop_ns: int
+
+
+class Event(NamedTuple):
+    """What went wrong at one moment of a recording."""
+
+    t_ns: int
+    stream: str
+    cause: str
+    text: str
+
+
+def of_labels(table: pa.Table) -> list[Span]:
+    """Return the spans in which each label column of a table has one value, lane by lane.
+
+    A column of 0 and 1 gives spans by its own name. One with other values, as ``contact`` with numbers from 0, gives
+    spans with name and value; -1, null and the empty text are no span there.
+    """
+    if TIME not in table.column_names or not table.num_rows:
+        return []
+    t_ns = table.column(TIME).to_numpy()
+    found = []
+    for field in table.schema:
+        if described(field).get("quantity") == "label" and field.name != TIME:
+            found += _of_column(str(field.name), table.column(field.name), t_ns)
+    return found
+
+
+def _of_column(name: str, column: pa.ChunkedArray, t_ns: Times) -> list[Span]:
+    encoded = column.combine_chunks().dictionary_encode()
+    codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)  # (time,)
+    values = {code: _text(value) for code, value in enumerate(encoded.dictionary.to_pylist())} | {-1: ""}
+    numbered = not any(set(values.values()) - {""} <= known for known in _SWITCHES)
+    texts = {code: _shown(name, value, numbered=numbered) for code, value in values.items()}
+    return [
+        Span(name, texts[int(codes[start])], int(t_ns[start]), stop_ns(t_ns, stop))
+        for start, stop in _stretches(codes)
+        if texts[int(codes[start])]
+    ]
+
+
+def _text(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _shown(name: str, value: str, *, numbered: bool) -> str:
+    if name in _NAMED:
+        return _NAMED[name].get(int(value), value) if value.lstrip("-").isdigit() else value
+    if numbered:
+        nothing = set(_NOTHING) - {"0"}
+        return "" if value in nothing else f"{name} {value}" if value.lstrip("-").isdigit() else value
+    return "" if value in _NOTHING else name
+
+
+def _stretches(values: AnyArray) -> list[tuple[int, int]]:
+    """Return first row and stop of each stretch of one value."""
+    edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
+    return list(pairwise(edges))
+
+
+def stop_ns(t_ns: Times, stop: int) -> int:
+    """Return when a stretch of rows ends, given its stop, exclusive: with the next row, or a step behind the last."""
+    if stop < len(t_ns):
+        return int(t_ns[stop])
+    step_ns = int(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0
+    return int(t_ns[-1]) + step_ns
+
+
+def gaps(stream: str, table: pa.Table) -> list[Span]:
+    """Return the gaps of a stream: from the sample before to the one after it."""
+    if TIME not in table.column_names or table.num_rows < 2:
+        return []
+    t_ns = table.column(TIME).to_numpy()
+    return [Span(stream or "rows", "gap", int(t_ns[row - 1]), int(t_ns[row])) for row in gaps_before(table)]
+
+
+def masked_gaps(table: pa.Table) -> list[Span]:
+    """Return the gaps of streams in a synchronized table, by its masks that end in ``_gap``."""
+    if TIME not in table.column_names or not table.num_rows:
+        return []
+    t_ns = table.column(TIME).to_numpy()
+    found = []
+    for name in table.column_names:
+        if name.endswith(GAP):
+            values = table.column(name).to_numpy().astype(bool)
+            lane = name.removesuffix(GAP)
+            found += [
+                Span(lane, "gap", int(t_ns[start]), stop_ns(t_ns, stop))
+                for start, stop in _stretches(values)
+                if values[start]
+            ]
+    return found
+
+
+def merged(found: Sequence[Span], lane: str = "gaps") -> list[Span]:
+    """Return spans of several lanes as one lane without overlaps; each names the lanes that it is of.
+
+    >>> [one[1:] for one in merged([Span("a", "gap", 0, 5), Span("b", "gap", 3, 9)])]
+    [('a', 0, 3), ('a, b', 3, 5), ('b', 5, 9)]
+    """
+    edges = sorted({edge for one in found for edge in (one.start_ns, one.stop_ns)})
+    starts: dict[int, list[str]] = {}
+    stops: dict[int, list[str]] = {}
+    for one in found:
+        starts.setdefault(one.start_ns, []).append(one.lane)
+        stops.setdefault(one.stop_ns, []).append(one.lane)
+    there: Counter[str] = Counter()
+    together = []
+    for start_ns, stop_ns_ in pairwise(edges):
+        there.update(starts.get(start_ns, ()))
+        there.subtract(stops.get(start_ns, ()))
+        names = sorted(name for name, count in there.items() if count > 0)
+        if names:
+            together.append(Span(lane, ", ".join(names), start_ns, stop_ns_))
+    return together
+
+
+def events(table: pa.Table) -> list[Event]:
+    """Return the rows of a stream of events, in the order of time."""
+    rows = table.to_pylist()
+    found = [
+        Event(int(row[TIME]), str(row.get("stream") or ""), str(row.get("cause") or ""), _event(row)) for row in rows
+    ]
+    return sorted(found)
+
+
+def _event(row: Mapping[str, object]) -> str:
+    what = [str(row.get("cause") or "event")]
+    what += [f"{row[name]} {name}" for name in ("frames", "bytes") if row.get(name)]
+    what += [str(row["detail"])] if row.get("detail") else []
+    return ", ".join(what)

@@ -1,0 +1,1 @@
+"""Trackers of experiments, each a product: TensorBoard, MLflow, Weights & Biases. Third parties add theirs."""

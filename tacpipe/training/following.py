@@ -1,0 +1,165 @@
+"""Who follows a training while it runs: a growing file, the terminal, trackers. None of them changes what is learned.
+
+A stage with a workspace is run within `in_workspace`; the loop calls `network` for each network that it trains there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from tacpipe.io import progress, termination
+
+HISTORY = "history.jsonl"
+Line = dict[str, Any]  # of the history: the results of an epoch, as JSON holds them
+
+
+@dataclass(frozen=True)
+class Network:
+    """One of the networks that a stage trains: which it is, and how long it may take."""
+
+    epochs: int  # at most
+    number: int = 1
+    count: int = 1
+    labels: Mapping[str, Any] = field(default_factory=dict)  # are added to each of its lines
+
+    @property
+    def name(self) -> str:
+        """Its number among several, empty where it is the only one."""
+        return f"network {self.number} of {self.count}" if self.count > 1 else ""
+
+
+class Follower(Protocol):
+    """What is called as a training proceeds."""
+
+    def begin(self, network: Network, history: Sequence[Line]) -> None:
+        """A network is trained from here; ``history`` are its epochs before an interruption."""
+
+    def batch(self, passed: float, loss: Callable[[], float]) -> None:
+        """Another batch is learned; ``passed`` is the fraction of the epoch, ``loss`` returns the mean so far."""
+
+    def line(self, line: Line, learning_rate: float) -> None:
+        """An epoch is over and its checkpoint written."""
+
+    def end(self, *, trained: bool) -> None:
+        """The network is trained, or an error or a user ended its training."""
+
+
+@dataclass(frozen=True)
+class Followers:
+    """Several as one."""
+
+    each: Sequence[Follower] = ()
+
+    def batch(self, passed: float, loss: Callable[[], float]) -> None:
+        """Call ``batch`` of each."""
+        for one in self.each:
+            one.batch(passed, loss)
+
+    def line(self, line: Line, learning_rate: float) -> None:
+        """Call ``line`` of each."""
+        for one in self.each:
+            one.line(line, learning_rate)
+
+
+_trackers: ContextVar[tuple[Follower, ...]] = ContextVar("trackers", default=())  # of the command
+_current: ContextVar[tuple[Follower, ...]] = ContextVar("followers", default=())  # of the stage that runs
+
+
+@contextlib.contextmanager
+def tracked(trackers: Sequence[Follower]) -> Iterator[None]:
+    """Have each training in the block followed by ``trackers`` too."""
+    before = _trackers.set(tuple(trackers))
+    try:
+        yield
+    finally:
+        _trackers.reset(before)
+
+
+@contextlib.contextmanager
+def in_workspace(workspace: Path, *shown: Follower) -> Iterator[None]:
+    """Have each training in the block followed by a file in ``workspace``, by ``shown``, and by the command's trackers."""
+    file = _HistoryFile(workspace / HISTORY)
+    before = _current.set((file, *_trackers.get(), *shown))
+    try:
+        yield
+    finally:
+        _current.reset(before)
+        file.close()
+
+
+@contextlib.contextmanager
+def network(found: Network, history: Sequence[Line]) -> Iterator[Followers]:
+    """Yield the followers of a network that is trained in the block."""
+    followers, trained = _current.get(), False
+    for one in followers:
+        one.begin(found, history)
+    try:
+        yield Followers(followers)
+        trained = True
+    finally:
+        for one in followers:
+            one.end(trained=trained)
+
+
+@contextlib.contextmanager
+def resumable(found: Network, done: int) -> Iterator[None]:
+    """Have an interrupt of the epoch in the block stated with the epoch that the same command resumes from."""
+    name = f" of {found.name}" if found.name else ""
+    sentence = f"tacpipe: interrupted; the same command resumes training{name} from epoch {done + 1} of {found.epochs}."
+    with termination.reporting(sentence if done else termination.SENTENCE):
+        yield
+
+
+class _HistoryFile:
+    """The lines of all networks of a stage as JSON lines, for ``tail -f``; a failure to write it ends no training."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._handle: int | None = None
+        self._labels: Mapping[str, Any] = {}
+        self._failed = False
+
+    def begin(self, network: Network, history: Sequence[Line]) -> None:
+        self._labels = network.labels
+        if self._handle is None and not self._failed:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
+            with self._forgiven():
+                self._handle = os.open(self._path, flags, 0o666)
+        for line in history:
+            self.line(line, 0.0)
+
+    def batch(self, passed: float, loss: Callable[[], float]) -> None:
+        pass
+
+    def line(self, line: Line, learning_rate: float) -> None:
+        if self._handle is not None:
+            with self._forgiven():
+                os.write(self._handle, (json.dumps({**line, **self._labels}) + "\n").encode())
+
+    def end(self, *, trained: bool) -> None:
+        pass
+
+    def close(self) -> None:
+        """Close the file, and remove one without a line: a workspace in which nothing was saved is removed."""
+        if self._handle is not None:
+            with self._forgiven():
+                if not os.fstat(self._handle).st_size:
+                    self._path.unlink()
+            os.close(self._handle)
+            self._handle = None
+
+    @contextlib.contextmanager
+    def _forgiven(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if not self._failed:
+                progress.report(f"{self._path} cannot be written ({error.strerror}); training continues without it.")
+            self._failed = True

@@ -1,0 +1,1 @@
+"""Recordings as they are seen: in Rerun's viewer, and as a picture."""

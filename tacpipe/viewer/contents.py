@@ -1,0 +1,195 @@
+"""All that is drawn of one recording: its curves, taxels, spans, events, paths, clouds, camera frames and forecasts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.arrays import Bytes, Float32s, Times
+from tacpipe.channels.streams import TRUTH, rate_hz
+from tacpipe.clouds.cloud import COLOUR, POSITION
+from tacpipe.datasets.streams import streams_of
+from tacpipe.formats.arrays.frames import encoding
+from tacpipe.traces import curves, forecasts, paths, spans, taxels
+from tacpipe.traces.curves import TIME, Curves
+from tacpipe.traces.forecasts import Forecast
+from tacpipe.traces.paths import Path
+from tacpipe.traces.spans import Event, Span
+from tacpipe.traces.taxels import Taxels
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Recording
+    from tacpipe.plugins.stage import Attribute
+
+EVENTS = "events"
+# quantities, in the order in which they are looked for
+FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
+
+
+@dataclass(frozen=True)
+class Points:
+    """A cloud at one moment; one without times holds for the whole recording."""
+
+    stream: str
+    t_ns: int | None
+    points_m: Float32s  # (point, xyz)
+    colours: Bytes | None  # (point, rgb)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The pictures of a camera as they were encoded."""
+
+    stream: str
+    t_ns: Times  # (time,)
+    content: list[bytes]
+    media_type: str
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What is drawn of a recording."""
+
+    name: str
+    attributes: Mapping[str, Attribute]
+    rates: Mapping[str, tuple[int, float | None]]  # rows and rate in Hz, by stream
+    curves: list[Curves] = field(default_factory=list)
+    truth: list[Curves] = field(default_factory=list)  # what a simulation knows
+    taxels: list[Taxels] = field(default_factory=list)
+    spans: list[Span] = field(default_factory=list)
+    gaps: list[Span] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    paths: list[Path] = field(default_factory=list)
+    clouds: list[Points] = field(default_factory=list)
+    frames: list[Frames] = field(default_factory=list)
+    forecasts: list[Forecast] = field(default_factory=list)
+    predicted: Mapping[str, Any] = field(default_factory=dict)  # values that a model predicted for the whole recording
+
+    @cached_property
+    def ends_ns(self) -> tuple[int, int]:
+        """When the first and the last sample of any stream were taken; twice 0 where nothing has a time."""
+        stamps: list[Times] = [one.t_ns for one in (*self.curves, *self.truth)]
+        stamps += [one.t_ns for one in self.taxels] + [one.t_ns for one in self.paths]
+        stamps += [one.t_ns for one in self.frames]
+        stamps += [np.array([one.t_ns]) for one in self.clouds if one.t_ns is not None]
+        stamps = [one for one in stamps if len(one)]
+        return (min(int(one[0]) for one in stamps), max(int(one[-1]) for one in stamps)) if stamps else (0, 0)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to draw."""
+        return not (self.curves or self.taxels or self.paths or self.clouds or self.frames)
+
+    @property
+    def labels(self) -> dict[str, Attribute]:
+        """The attributes by name, without those that a simulation adds."""
+        return {name: self.attributes[name] for name in sorted(self.attributes) if not name.startswith(TRUTH)}
+
+    @property
+    def by_interest(self) -> list[str]:
+        """The streams with curves, those first whose quantities a reader looks for first."""
+
+        def rank(name: str) -> int:
+            here = [one.quantity for one in self.curves if one.stream == name]
+            return min((FIRST.index(one) for one in here if one in FIRST), default=len(FIRST))
+
+        return sorted(dict.fromkeys(one.stream for one in self.curves), key=rank)
+
+    @property
+    def duration_s(self) -> float:
+        """How long the recording lasts."""
+        start_ns, stop_ns = self.ends_ns
+        return (stop_ns - start_ns) / 1e9
+
+
+def of(
+    recording: Recording, predictions: pa.Table | None = None, predicted: Mapping[str, Any] | None = None
+) -> Contents:
+    """Return what is drawn of a recording.
+
+    ``predictions`` is its table in a dataset of predictions or results, ``predicted`` its row where that has one each.
+    """
+    whole = recording.table() if recording.streams == ("",) else None
+    if whole is not None and TIME not in whole.column_names:  # of a split, or one row a recording
+        return Contents(recording.name, recording.attributes, {"": (whole.num_rows, None)})
+    streams = streams_of(recording)
+    truth = _truth(recording, whole)
+    touched = taxels.of_streams(streams)
+    marks = [span for table in streams.values() for span in spans.of_labels(table)]
+    marks += [span for table in truth.values() for span in spans.of_labels(table)]
+    if whole is None:
+        missing = [
+            span for stream, table in streams.items() if not _is_cloud(table) for span in spans.gaps(stream, table)
+        ]
+    else:
+        missing = spans.masked_gaps(whole)
+    happened = spans.events(recording.table(EVENTS)) if EVENTS in recording.streams else []
+    clouds = {stream: table for stream, table in streams.items() if _is_cloud(table)}
+    plotted = {stream: table for stream, table in streams.items() if stream not in clouds}
+    ahead = [] if predictions is None else forecasts.of_table(predictions, touched)
+    ahead += forecasts.of_values(predicted or {}, touched)
+    return Contents(
+        recording.name,
+        recording.attributes,
+        {stream: (table.num_rows, None if stream in clouds else rate_hz(table)) for stream, table in streams.items()},
+        curves.of_streams(plotted),
+        curves.of_streams(truth),
+        touched,
+        marks,
+        missing,
+        happened,
+        paths.of_streams(plotted),
+        [points for stream, table in clouds.items() for points in _points(stream, table)],
+        [found for stream, table in streams.items() for found in _frames(stream, table)],
+        ahead,
+        predicted or {},
+    )
+
+
+def _truth(recording: Recording, whole: pa.Table | None) -> dict[str, pa.Table]:
+    """Return the ground truth of a simulated recording as a stream."""
+    if "truth" in recording.streams:
+        return {"truth": recording.table("truth")}
+    if whole is None:
+        return {}
+    names = [name for name in whole.column_names if name.startswith(TRUTH)]
+    return {"truth": whole.select([TIME, *names])} if names and TIME in whole.column_names else {}
+
+
+def _is_cloud(table: pa.Table) -> bool:
+    return set(POSITION) <= set(table.column_names)
+
+
+def _points(stream: str, table: pa.Table) -> list[Points]:
+    """Return the clouds of a stream, one for each stamp."""
+    points_m = curves.matrix(table, POSITION).astype(np.float32)
+    coloured = set(COLOUR) <= set(table.column_names)
+    colours = curves.matrix(table, COLOUR).astype(np.uint8) if coloured else None
+    if TIME not in table.column_names:
+        return [Points(stream, None, points_m, colours)]
+    stamps_ns, starts = np.unique(table.column(TIME).to_numpy(), return_index=True)
+    stops = [*starts[1:].tolist(), len(points_m)]
+    return [
+        Points(stream, int(t_ns), points_m[start:stop], None if colours is None else colours[start:stop])
+        for t_ns, start, stop in zip(stamps_ns, starts.tolist(), stops, strict=True)
+    ]
+
+
+def _frames(stream: str, table: pa.Table) -> list[Frames]:
+    if TIME not in table.column_names:
+        return []
+    found = []
+    for column in table.schema:
+        if not str(column.type).endswith("binary"):
+            continue
+        content = [bytes(one or b"") for one in table.column(column.name).to_pylist()]
+        kind = next(filter(None, map(encoding, content)), "")
+        if kind:
+            found.append(Frames(stream, table.column(TIME).to_numpy(), content, f"image/{kind}"))
+    return found

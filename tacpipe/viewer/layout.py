@@ -1,0 +1,237 @@
+"""Which views the viewer opens with, and where they lie: few large ones, the others in tabs.
+
+On the left the time axes, one below the other and moved together: touch, spans, streams. On the right the taxels at the
+cursor, all taxels over the whole recording, and space. Rerun is imported inside the functions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tacpipe.traces.taxels import Taxels
+from tacpipe.viewer import stream
+from tacpipe.viewer.contents import Contents
+
+LANE, LEAST, MOST = 0.35, 1.1, 2.2  # height of the spans next to that of the touch, 3: a lane, and its limits
+MAPS_A_ROW = 3
+SHORT_S, LOOP_S = 20.0, 10.0  # a recording that plays as a whole; what plays of a longer one
+
+
+def signature(contents: Contents) -> tuple[Any, ...]:
+    """Return what the layout depends on; recordings with the same one share it."""
+    titles = (
+        sorted(f"{one.stream} {one.title}" for one in contents.curves),
+        sorted(one.name for one in contents.taxels),
+    )
+    steps = sorted({(one.measured.name, one.step) for one in contents.forecasts})
+    space = (sorted(one.name for one in contents.paths), sorted({one.stream for one in contents.clouds}))
+    cameras = sorted(one.stream for one in contents.frames)
+    return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth))
+
+
+def blueprint(contents: Contents, *, several: bool = False) -> Any:
+    """Return the layout of a recording's views as Rerun's blueprint."""
+    import rerun.blueprint as rrb
+
+    left, right = _times(contents), _moments(contents)
+    if left:
+        root = rrb.Horizontal(_stacked(left), _stacked([*right, _places(contents)]), column_shares=[1.7, 1])
+    elif right:
+        root = rrb.Horizontal(_places(contents)[0], _stacked(right), column_shares=[1, 1.2])
+    else:
+        root = _places(contents)[0]
+    return rrb.Blueprint(
+        root,
+        _playing(contents),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="expanded" if several else "collapsed"),  # which has the list of recordings
+    )
+
+
+def _playing(contents: Contents) -> Any:
+    """Return the panel of time: a long recording plays the seconds around its largest touch, over and over."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    part_s = loop_s(contents)
+    if part_s is None:
+        return rrb.TimePanel(state="collapsed", timeline=stream.TIMELINE, play_state="playing", loop_mode="all")
+    selection = rr.encodings.AbsoluteTimeRange(*(round(edge_s * 1e9) for edge_s in part_s))
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline=stream.TIMELINE,
+        play_state="playing",
+        loop_mode="selection",
+        time_selection=selection,
+    )
+
+
+def loop_s(contents: Contents) -> tuple[float, float] | None:
+    """Return the part of a recording of more than 20 s that plays at first, seconds from its start; None for all."""
+    touched = [one for one in contents.taxels if len(one.t_ns) > 1]
+    if contents.duration_s <= SHORT_S or not touched:
+        return None
+    most = max(touched, key=lambda one: float(np.nanmax(one.load, initial=0.0)))
+    peak_s = (int(most.t_ns[int(np.nanargmax(most.load))]) - contents.ends_ns[0]) / 1e9
+    start_s = min(max(peak_s - LOOP_S / 2, 0.0), contents.duration_s - LOOP_S)
+    return start_s, start_s + LOOP_S
+
+
+def _stacked(parts: list[tuple[Any, float]]) -> Any:
+    import rerun.blueprint as rrb
+
+    views, shares = zip(*parts, strict=True)
+    return rrb.Vertical(*views, row_shares=list(shares)) if len(views) > 1 else views[0]
+
+
+def _times(contents: Contents) -> list[tuple[Any, float]]:
+    """Return the views with a time axis, with their heights."""
+    import rerun.blueprint as rrb
+
+    found: list[tuple[Any, float]] = []
+    unit = f" ({_unit(contents)})".replace(" ()", "")
+    ahead = [one for one in contents.forecasts if one.step]
+    if ahead:
+        for name in dict.fromkeys(one.measured.name for one in ahead):
+            title = f"{name}: load measured and predicted{unit}"
+            found.append((_plot(_origin(stream.FORECAST, name), title), 2.0))
+        found.append((_plot(stream.ERROR, f"Mean absolute error of the forecasts{unit}"), 1.3))
+    elif any(len(one.t_ns) > 1 for one in contents.taxels):
+        found.append((_plot(stream.TOUCH, f"Touch: mean distance of the taxels from rest{unit}"), 3.0))
+    lanes = {one.lane for one in contents.spans} | ({"gaps"} if contents.gaps else set())
+    lanes |= {f"events {one.stream}" for one in contents.events}
+    if lanes:
+        view = rrb.StateTimelineView(origin=stream.SPANS, name="Contacts, labels, gaps", time_view=_linked())
+        found.append((view, min(max(LEAST, LANE * (len(lanes) + 1)), MOST)))
+    tabs = _tabs(contents)
+    if tabs:
+        found.append((rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0], 3.2))
+    return found
+
+
+def _tabs(contents: Contents) -> list[Any]:
+    """Return a tab a stream, one of each finger's taxels, and that of the ground truth."""
+    import rerun.blueprint as rrb
+
+    found = []
+    for name in contents.by_interest:
+        views = [
+            _plot(_origin(stream.SERIES, name, one.title), one.title) for one in contents.curves if one.stream == name
+        ]
+        found.append(rrb.Vertical(*views, name=name or "rows") if len(views) > 1 else views[0])
+    for one in contents.taxels:
+        if len(one.t_ns) > 1:
+            titles = [stream.channels_title(one, axis) for axis in (stream.AXES if one.change.shape[2] == 3 else ("",))]
+            views = [_plot(_origin(stream.CHANNELS, one.name, title), title) for title in titles]
+            found.append(rrb.Vertical(*views, name=f"{one.name} taxels"))
+    if contents.truth:
+        views = [_plot(_origin(stream.TRUTH, one.title), one.title) for one in contents.truth]
+        found.append(rrb.Grid(*views, name="ground truth"))
+    if contents.events:
+        found.append(rrb.TextLogView(origin=stream.EVENTS, name="events"))
+    return found
+
+
+def _space(contents: Contents) -> Any:
+    """Return the view of paths and clouds, seen from a side from which all of them are in sight."""
+    import rerun.blueprint as rrb
+
+    places = [one.position_m for one in contents.paths] + [one.points_m for one in contents.clouds]
+    if contents.clouds:  # the camera that saw the cloud looks along z
+        middle = np.median(np.concatenate([one.points_m for one in contents.clouds]), axis=0)
+        behind, up = np.array([0.0, 0.0, -1.0]), (0, -1, 0)
+        extent = np.concatenate([one.points_m for one in contents.clouds])
+    else:
+        extent = np.concatenate(places)
+        middle, behind, up = (extent.min(axis=0) + extent.max(axis=0)) / 2, np.array([0.8, -1.0, 0.6]), (0, 0, 1)
+    low, high = np.quantile(extent, [0.02, 0.98], axis=0)
+    reach_m = max(float(np.linalg.norm(high - low)), 0.05)
+    eye = rrb.EyeControls3D(position=middle + behind / np.linalg.norm(behind) * reach_m, look_target=middle, eye_up=up)
+    return rrb.Spatial3DView(origin=stream.SPACE, name="Space (m)", eye_controls=eye)
+
+
+def _carpet(contents: Contents) -> Any:
+    import rerun.blueprint as rrb
+
+    width, height = stream.carpet_size(contents)
+    bounds = rrb.VisualBounds2D(x_range=(-10, width + 10), y_range=(-5, height + 5))
+    return rrb.Spatial2DView(origin=stream.CARPET, name="All taxels over the recording", visual_bounds=bounds)
+
+
+def _moments(contents: Contents) -> list[tuple[Any, float]]:
+    """Return the views of the moment at the cursor, with their heights."""
+    import rerun.blueprint as rrb
+
+    found: list[tuple[Any, float]] = []
+    maps = [_map(name, one, contents) for name, one in _maps(contents)]
+    if maps:
+        grid = rrb.Grid(*maps, grid_columns=min(len(maps), MAPS_A_ROW)) if len(maps) > 1 else maps[0]
+        found.append((grid, 3.0 if len(maps) <= MAPS_A_ROW else 4.0))
+    if any(len(one.t_ns) > 1 for one in contents.taxels):
+        found.append((_carpet(contents), 1.3))
+    return found
+
+
+def _places(contents: Contents) -> tuple[Any, float]:
+    """Return the tabs with what lies in space, cameras, and the recording's labels, with their height."""
+    import rerun.blueprint as rrb
+
+    rest: list[Any] = [_space(contents)] if contents.paths or contents.clouds else []
+    rest += [rrb.Spatial2DView(origin=_origin(stream.CAMERAS, one.stream), name=one.stream) for one in contents.frames]
+    rest.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
+    return (rrb.Tabs(*rest, active_tab=0) if len(rest) > 1 else rest[0]), 2.4
+
+
+def _map(name: str, one: Taxels, contents: Contents) -> Any:
+    import rerun.blueprint as rrb
+
+    x, y = stream.map_bounds(one)
+    bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+    return rrb.Spatial2DView(
+        origin=_origin(stream.MAPS, name), name=_map_title(name, one, contents), visual_bounds=bounds
+    )
+
+
+def _maps(contents: Contents) -> list[tuple[str, Taxels]]:
+    """Return the maps by name, of measured taxels and of what was predicted of them."""
+    names = []
+    for one in contents.taxels:
+        names.append((one.name, one))
+        steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == one.name]
+        names += [(stream.map_name(one.name, what, max(steps)), one) for what in stream.COMPARED if steps]
+    return names
+
+
+def _unit(contents: Contents) -> str:
+    """Return the unit of the taxels, empty where they have several."""
+    units = {one.unit for one in contents.taxels}
+    return units.pop() if len(units) == 1 else ""
+
+
+def _map_title(name: str, one: Taxels, contents: Contents) -> str:
+    """Return the title of a map, short enough for three of them in a row."""
+    steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == one.name]
+    if not steps or name == one.name:
+        return name if contents.forecasts else f"{name} ({one.unit})".replace(" ()", "")
+    ahead = f"t+{max(steps)}" if max(steps) else "predicted"
+    return ahead if name == stream.map_name(one.name, stream.COMPARED[0], max(steps)) else f"error {ahead}"
+
+
+def _plot(origin: str, name: str) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_x=_linked(), plot_legend=rrb.PlotLegend("RightTop"))
+
+
+def _linked() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeAxis(link="LinkToGlobal")
+
+
+def _origin(*parts: str) -> str:
+    import rerun
+
+    return str(rerun.new_entity_path(list(parts)))

@@ -1,0 +1,50 @@
+"""Runs made by hand, of which all that a comparison states can be computed otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats
+from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.metrics.pairing import Measure
+
+QUESTION = Question("known")
+
+
+def _mean(found: AnyFloats) -> AnyFloats:
+    return np.where(found[:, 1] > 0, found[:, 0] / np.where(found[:, 1] > 0, found[:, 1], 1), np.nan)
+
+
+MEAN = Measure(
+    ("error",),
+    "N",
+    "the mean error",
+    "skill",
+    "recordings",
+    _mean,
+    lambda one, other: 1 - one / other,
+    lambda found: (float(found[0] / found[1]),),
+)
+
+
+def sums(errors: Sequence[float] | AnyFloats) -> dict[str, AnyFloats]:
+    """One value a recording."""
+    return {f"r{place:02d}": np.array([error, 1.0]) for place, error in enumerate(errors)}
+
+
+def run(
+    errors: Mapping[str, Sequence[float] | AnyFloats],
+    method: str = "net",
+    *,
+    seed: int = 0,
+    clusters: Mapping[str, str] | None = None,
+    question: Question = QUESTION,
+    **about: Any,
+) -> Run:
+    """A run of predictors with these errors by recording."""
+    held = Errors(MEAN, {name: sums(one) for name, one in errors.items()}, clusters)
+    settings = about.pop("settings", {})
+    return Run(about.pop("dataset", None), "weighing", method, settings, {question: held}, seed=seed, **about)

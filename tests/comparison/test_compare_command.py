@@ -1,0 +1,150 @@
+"""What ``tacpipe compare`` prints: a row a method or run, columns for what differs, the best first."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tacpipe.cli import compare
+from tacpipe.cli.compare import Compared
+from tacpipe.comparison import engine, runs
+from tacpipe.comparison.runs import Question, Run
+from tacpipe.comparison.specification import Task
+from tacpipe.engine import pipeline
+from tacpipe.metrics import headline
+from tests.comparison.comparison_fakes import run
+from tests.conftest import Ran
+from tests.test_older_project import ARCHIVE
+
+BASE = [4.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0]
+SMALL, LARGE = [1.0, 1.5, 1.0, 1.5, 1.0, 1.5, 1.0, 1.5], [2.0, 2.5, 2.0, 2.5, 2.0, 2.5, 2.0, 2.5]
+
+
+def dataset(data: str = "d" * 64) -> Any:
+    return SimpleNamespace(source=SimpleNamespace(inputs={"datasets": [{"dataset": data}]}))
+
+
+def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) -> tuple[str, Run]:
+    return path, run({"model": errors, "mean": BASE}, dataset=dataset(data), **about)
+
+
+def compared(*given: tuple[str, Run], pool: bool = True) -> Compared:
+    task, every = Task("weighing"), [one for _, one in given]
+    methods = runs.grouped(every) if pool else runs.separate(every)
+    return Compared({path: one.dataset for path, one in given}, engine.comparisons(task, methods), pool)
+
+
+def lines(found: Compared, width: int = 120) -> list[list[str]]:
+    (table,) = found.tables()
+    return [line.split() for line in table.text(width).splitlines()]
+
+
+WIDTHS = (
+    weighed(LARGE, "r/large/0", settings={"width": 8, "deep": True}, seed=0),
+    weighed(LARGE, "r/large/1", settings={"width": 8, "deep": True}, seed=1),
+    weighed(SMALL, "r/small/0", settings={"width": 4, "deep": True}, seed=0),
+)
+
+
+def test_settings_that_differ_are_columns_and_others_are_not_and_the_best_is_first() -> None:
+    head, part, first, second, baseline, *_ = lines(compared(*WIDTHS))
+
+    assert head == ["width", "error", "skill", "95", "%", "interval", "n", "runs"]
+    assert part == ["known"]
+    assert first[:4] == ["net", "4", "1.25", "+0.688"] and first[-2:] == ["8", "1"]
+    assert second[:4] == ["net", "8", "2.25", "+0.438"] and second[-2:] == ["8", "2"]  # two seeds are pooled
+    assert baseline == ["vs", "mean", "4"]
+
+
+def test_without_pooling_each_result_is_a_row_named_by_its_path_with_its_seed() -> None:
+    head, _, *rows = lines(compared(*WIDTHS, pool=False))
+
+    assert head == ["width", "seed", "error", "skill", "95", "%", "interval", "n"]
+    assert [row[0] for row in rows[:3]] == ["small/0", "large/0", "large/1"]
+    assert [row[2] for row in rows[1:3]] == ["0", "1"]
+
+
+def test_data_is_a_column_where_results_are_of_other_data() -> None:
+    alike = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "1" * 64, method="other"))
+    other = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "2" * 64, method="other"))
+
+    assert "data" not in lines(alike)[0]
+    assert lines(other)[0][0] == "data" and lines(other)[2][1] == "2" * 8
+
+
+def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interval() -> None:
+    some = [
+        weighed(LARGE, "a", question=Question("known")),
+        weighed(SMALL, "b", question=Question("unseen")),
+    ]
+    found = compared(*some)
+
+    assert [line for line in lines(found) if line in (["known"], ["unseen"])] == [["known"], ["unseen"]]
+    (table,) = found.tables()
+    assert all(len(line) <= 80 for line in table.text(80).splitlines())
+    assert "95 % interval" in table.text(40).splitlines()[0]
+
+
+def test_too_few_recordings_for_a_verdict_are_stated() -> None:
+    few = compared(weighed(SMALL[:3], "a"))
+    assert f"below {headline.FEWEST}" in few.tables()[0].caption
+    assert "below" not in compared(*WIDTHS).tables()[0].caption
+
+
+def test_json_holds_every_row_with_its_results_and_csv_a_line_for_each() -> None:
+    found = compared(*WIDTHS)
+    ((one,), rows) = (found.to_json()["comparisons"], list(csv.DictReader(io.StringIO(found.to_csv()))))
+    first, second, third = one["rows"] if one["rows"][-1]["kind"] == "baseline" else sorted(one["rows"], key=str)
+
+    assert (first["settings"], first["results"]) == ({"width": 4}, ["r/small/0"])
+    assert second["results"] == ["r/large/0", "r/large/1"] and second["runs"] == 2
+    assert first["gain"] == pytest.approx(1 - 1.25 / 4) and first["low"] <= first["gain"] <= first["high"]
+    assert third["kind"] == "baseline" and third["gain"] is None and third["errors"] == {"error": 4.0}
+    assert len(rows) == 3
+    assert {row["width"]: float(row["gain"]) for row in rows[:2]} == {
+        "4": pytest.approx(first["gain"]),
+        "8": pytest.approx(second["gain"]),
+    }
+
+
+def test_a_result_of_an_older_version_compares_as_its_headline_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[[str], Ran]
+) -> None:
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    monkeypatch.chdir(tmp_path)
+    done = call("compare results/forward --json")
+    assert done.code == 0, done.err
+    (one,) = json.loads(done.out)["comparisons"]
+    (stored,) = json.loads((tmp_path / "results/forward/headline.json").read_text())["headlines"]
+    (model,) = [row for row in one["rows"] if row["kind"] == "model"]
+
+    assert list(model["errors"].values()) == pytest.approx(stored["model"]["values"], rel=1e-5)
+    assert model["baseline"] == stored["best_baseline"] and model["gain"] == pytest.approx(
+        stored["gain"], abs=1e-7
+    )  # sums are kept to nine digits
+    assert call("compare models/forward").code == 2  # a model is not a result
+    assert call("compare results/forward --json --csv").code == 2
+
+
+def test_a_result_without_errors_of_recordings_is_left_out_by_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = compared(*WIDTHS)
+    opened = {**given.results, "r/old": dataset()}
+    for one in opened.values():
+        one.files = {compare.METRICS: b"{}"}
+    monkeypatch.setattr(pipeline, "open_dataset", lambda path: opened[str(path)])
+    monkeypatch.setattr(engine, "compare", lambda results, pool: given.comparisons)
+
+    found = compare.run([Path(path) for path in opened], pool=True)
+    assert found.unused() == ["r/old"]
+    assert "left out r/old" in capsys.readouterr().err

@@ -1,0 +1,84 @@
+"""A scheduler and workers of Dask, in processes of their own: as threads of this one they would disturb other tests."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+GIVE_UP_S = 300.0  # only what hangs takes so long
+
+
+class Cluster:
+    """A scheduler and workers as a lab starts them, in processes that a test may kill."""
+
+    def __init__(self, folder: Path, **environment: str) -> None:
+        self.folder, self.environment = folder, environment
+        self.scheduler = self._start("scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0")
+        self.address = self._found("scheduler", r"Scheduler at:\s+tcp://(\S+)")
+        self.workers: dict[str, subprocess.Popen[bytes]] = {}
+
+    def work(self, name: str, *options: str) -> None:
+        """Start a worker, a process that nobody starts again."""
+        given = ("--nthreads", "1", "--no-nanny", "--name", name, "--memory-limit", "0", *options)
+        self.workers[name] = self._start(name, "worker", f"tcp://{self.address}", *given)
+        self._found(name, r"Starting established connection to (tcp)")
+
+    @property
+    def executor(self) -> str:
+        return f"dask://{self.address}"
+
+    def close(self) -> None:
+        for process in (*self.workers.values(), self.scheduler):
+            if process.poll() is None:
+                process.send_signal(signal.SIGKILL)
+            process.wait()
+
+    def _start(self, name: str, *words: str) -> subprocess.Popen[bytes]:
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", **self.environment}
+        with (self.folder / f"{name}.log").open("wb") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"],
+                cwd="/",
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+
+    def _found(self, name: str, pattern: str) -> str:
+        """Return what a pattern finds in a process's log, once it is there."""
+        began_s = time.monotonic()
+        while time.monotonic() - began_s < GIVE_UP_S:
+            found = re.search(pattern, (self.folder / f"{name}.log").read_text())
+            if found:
+                return found[1]
+            time.sleep(0.05)
+        raise AssertionError((self.folder / f"{name}.log").read_text())
+
+
+@pytest.fixture(scope="session")
+def scheduler(tmp_path_factory: pytest.TempPathFactory, plugin: Path) -> Iterator[str]:
+    """The executor of two workers that find the plug-in of ``lab``."""
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    found = Cluster(tmp_path_factory.mktemp("scheduler"), PYTHONPATH=str(plugin))
+    found.work("first")
+    found.work("second")
+    yield found.executor
+    found.close()
+
+
+@pytest.fixture
+def cluster(tmp_path_factory: pytest.TempPathFactory, lab: object) -> Iterator[Cluster]:
+    """A scheduler without workers, which find the plug-in of ``lab``."""
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    found = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield found
+    found.close()

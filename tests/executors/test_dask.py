@@ -1,0 +1,151 @@
+"""Workers of Dask: who may be reached, what they must have, and what is left where one of them ends."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tacpipe.engine.executors import agreement, dask
+from tests.conftest import Lab
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+
+
+@pytest.mark.parametrize(
+    ("address", "named"),
+    [
+        ("dask://10.0.0.7:8786", "tls://10.0.0.7:8786"),
+        ("dask://cluster.example:8786", "tls://cluster.example:8786"),
+        ("tls", "tls://"),
+        ("local://8786", "8786"),
+        ("ray", "dask, local, tls"),
+    ],
+)
+def test_a_scheduler_that_must_not_or_cannot_be_reached_is_refused(lab: Lab, address: str, named: str) -> None:
+    lab.run("simulate toy -o data/rec --jobs 1")
+    ran = lab.call(f"scale data/rec -o data/out --executor {address}")
+    assert ran.code == 2
+    assert named in ran.err
+
+
+def test_a_scheduler_that_does_not_answer_is_named(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    monkeypatch.setattr(dask, "_CONNECT_S", 0.2)
+    lab.run("simulate toy -o data/rec --jobs 1")
+    ran = lab.call("scale data/rec -o data/out --executor dask://127.0.0.1:1")
+    assert ran.code == 1
+    assert "127.0.0.1:1" in ran.err
+    assert "Traceback" not in ran.err
+
+
+@pytest.mark.long
+def test_a_record_names_the_worker(lab: Lab, scheduler: str) -> None:
+    lab.run("simulate toy -o data/rec --jobs 1")
+    lab.run(f"scale data/rec -o data/out --executor {scheduler}")
+    made = [record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "scale"]
+    assert [one["worker"] for one in made] and all(one["worker"] != "" for one in made)
+    others = [
+        record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "simulate.toy"
+    ]
+    assert not any("worker" in one for one in others)
+
+
+@pytest.mark.long
+def test_a_worker_with_other_versions_is_refused_in_one_sentence(
+    lab: Lab, scheduler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run("simulate toy -o data/rec --jobs 1")
+    here = agreement.here
+    monkeypatch.setattr(agreement, "here", lambda stage: {**here(stage), "numpy": "0.1"})
+    ran = lab.call(f"scale data/rec -o data/out --executor {scheduler}")
+    assert ran.code == 2
+    assert "(here 0.1)" in ran.err
+    assert "Traceback" not in ran.err
+
+
+@pytest.mark.long
+def test_a_worker_that_sees_another_store_is_refused(lab: Lab, scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.run("simulate toy -o data/rec --jobs 1")
+    absolute = dask._absolute
+    monkeypatch.setattr(dask, "_absolute", lambda task: replace(absolute(task), run=f"{task.run}-of-another"))
+    ran = lab.call(f"scale data/rec -o data/out --executor {scheduler}")
+    assert ran.code == 1
+    assert str(lab.folder) in ran.err
+
+
+@pytest.mark.long
+def test_a_collection_beside_a_worker_takes_nothing_that_it_made(lab: Lab, scheduler: str) -> None:
+    """The worker's own lease announces what it makes; the command's lease, what it has heard of."""
+    lab.run("simulate toy -o data/rec --trials 3 --jobs 1")
+    gate = lab.folder / "gate"
+    gate.touch()
+    lab.run(f"scale data/rec -o data/out --gate {gate} --executor {scheduler}")
+    made = {digest for digest, _ in lab.manifest("data/out").sizes()}
+    announced = {digest for run in lab.store.leases.runs() for digest in run.objects}  # for a second after the command
+    assert made <= announced
+
+
+def test_tasks_are_named_by_absolute_paths() -> None:
+    task = dask.Task("store", "ingest.numbers", {}, files={"a": "raw/a.txt"})
+    files = dask._absolute(task).files
+    assert files is not None and files["a"].startswith("/") and files["a"].endswith("raw/a.txt")
+
+
+@pytest.mark.long
+def test_what_a_killed_worker_left_another_one_computes(lab: Lab, cluster: Any) -> None:
+    lab.run("simulate toy -o data/rec --trials 6 --jobs 1")
+    lab.run("scale data/rec -o data/one --jobs 1")
+    expected = lab.manifest("data/one").content
+    cluster.work("first")
+    cluster.work("second")
+    import threading
+
+    killer = threading.Timer(1.0, cluster.workers["first"].send_signal, [signal.SIGKILL])
+    killer.start()
+    lab.run(f"scale data/rec -o data/other --factor 2 --rerun --pause-s 0.7 --executor {cluster.executor}")
+    killer.join()
+    assert cluster.workers["first"].wait() == -signal.SIGKILL
+    shards = {name: entry["shards"] for name, entry in lab.manifest("data/other").recordings.items()}
+    assert shards == {name: entry["shards"] for name, entry in lab.manifest("data/one").recordings.items()}
+    assert expected  # the params differ, the shards do not
+
+
+@pytest.mark.long
+def test_a_scheduler_that_ends_is_reported_and_what_was_finished_is_kept(lab: Lab, cluster: Any) -> None:
+    lab.run("simulate toy -o data/rec --trials 6 --jobs 1")
+    cluster.work("only")
+    import threading
+
+    killer = threading.Timer(2.0, cluster.scheduler.send_signal, [signal.SIGKILL])
+    killer.start()
+    ran = lab.call(f"scale data/rec -o data/out --pause-s 0.7 --executor {cluster.executor}")
+    killer.join()
+    assert ran.code == 1
+    assert cluster.address in ran.err
+    assert "Traceback" not in ran.err
+    again = lab.run("scale data/rec -o data/out --pause-s 0.7 --jobs 1")
+    assert " 0 reused" not in again.err
+
+
+@pytest.mark.long
+def test_a_scheduler_without_workers_is_refused(lab: Lab, cluster: Any) -> None:
+    lab.run("simulate toy -o data/rec --jobs 1")
+    ran = lab.call(f"scale data/rec -o data/out --executor {cluster.executor}")
+    assert ran.code == 1
+    assert "dask worker" in ran.err
+
+
+@pytest.mark.long
+def test_workers_are_started_for_one_command_and_end_with_it(lab: Lab) -> None:
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    lab.run("simulate toy -o data/rec --trials 4 --jobs 1")
+    lab.run("scale data/rec -o data/out --executor dask --jobs 2")
+    workers = {
+        record["provenance"].get("worker")
+        for _, record in lab.store.records()
+        if record["identity"].get("stage") == "scale"
+    }
+    assert workers == {"0", "1"} or len(workers) == 1

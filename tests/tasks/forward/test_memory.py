@@ -1,0 +1,54 @@
+"""What evaluation holds of a long recording: the recording as it is stored and its predictions, and one batch of windows."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tacpipe.tasks.forward import evaluation, predictors, tracks
+from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.metrics import Trial
+from tests.stages.learning_fakes import FakeShard, motion
+from tests.tasks.forward.trials import trained
+
+ROWS = 4000
+
+
+def peak_bytes(forecaster: Forecaster, rows: int) -> int:
+    """Return what the evaluation of a recording of so many rows takes at most, besides its track."""
+    shard: FakeShard = motion(0, rows=rows)
+    track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
+    loads = Loads(forecaster.codec.layout, forecaster.horizon)
+    tracemalloc.start()
+    evaluation._predictions(forecaster, track, Trial("a", True), loads)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak
+
+
+def test_the_evaluation_of_a_longer_recording_takes_more_by_its_predictions_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(predictors, "CHUNK", 64)
+    forecaster = Forecaster.load(trained(tmp_path))
+    short, long = (peak_bytes(forecaster, rows) for rows in (ROWS, 3 * ROWS))
+    steps = sum(step <= forecaster.horizon for step in evaluation.STORED_STEPS)
+    stored = steps * len(forecaster.codec.latents) * 4  # bytes of the predictions that are kept of a window
+    grown = (long - short) / (2 * ROWS)  # bytes a row
+    assert grown < 2 * stored + 100, grown
+
+
+def test_the_predictions_of_a_batch_are_made_one_after_another(tmp_path: Path) -> None:
+    forecaster = Forecaster.load(trained(tmp_path))
+    track = tracks.track(motion(0, rows=200), forecaster.codec)  # type: ignore[arg-type]
+    (some,) = predictors.predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
+    found = dict(some.predictions.items())
+    assert list(found) == list(some.predictions) and len(found) == len(some.predictions) > 5
+    for name, prediction in found.items():
+        assert np.array_equal(prediction.count, some.predictions[name].count)
+    with pytest.raises(KeyError):
+        some.predictions["another"]

@@ -1,0 +1,39 @@
+"""docs/promises.md names the tests that speak for each promise: files that exist, and every file of tests/promises."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+PAGE = TESTS.parent / "docs/promises.md"
+NAMED = re.compile(r"`((?:\w+/)*test_[\w*]+\.py)`")
+
+
+def rows() -> Iterator[list[str]]:
+    """Yield the cells of each row of the table of promises."""
+    table = PAGE.read_text().split("## What is promised")[1].split("\n## ")[0]
+    for line in table.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("| ") and cells[0] not in ("promise", "---"):
+            yield cells
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMED.findall(PAGE.read_text()))))
+def test_a_file_that_the_page_names_exists(name: str) -> None:
+    assert list(TESTS.glob(name)), f"docs/promises.md names {name}, which is not below tests/"
+
+
+def test_every_file_of_tests_promises_is_named() -> None:
+    named = {path for name in NAMED.findall(PAGE.read_text()) for path in TESTS.glob(name)}
+    assert sorted(set(TESTS.glob("promises/test_*.py")) - named) == []
+
+
+def test_every_promise_names_a_test() -> None:
+    found = list(rows())
+    assert len(found) > 20
+    without = [cells[0] for cells in found if len(cells) != 3 or not NAMED.search(cells[2])]
+    assert without == ["Bad input is one sentence, with the documented exit code, and leaves everything as it was."]

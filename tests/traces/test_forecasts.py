@@ -1,0 +1,55 @@
+"""Forecasts next to what was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.channels import biotac_sp, schema
+from tacpipe.traces import forecasts, taxels
+from tests.viewer import hand
+
+
+def predictions(measured: taxels.Taxels, steps: tuple[int, ...], off: float) -> pa.Table:
+    """Return a table as `tacpipe predict` writes it: what comes ``step`` rows later, plus ``off``."""
+    rows = len(measured.t_ns) - max(steps)
+    flat = measured.change.reshape(len(measured.t_ns), -1)
+    fields, columns = [pa.field("t_ns", pa.int64())], [pa.array(measured.t_ns[:rows])]
+    for place, channel in enumerate(measured.channels):
+        for step in steps:
+            about = {"quantity": "prediction", "step": str(step)}
+            fields.append(pa.field(f"{measured.stream}_{channel}_t{step}", pa.float64(), metadata=about))
+            columns.append(pa.array(flat[step : step + rows, place] + off))
+    return pa.Table.from_arrays(columns, schema=pa.schema(fields))
+
+
+def test_a_forecast_stands_at_the_time_that_it_is_of() -> None:
+    (measured,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
+    found = forecasts.of_table(predictions(measured, (1, 10), off=4.0), [measured])
+
+    assert [one.step for one in found] == [1, 10]
+    for one in found:
+        rows = np.searchsorted(measured.t_ns, one.predicted.t_ns)
+        assert rows[0] == one.step
+        np.testing.assert_allclose(one.measured.change, measured.change[rows])
+        np.testing.assert_allclose(one.predicted.change, measured.change[rows] + 4)
+        np.testing.assert_allclose(one.error, 4)
+        np.testing.assert_allclose(one.residual.change, 4)
+
+
+def test_a_finger_of_which_a_channel_is_missing_has_no_forecast() -> None:
+    (measured,) = taxels.of_table("xela1", hand.finger(hand.pressed()))
+    table = predictions(measured, (1,), 0.0)
+
+    assert forecasts.of_table(table.drop_columns(table.column_names[-1]), [measured]) == []
+    assert forecasts.of_table(hand.arm(), [measured]) == []
+
+
+def test_the_reading_of_two_fingers_is_compared_electrode_by_electrode() -> None:
+    table = schema.stream(np.array([5]), np.arange(58)[:, None], biotac_sp.fields())
+    values = {name: 1000.0 + place for place, name in enumerate(biotac_sp.value_columns("e_th"))}
+
+    (found,) = forecasts.of_values(values, taxels.of_table("reading", table))
+
+    assert (found.step, found.measured.finger) == (0, "th")
+    np.testing.assert_array_equal(found.residual.magnitude, [1000.0 + np.arange(24) - (29 + np.arange(24))])

@@ -1,0 +1,225 @@
+"""Who follows a training: the file that grows, the lines and the bar, and what an interrupted one resumes from."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+import torch
+
+from tacpipe.errors import TacpipeError
+from tacpipe.io import progress, termination
+from tacpipe.training import display, following
+from tacpipe.training.following import Line, Network
+from tacpipe.training.loop import Loss, Part, Trained, Windows, train
+from tests.training.test_loop import SCHEDULE, build, interrupted_after, loss, run, same
+
+
+class Seen:
+    """A follower that keeps what it was called with."""
+
+    def __init__(self, act: Callable[[], None] = lambda: None) -> None:
+        self.networks: list[tuple[Network, list[Line]]] = []
+        self.passed: list[float] = []
+        self.losses: list[float] = []
+        self.lines: list[tuple[Line, float]] = []
+        self.ends: list[bool] = []
+        self.act = act
+
+    def begin(self, network: Network, history: Sequence[Line]) -> None:
+        self.networks.append((network, list(history)))
+
+    def batch(self, passed: float, mean: Callable[[], float]) -> None:
+        self.passed.append(passed)
+        self.losses.append(mean())
+
+    def line(self, line: Line, learning_rate: float) -> None:
+        self.act()
+        self.lines.append((line, learning_rate))
+
+    def end(self, *, trained: bool) -> None:
+        self.ends.append(trained)
+
+
+def followed(folder: Path, *followers: following.Follower, training: Loss = loss) -> Trained:
+    with following.in_workspace(folder, *followers):
+        return run(folder, training)
+
+
+def lines(folder: Path) -> list[Line]:
+    return [json.loads(line) for line in (folder / following.HISTORY).read_text().splitlines()]
+
+
+def test_a_follower_is_called_at_every_batch_and_every_epoch(tmp_path: Path) -> None:
+    seen = Seen()
+    trained = followed(tmp_path, seen)
+
+    epochs = len(trained.history)
+    assert seen.passed == [0.25, 0.5, 0.75, 1.0] * epochs  # of 32 windows, 8 a batch
+    assert seen.losses[3] == pytest.approx(trained.history[0]["train_loss"])
+    assert [line for line, _ in seen.lines] == trained.history
+    assert {rate for _, rate in seen.lines} == {SCHEDULE.learning_rate}
+    assert seen.ends == [True]
+
+
+def test_the_learning_rate_of_a_line_is_that_of_its_first_batch(tmp_path: Path) -> None:
+    seen, schedule = Seen(), dataclasses.replace(SCHEDULE, cycle=True, patience=9)
+    with following.in_workspace(tmp_path, seen):
+        train(build, Windows(Part(32, loss), Part(40, loss), schedule.batch), schedule, tmp_path)
+
+    assert [rate for _, rate in seen.lines] == [schedule.rate(epoch / 6) for epoch in range(6)]
+
+
+def test_the_history_file_grows_with_every_epoch_and_ends_as_the_history(tmp_path: Path) -> None:
+    counts: list[int] = []
+    seen = Seen(act=lambda: counts.append(len(lines(tmp_path))))
+    trained = followed(tmp_path, seen)
+
+    assert counts == list(range(1, len(trained.history) + 1))
+    assert (tmp_path / following.HISTORY).read_bytes() == trained.history_lines
+
+
+def test_a_resumed_training_states_its_epoch_and_the_file_is_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(KeyboardInterrupt), display.on_stderr("train", tmp_path) as shown:
+        followed(tmp_path, *shown, training=interrupted_after(9))  # in the third epoch of four batches
+    before = capsys.readouterr().err
+    kept = len(lines(tmp_path))
+    with display.on_stderr("train", tmp_path) as shown:
+        trained = followed(tmp_path, *shown)
+    after = capsys.readouterr().err
+
+    assert kept == 2
+    assert "epoch 2/6" in before and "epoch 3/6" not in before and "trained" not in before
+    assert "resumes from epoch 3 of 6" in after and "epoch 2/6" not in after and "epoch 3/6" in after
+    assert lines(tmp_path) == trained.history
+
+
+def test_an_interrupt_is_stated_with_the_epoch_that_is_resumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        followed(tmp_path, training=interrupted_after(9))
+    termination.report()
+    assert "epoch 3 of 6" in capsys.readouterr().err
+
+    with pytest.raises(KeyboardInterrupt):
+        followed(tmp_path / "another", training=interrupted_after(2))
+    termination.report()
+    assert "epoch" not in capsys.readouterr().err  # nothing is kept of the first
+
+
+def test_the_lines_of_several_networks_are_in_one_file_with_their_labels(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work = Windows(Part(32, loss), Part(40, loss), SCHEDULE.batch)
+    with display.on_stderr("train", tmp_path) as shown, following.in_workspace(tmp_path, *shown):
+        several = [
+            train(build, work, SCHEDULE, tmp_path / name, number=number, count=2, labels={"target": name})
+            for number, name in enumerate(("a", "b"), 1)
+        ]
+
+    assert lines(tmp_path) == [
+        {**line, "target": name} for name, one in zip("ab", several, strict=True) for line in one.history
+    ]
+    err = capsys.readouterr().err
+    assert err.count(following.HISTORY) == 1
+    assert "network 1 of 2: epoch 1/6" in err and "network 2 of 2: epoch 1/6" in err
+
+
+def test_what_follows_changes_no_bit(tmp_path: Path) -> None:
+    alone = run(tmp_path / "alone")
+
+    def draw() -> None:
+        torch.manual_seed(99)
+
+    drawing = Seen(act=draw)
+    assert same(followed(tmp_path / "followed", drawing), alone)
+
+
+def test_a_file_that_cannot_be_written_is_reported_once_and_ends_no_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = run(tmp_path / "alone")
+    (tmp_path / "followed").mkdir()
+    (tmp_path / "followed" / following.HISTORY).symlink_to(tmp_path / "elsewhere")  # none is followed in a store
+    assert same(followed(tmp_path / "followed"), alone)
+    assert not (tmp_path / "elsewhere").exists()
+    assert capsys.readouterr().err.count(following.HISTORY) == 1
+
+    def full(handle: int, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / "full").mkdir()
+    with monkeypatch.context() as patch, following.in_workspace(tmp_path / "full"):
+        patch.setattr(os, "write", full)
+        with following.network(Network(2), []) as followers:
+            for epoch in (1, 2):
+                followers.line({"epoch": epoch}, 0.1)
+    assert capsys.readouterr().err.count("No space left") == 1
+
+
+def test_nothing_is_left_of_a_training_that_failed_in_its_first_epoch(tmp_path: Path) -> None:
+    def diverging(model: torch.nn.Module, indices: torch.Tensor) -> torch.Tensor:
+        return loss(model, indices) * float("nan")
+
+    with pytest.raises(TacpipeError, match="diverged"):
+        followed(tmp_path, training=diverging)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_terminal_a_line_an_epoch_holds_losses_best_and_seconds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with display.on_stderr("train", tmp_path) as shown:
+        trained = followed(tmp_path, *shown)
+    found = re.findall(
+        r"epoch (\d)/6  train ([\d.e-]+) +val ([\d.e-]+) +best ([\d.e-]+) \(epoch (\d)\)  \d+\.\d s  [\d:]+ left",
+        capsys.readouterr().err,
+    )
+
+    assert [int(one[0]) for one in found] == [line["epoch"] for line in trained.history]
+    for one, line in zip(found, trained.history, strict=True):
+        assert float(one[1]) == pytest.approx(line["train_loss"], rel=1e-3)
+        assert float(one[2]) == pytest.approx(line["val_loss"], rel=1e-3)
+    best = min(trained.history, key=lambda line: line["val_loss"])
+    assert int(found[-1][4]) == best["epoch"] and float(found[-1][3]) == pytest.approx(best["val_loss"], rel=1e-3)
+
+
+def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.shown(False), display.on_stderr("train", tmp_path) as shown:
+        followed(tmp_path, *shown)
+    assert capsys.readouterr().err == ""
+
+
+def test_on_a_terminal_the_bar_counts_batches_and_shows_loss_best_rate_and_remaining_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "wanted", lambda: True)
+    monkeypatch.setattr(display, "REDRAW_S", 0.0)
+    drawn: list[tuple[str, float, str]] = []
+    with display.on_stderr("train", tmp_path) as shown:
+        assert isinstance(shown[0], display.Bar)
+        tasks = shown[0].progress.tasks
+        pulsing = [tasks[0].total]
+
+        class Look(Seen):
+            def batch(self, passed: float, mean: Callable[[], float]) -> None:
+                (task,) = shown[0].progress.tasks  # type: ignore[attr-defined]
+                drawn.append((task.description, task.completed, task.fields["note"]))
+
+        trained = followed(tmp_path, *shown, Look())
+        pulsing.append(shown[0].progress.tasks[0].total)
+
+    assert pulsing == [None, None]  # before the first epoch and after the last it moves too
+    assert [completed for _, completed, _ in drawn] == [n / 4 for n in range(1, 4 * len(trained.history) + 1)]
+    assert drawn[4][0] == "epoch 2/6"
+    best = f"{trained.history[0]['val_loss']:#.4g}"
+    assert re.fullmatch(rf"loss [\d.]+  best {best} \(epoch 1\)  [\d.]+ batches/s  [\d:]+ left", drawn[4][2])

@@ -1,0 +1,98 @@
+"""What is drawn of a recording, and as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tacpipe
+from tacpipe.cli import view
+from tacpipe.errors import UsageError
+from tacpipe.viewer import contents, figure
+from tests.conftest import Lab
+from tests.viewer import hand
+
+
+def drawn() -> contents.Contents:
+    return contents.of(hand.recording())  # type: ignore[arg-type]
+
+
+def test_a_recording_has_its_fingers_arm_labels_events_and_camera() -> None:
+    found = drawn()
+
+    assert [one.name for one in found.taxels] == ["xela1", "xela2"]
+    assert {one.stream for one in found.curves} == {"robot"}
+    assert [(one.lane, one.text) for one in found.spans] == [("contact", "contact 0"), ("slip", "slip")]
+    assert [one.cause for one in found.events] == ["cut"] and found.gaps == []
+    assert [one.name for one in found.paths] == ["robot"]
+    ((frames),) = found.frames
+    assert (frames.media_type, frames.content[0]) == ("image/png", hand.PNG)
+    assert found.duration_s == pytest.approx(hand.SECONDS - 1 / hand.ARM_HZ)
+
+
+def test_a_cloud_of_each_stamp_is_one_cloud() -> None:
+    import pyarrow as pa
+
+    points = {f"{axis}_m": np.arange(6.0) for axis in "xyz"}
+    table = pa.table({"t_ns": [hand.START_NS] * 2 + [hand.START_NS + 5] * 4, **points})
+
+    found = contents.of(hand.recording(scene=table))  # type: ignore[arg-type]
+
+    assert [(one.t_ns, one.points_m.tolist()) for one in found.clouds] == [
+        (hand.START_NS, [[0, 0, 0], [1, 1, 1]]),
+        (hand.START_NS + 5, [[n, n, n] for n in range(2, 6)]),
+    ]
+    assert {one.stream for one in found.curves} == {"robot"}
+
+
+def test_the_first_plot_is_the_touch_of_all_fingers_in_their_unit() -> None:
+    first, *rest = figure.panels(drawn())
+
+    assert first.names == ("xela1", "xela2") and "count" in first.title
+    np.testing.assert_allclose(first.values[:, 1], first.values[:, 0] / 2, atol=0.5)
+    assert [one.title for one in rest] == ["robot position (m)", "robot orientation"]
+
+
+@pytest.mark.parametrize("ending", [".png", ".svg"])
+def test_a_picture_is_drawn_and_its_bytes_are_the_same_each_time(tmp_path: Path, ending: str) -> None:
+    for name in ("a", "b"):
+        figure.draw(drawn(), tmp_path / f"{name}{ending}")
+
+    content = (tmp_path / f"a{ending}").read_bytes()
+    assert content == (tmp_path / f"b{ending}").read_bytes() and len(content) > 10_000
+    if ending == ".svg":
+        text = content.decode()
+        assert text.count("<path") > 20 and "image/png" in text
+
+
+def test_what_is_no_picture_or_has_nothing_to_plot_is_a_usage_error(lab: Lab, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"\.txt"):
+        figure.draw(drawn(), tmp_path / "a.txt")
+    lab.run("simulate toy -o data/r")
+    assert lab.call("show data/r trial-000").code == 2
+    assert lab.call("show data/r --plot a.png").code == 2  # several recordings
+    lab.run("show data/r trial-000 --plot a.png")
+    assert (lab.folder / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_recording_draws_itself_in_a_notebook(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    recording = tacpipe.open("data/r")["trial-000"]
+
+    found = recording._repr_html_()
+
+    assert "trial-000" in found and "<svg" in found and "<polyline" in found and len(found) < 120_000
+
+
+def test_conditions_are_read_as_labels_are_set() -> None:
+    assert view.conditions(["object=cup", "trial=3", "failed=false", "note=a=b"]) == {
+        "object": "cup",
+        "trial": 3,
+        "failed": False,
+        "note": "a=b",
+    }
+    for wrong in ("cup", "=cup"):
+        with pytest.raises(UsageError):
+            view.conditions([wrong])

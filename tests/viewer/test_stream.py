@@ -1,0 +1,211 @@
+"""What `tacpipe view` writes, read back with Rerun's own reader; `make test-viewer` has the environment for it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import tacpipe
+from tacpipe.traces import palette, taxels
+from tacpipe.viewer import contents, layout, session
+from tests.conftest import Lab
+from tests.traces.test_forecasts import predictions
+from tests.viewer import hand
+
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(
+        importlib.util.find_spec("rerun") is None, reason="needs Rerun, the extra view: make test-viewer"
+    ),
+]
+
+
+@pytest.fixture(autouse=True)
+def own_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home of its own, in which what Rerun's programs keep would be found."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for name in ("XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path / "home"
+
+
+def read(file: Path, store: int = 0) -> dict[str, list[pa.RecordBatch]]:
+    """Return the tables of each entity of a recording in a file."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(file)
+    found: dict[str, list[pa.RecordBatch]] = {}
+    for chunk in reader.stream(store=reader.recordings()[store]):
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def timed(batches: list[pa.RecordBatch], component: str) -> tuple[np.ndarray, list[Any]]:
+    """Return the times, nanoseconds since the start, and the values of a component."""
+    rows: list[tuple[int, Any]] = []
+    for batch in batches:
+        if "time" in batch.schema.names and component in batch.schema.names:
+            stamps = batch["time"].cast(pa.int64()).to_pylist()
+            rows += zip(stamps, batch[component].to_pylist(), strict=True)
+    rows.sort(key=lambda one: one[0])
+    return np.array([one[0] for one in rows]), [one[1] for one in rows]
+
+
+def static(batches: list[pa.RecordBatch], component: str) -> Any:
+    """Return the values of a component that hold for the whole recording."""
+    (found,) = [
+        batch[component][0].as_py()
+        for batch in batches
+        if "time" not in batch.schema.names and component in batch.schema.names
+    ]
+    return found
+
+
+def written(folder: Path, **more: pa.Table) -> tuple[contents.Contents, dict[str, list[pa.RecordBatch]]]:
+    drawn = contents.of(hand.recording(**more))  # type: ignore[arg-type]
+    (file,) = session.write([drawn], folder, "data/hand")
+    return drawn, read(file)
+
+
+def test_the_touch_of_each_finger_is_written_at_its_times(tmp_path: Path) -> None:
+    _, found = written(tmp_path)
+
+    t_ns, values = timed(found["/touch/xela1"], "Scalars:scalars")
+    np.testing.assert_array_equal(t_ns, hand.times(hand.SKIN_HZ) - hand.START_NS)
+    wanted = np.linalg.norm(hand.pressed(), axis=2).mean(axis=1)
+    np.testing.assert_allclose(np.ravel(values), wanted)
+    assert static(found["/touch/xela1"], "SeriesLines:names") == ["xela1"]
+
+
+def test_maps_have_a_disc_a_taxel_in_the_colour_of_its_change_and_an_arrow_of_its_shear(tmp_path: Path) -> None:
+    drawn, found = written(tmp_path)
+
+    one = drawn.taxels[0]
+    places = np.array(static(found["/taxels/xela1/discs"], "Points2D:positions"))
+    np.testing.assert_allclose(places, one.places * (1, -1), rtol=1e-6)
+    t_ns, colours = timed(found["/taxels/xela1/discs"], "Points2D:colors")
+    assert len(t_ns) == hand.SECONDS * hand.SKIN_HZ
+    low, high = taxels.scale(np.concatenate([each.magnitude.ravel() for each in drawn.taxels]))
+    last = np.array(colours[-1], np.uint32)
+    rgb = np.stack([last >> 24, (last >> 16) & 255, (last >> 8) & 255], axis=-1)
+    np.testing.assert_array_equal(rgb, palette.coloured(one.magnitude[-1], low, high))
+    _, vectors = timed(found["/taxels/xela1/shear"], "Arrows2D:vectors")
+    assert np.array(vectors[0]).any() == np.False_
+    right, up = np.array(vectors[-1]).T
+    assert (right > 0).all() and not up.any()  # the shear is along x alone
+
+
+def test_spans_begin_and_end_at_their_moments(tmp_path: Path) -> None:
+    _, found = written(tmp_path)
+
+    for lane, states in {"contact": [(1.0, "contact 0"), (3.0, "")], "slip": [(2.5, "slip"), (3.0, "")]}.items():
+        t_ns, values = timed(found[f"/spans/{lane}"], "StateChange:state")
+        assert [(t / 1e9, one[0]) for t, one in zip(t_ns.tolist(), values, strict=True)] == states
+    _, texts = timed(found["/events"], "TextLog:text")
+    assert "cut" in texts[0][0]
+
+
+def test_long_lines_are_envelopes_unless_all_rows_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tacpipe.viewer.stream.MOST_ROWS", 500)
+    drawn = contents.of(hand.recording())  # type: ignore[arg-type]
+    path = next(iter(name for name in written(tmp_path)[1] if name.startswith("/series/robot/robot\\ position")))
+    for all_rows, most in ((False, 500), (True, hand.SECONDS * hand.ARM_HZ)):
+        (tmp_path / str(all_rows)).mkdir()
+        (file,) = session.write([drawn], tmp_path / str(all_rows), "hand", all_rows=all_rows)
+        values = np.array(timed(read(file)[path], "Scalars:scalars")[1])
+        assert most - 2 <= len(values) <= most
+        assert values[:, 0].max() == drawn.paths[0].position_m[:, 0].max()
+
+
+def test_arm_clouds_and_cameras_are_written(tmp_path: Path) -> None:
+    scene = pa.table({f"{axis}_m": np.arange(6.0) for axis in "xyz"})
+    drawn, found = written(tmp_path, scene=scene)
+
+    _, places = timed(found["/space/robot/now"], "Transform3D:translation")
+    np.testing.assert_allclose(places[-1][0], drawn.paths[0].position_m[-1], rtol=1e-6)
+    assert len(static(found["/space/scene"], "Points3D:positions")) == 6
+    t_ns, blobs = timed(found["/cameras/camera"], "EncodedImage:blob")
+    np.testing.assert_array_equal(t_ns, hand.times(hand.SKIN_HZ)[::10] - hand.START_NS)
+    assert bytes(blobs[0][0]) == hand.PNG
+
+
+def test_forecasts_stand_next_to_what_came_with_their_error(tmp_path: Path) -> None:
+    (measured, _) = contents.of(hand.recording()).taxels  # type: ignore[arg-type]
+    drawn = contents.of(hand.recording(), predictions(measured, (1, 10), 4.0))  # type: ignore[arg-type]
+    (file,) = session.write([drawn], tmp_path, "hand")
+    found = read(file)
+
+    t_ns, values = timed(found["/error/xela1/t\\+10"], "Scalars:scalars")
+    np.testing.assert_allclose(np.ravel(values), 4.0)
+    assert t_ns[0] == 10 * 1_000_000_000 // hand.SKIN_HZ
+    assert "/taxels/xela1\\ residual\\ t\\+10/discs" in found and "/forecast/xela1/measured" in found
+
+
+def test_every_view_of_the_layout_shows_an_entity_that_is_written(tmp_path: Path) -> None:
+    drawn, found = written(tmp_path)
+    origins = [view.origin for view in views(layout.blueprint(drawn).root_container)]
+
+    assert len(origins) > 8
+    missing = [one for one in origins if not any(f"{path}/".startswith(f"/{one.strip('/')}/") for path in found)]
+    assert missing == []
+
+
+def views(part: Any) -> list[Any]:
+    contents_of = getattr(part, "contents", None)
+    if isinstance(contents_of, list | tuple):
+        return [view for one in contents_of for view in views(one)]
+    return [part]
+
+
+def test_view_saves_the_recordings_that_are_chosen_as_one_file(lab: Lab, own_home: Path) -> None:
+    lab.run("simulate forward --trials 4 --duration-s 4 -o data/r")
+    lab.run("label data/r trial-002 --set object=cup")
+    lab.run("view data/r --where object=cup --save cup.rrd")
+    lab.run("view data/r trial-00[013] --save three.rrd")
+    from rerun.chunk import RrdReader
+
+    assert [one.recording_id for one in RrdReader("cup.rrd").recordings()] == ["trial-002"]
+    assert sorted(one.recording_id for one in RrdReader("three.rrd").recordings()) == [
+        "trial-000",
+        "trial-001",
+        "trial-003",
+    ]
+    one = tacpipe.open("data/r")["trial-002"]
+    t_ns, values = timed(read(Path("cup.rrd"))["/touch/xela1"], "Scalars:scalars")
+    assert len(values) == one.table("xela1").num_rows and (np.diff(t_ns) >= 0).all()
+    assert lab.call("view data/r --save cup.rrd").code == 0  # its own file is replaced
+    (lab.folder / "other.rrd").write_text("mine")
+    assert lab.call("view data/r --save other.rrd").code == 2
+    assert lab.call("view data/r nobody --save x.rrd").code == 2
+    assert lab.call("view data/r --where object=nothing --save x.rrd").code == 2
+    kept = [one for one in own_home.rglob("*") if "analytics" in one.name]
+    assert kept == []
+
+
+def test_the_page_of_the_web_viewer_forbids_connections_to_other_computers(tmp_path: Path) -> None:
+    from tacpipe.viewer import web
+
+    files = session.write([contents.of(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
+    with web.served(files, None) as address, urllib.request.urlopen(address, timeout=60) as answer:
+        policy = answer.headers["Content-Security-Policy"]
+        assert b"Rerun" in answer.read()
+    sources = {word for part in policy.split(";") for word in part.split()[1:] if "://" in word}
+    assert sources == {"http://localhost:*", "http://127.0.0.1:*"}
+
+
+def test_the_viewer_s_program_keeps_and_sends_no_statistics(tmp_path: Path, own_home: Path) -> None:
+    (file,) = session.write([contents.of(hand.recording())], tmp_path, "hand")  # type: ignore[arg-type]
+    session.merge([file], tmp_path / "one.rrd")
+
+    assert not [one for one in own_home.rglob("*") if "analytics" in one.name]
+    env = {name: value for name, value in os.environ.items() if name != "CI"}
+    subprocess.run([session.program(), "rrd", "merge", file, "-o", tmp_path / "two.rrd"], env=env, check=True)
+    assert [one for one in own_home.rglob("*") if "analytics" in one.name]  # as it would by itself
