@@ -46,6 +46,7 @@ ZARR = ("export zarr data/synced -o zarr", "ingest zarr zarr --guess")
 EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not without
     "learn": LEARN,
     "clouds": CLOUDS,
+    "dask": (),
     "devices": DEVICES,
     "frames": (),
     "hdf5": HDF5,
