@@ -1,19 +1,26 @@
 """Compute the result pages of a release: `make result-pages DATA=FOLDER`.
 
 Runs DVC's chain of each task on the published recordings in ``DATA``, in ``.cache/result-pages``, and copies the pages to
-``dist/results``. An interrupted run resumes: DVC skips finished stages, and tacpipe what it has computed within one.
+``dist/results``, and writes the tables of ``docs/results`` from the same results. An interrupted run resumes: DVC skips
+finished stages, and tacpipe what it has computed within one.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
+
+if TYPE_CHECKING:
+    from tacpipe.comparison.engine import Comparison
 
 ROOT = Path(__file__).parents[1]
 SETS = {  # of a task: the folders that its set has in DATA
@@ -21,6 +28,43 @@ SETS = {  # of a task: the folders that its set has in DATA
     "material": ("biotac_slide_20_50", "roboskin_slide_20_50"),
     "touch": ("vision2tactile",),
 }
+
+
+HEADS = {  # of a table: what tells its rows apart beside the method, and the value
+    "forward": ("objects", "skill"),
+    "material": ("sensor", "accuracy_percent"),
+    "touch": ("target", "rmse"),
+}
+ROWS = 7  # of a table
+
+
+def table(comparisons: Sequence[Comparison]) -> str:
+    """Return the best methods of the first part of one task and the best baseline, a row each, as CSV."""
+    name = comparisons[0].task
+    first = [one for one in comparisons if one.question.place == 0]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["method", *HEADS[name], "low", "high", first[0].measure.cluster])
+    for one in first:
+        where = one.question.target or one.question.part.removesuffix(" objects")
+        rows = [(row.name, row) for row in one.models[: max(ROWS // len(first) - 1, 1)]]
+        rows += [(f"{row.name} (best baseline)", row) for row in [one.best_baseline] if row]
+        rows.sort(key=lambda pair: pair[1].score.mean, reverse=one.measure.rises)
+        for method, row in rows:
+            score = row.score
+            writer.writerow([method, where, *(f"{value:.3f}" for value in (score.mean, score.low, score.high)), row.n])
+    return text.getvalue()
+
+
+def write_table(task: str, results: Path) -> Path:
+    """Write the table of a task from the results in a folder, and return its path."""
+    import tacpipe
+    from tacpipe.comparison import engine
+
+    opened = [tacpipe.open(path.parent) for path in sorted(results.rglob("metrics.json"))]
+    path = ROOT / "docs" / "results" / f"{task}.csv"
+    path.write_text(table(engine.compare(opened)), encoding="utf-8")
+    return path
 
 
 def published(params: dict[str, Any], data: Path) -> dict[str, Any]:
@@ -82,6 +126,7 @@ def main(data: Path, tasks: list[str]) -> None:
         subprocess.run([dvc, "repro", task], cwd=work, env=environment, check=True)
         shutil.copy(work / "results" / f"{task}.html", out)
         print(out / f"{task}.html")
+        print(write_table(task, work / "results" / task))
 
 
 if __name__ == "__main__":

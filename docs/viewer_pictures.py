@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +57,11 @@ def screen() -> Iterator[None]:
             server.terminate()
 
 
-def picture(file: Path, at_s: float | None, output: Path) -> None:
-    """Have the viewer open a file, set the cursor and take a picture of its window."""
+def picture(files: Sequence[Path], at_s: float | None, output: Path) -> None:
+    """Have the viewer open files, set the cursor and take a picture of its window."""
     from tacpipe.viewer import session
 
-    command = [session.program(), str(file), "--port", str(PORT), "--window-size", SIZE]
+    command = [session.program(), *map(str, files), "--port", str(PORT), "--window-size", SIZE]
     with subprocess.Popen(command, env=session.environment(), stderr=subprocess.DEVNULL) as viewer:
         try:
             client = connected()
@@ -113,8 +113,8 @@ def main() -> None:
         run("show data/slips trial-000 --plot plot.png", folder)
         (IMAGES / "plot.png").write_bytes((folder / "plot.png").read_bytes())
         for name, (command, at_s) in PICTURES.items():
-            run(f"{command} --save {name}.rrd", folder)
-            picture(folder / f"{name}.rrd", at_s, folder / f"{name}.png")
+            run(f"{command} --save {name}", folder)
+            picture(sorted((folder / name).iterdir()), at_s, folder / f"{name}.png")
             (IMAGES / f"{name}.png").write_bytes((folder / f"{name}.png").read_bytes())
             small(IMAGES / f"{name}.png")
         small(IMAGES / "plot.png")

@@ -1,8 +1,9 @@
 """Show results on one self-contained HTML page.
 
-Results of the same task are compared, seeds and folds of a method pooled. Of more than two of the task ``forward``, only
-the best method's and that of the paper are shown in full; with outputs of ``tacpipe compress``, the page shows the loss of
-codecs of other widths. With slides next to results of the task ``material``, it shows their profiles.
+Each task has a section: which method is best and by how much, a chart and a table, then everything else behind headings
+that fold. Results of the same task are compared, seeds and folds of a method pooled. Outputs of ``tacpipe compress`` next to
+results of the task ``forward`` show the loss of codecs; slides next to those of ``material`` and grasps next to those of
+``touch`` are drawn.
 
 Example: tacpipe report results/forward -o report.html
 """
@@ -30,9 +31,9 @@ class Params:
     traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn
 
 
-@stage(version=5)
+@stage(version=6)
 def report(params: Params, results: Datasets) -> Result:
-    """Return one page: headline, figures, tables, and where every number comes from."""
+    """Return one page: the answer, charts, tables, and where every number comes from."""
     from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 

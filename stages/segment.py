@@ -340,9 +340,9 @@ def slides(params: SlideParams, recording: Recording) -> RecordingOutput:
         params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
     )
     rows = slice(first, stop)
-    told = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
-    why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, told)
-    attributes = {**told, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
+    described = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
+    attributes = {**described, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
     attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})
     tables = {"slide": table.slice(first, stop - first).combine_chunks()}
     if profile:
@@ -437,15 +437,15 @@ def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Co
     """Refuse thresholds in a unit that no stream has: they would do nothing."""
     if params.on_level is not None and params.on_level <= 0:
         raise UsageError(f"on_level is {params.on_level:g}; it must be above 0, or every row would be in contact.")
-    told = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
+    described = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
     if set(fixed) == set(units) and (params.on_level, params.off_level) != (None, None):
         raise UsageError(
-            f"on_level and off_level are of streams in other units than counts, and recording {name} has {told}; give "
+            f"on_level and off_level are of streams in other units than counts, and recording {name} has {described}; give "
             f"on_count and off_count, or --thresholds noise."
         )
     if COUNT not in units.values() and (params.on_count, params.off_count) != (Params.on_count, Params.off_count):
         raise UsageError(
-            f"on_count and off_count are of streams in counts, and recording {name} has {told}; give on_level and "
+            f"on_count and off_count are of streams in counts, and recording {name} has {described}; give on_level and "
             f"off_level in that unit, or none: then they follow from the noise at rest."
         )
 
@@ -462,12 +462,12 @@ def _threshold_attributes(
     units: Mapping[str, str], limits: Sequence[Thresholds], fixed: Collection[str]
 ) -> dict[str, Attribute]:
     """Return the attributes that record by which thresholds streams other than the ``fixed`` were segmented."""
-    told: dict[str, Attribute] = {}
+    described: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if stream not in fixed and math.isfinite(on):
             begins = f"{stream}_contact" if stream else "contact"
-            told |= {f"{begins}_on": on, f"{begins}_off": off, f"{begins}_unit": unit}
-    return told
+            described |= {f"{begins}_on": on, f"{begins}_off": off, f"{begins}_unit": unit}
+    return described
 
 
 def _no_contact(

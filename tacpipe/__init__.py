@@ -154,7 +154,7 @@ def load(path: str | PathLike[str]) -> Any:
     ``model.predict(tacpipe.open(PATH))``, or ``predict`` of one recording of it, returns the arrow table that
     ``tacpipe predict`` writes, after the stages that the model was trained behind: those that the recordings have not been
     through yet are run, and answered by the store where they ran before. ``predict`` also reads arrays; how, the class of
-    the model says, which is that of its task. Raises `UsageError` if ``path`` holds no model.
+    the model states, which is that of its task. Raises `UsageError` if ``path`` holds no model.
     """
     from tacpipe.datasets import model_files
     from tacpipe.plugins import extras

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 _WIDE = ("W", "F")  # of East Asian letters, which take two cells
-_SHORT = reprlib.Repr()  # looks no deeper and no further than it tells, so that aliases of aliases cost nothing
+_SHORT = reprlib.Repr()  # looks no deeper and no further than it prints, so that aliases of aliases cost nothing
 _SHORT.maxlevel = 2
 _SHORT.maxstring = _SHORT.maxother = 60
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxset = 4
@@ -22,7 +22,7 @@ def excerpt(value: Any) -> str:
     """
     try:
         return _SHORT.repr(value)
-    except ValueError:  # Python tells no number of more than 4300 digits
+    except ValueError:  # Python prints no number of more than 4300 digits
         return "a number of thousands of digits"
 
 

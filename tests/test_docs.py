@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import io
 import os
 import re
 import shlex
@@ -307,6 +309,19 @@ def test_the_params_of_the_result_pages_are_of_published_recordings(tmp_path: Pa
     assert found["touch"]["objects"] == [0, 1]
     assert found["touch"]["quick"]["methods"]["pointnet"]["wrist"] == "estimated"
     assert given["forward"]["recordings"].startswith("simulate")
+
+
+def test_the_tables_of_results_are_made_from_results() -> None:
+    from tacpipe.comparison import engine
+    from tests.report.touch.touch_fakes import result
+
+    made = module("result_pages").table(engine.compare([result(), result("trees", off=0.02)]))
+    rows = list(csv.DictReader(io.StringIO(made)))
+    assert list(rows[0]) == ["method", "target", "rmse", "low", "high", "grasps"]
+    assert [(row["method"], row["rmse"]) for row in rows[:2]] == [
+        ("trees on geometry and colour", "0.020"), ("constant (best baseline)", "0.100")
+    ]  # fmt: skip
+    assert len(rows) == 8
 
 
 def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> None:

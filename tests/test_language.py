@@ -6,7 +6,9 @@ CONTRIBUTING.md has the glossary. A true exception stands in `EXCEPTIONS`, with 
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -40,6 +42,14 @@ NAMES = re.compile(
 PACKAGES = (  # whose names follow the table of words
     *("cli", "formats", "links", "maintenance", "recording", "report", "sensors", "signals", "simulation", "store"),
 )
+
+EXPLAINED = (  # whose docstrings and comments do too
+    *("stages", "tacpipe/channels", "tacpipe/clouds", "tacpipe/codecs", "tacpipe/datasets", "tacpipe/engine"),
+    *("tacpipe/exports", "tacpipe/formats/arrays", "tacpipe/formats/bags", "tacpipe/formats/lerobot", "tacpipe/links"),
+    *("tacpipe/models", "tacpipe/plugins", "tacpipe/recording", "tacpipe/sensors", "tacpipe/signals"),
+    *("tacpipe/simulation", "tacpipe/tasks/forward", "tacpipe/tasks/material", "tacpipe/testing"),
+)
+BE_NO = re.compile(r"\w+ no", re.IGNORECASE)  # is checked where users read it
 
 
 def found(text: str) -> list[str]:
@@ -151,6 +161,28 @@ def helpers(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("test_"):
             yield node.name
+
+
+@pytest.mark.parametrize("package", EXPLAINED)
+def test_no_docstring_or_comment_has_a_word_that_is_not_used(package: str) -> None:
+    wrong = {
+        f"{path.relative_to(ROOT)}: {word[0]}"
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for text in explanations(path.read_text(encoding="utf-8"))
+        for word in WORDS.finditer(re.sub(r"`[^`\n]*`|^ *>>>.*\n.*$", "", text, flags=re.MULTILINE))
+        if not BE_NO.fullmatch(word[0])
+        and word[0] not in ("ends within", "say")  # "say" for example; a file ends within
+    }
+    assert sorted(wrong) == []
+
+
+def explanations(source: str) -> Iterator[str]:
+    """Yield the docstrings and the comments of a module."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    yield from (token.string for token in tokens if token.type == tokenize.COMMENT)
 
 
 def test_help_of_a_command_that_a_test_runs_is_the_page_s(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,6 +54,14 @@ def test_an_older_dataset_is_opened_with_the_label_that_was_set_by_hand(older: P
     assert found.recordings["trial-001"].attributes["object"] == "cup"
 
 
+def test_an_older_model_and_an_older_result_are_shown(older: Path, call: Callable[[str], Ran]) -> None:
+    model, result = (call(f"show {place} --json") for place in ("models/forward", "results/forward"))
+    assert (model.code, result.code) == (0, 0), model.err + result.err
+    assert json.loads(model.out)["architecture"] == json.loads(result.out)["architecture"] == "gru"
+    assert json.loads(result.out)["params"]["hidden"] == 4
+    assert "gru · PCA-2" in call("show results/forward").out
+
+
 def test_an_older_model_predicts_what_it_predicted_then(older: Path) -> None:
     found = tacpipe.load("models/forward").predict(tacpipe.open("data/latents"), steps=[1])
     then = tacpipe.open("data/predicted").table()

@@ -137,10 +137,12 @@ def test_quiet_hides_the_headline_and_json_carries_it(lab: Path) -> None:
 
 def test_a_page_says_of_a_result_what_the_terminal_says(lab: Path) -> None:
     import tacpipe as library
-    from tacpipe.report.forward import section
+    from tacpipe.comparison import engine
 
     opened = library.open(lab / "results/forward")
-    (page,) = section.headlines(opened)
+    (compared,) = engine.compare([opened])
+    page = compared.headline
+    assert page is not None
     (printed,) = headline.read(opened.files[headline.FILE])
     assert headline_table.text([page]) == headline_table.text([printed])  # sums are kept to nine digits
     assert page.gain == pytest.approx(printed.gain) and page.verdict == printed.verdict

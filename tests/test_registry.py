@@ -71,15 +71,16 @@ def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
     (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
     (tmp_path / "own/own.egg-info/entry_points.txt").write_text("[tacpipe.reports]\nweighing = own_report\n")
     (tmp_path / "own/own_report.py").write_text(
-        'TITLE = "weights of objects"\n\n\ndef reads(dataset):\n    return False\n\n\n'
-        'def report(results, others, traces):\n    return f"<p>{len(results)} scales</p>"\n'
+        "from tacpipe.report.blocks import Fold, Note\n\nTITLE = 'weights of objects'\n\n\n"
+        "def read(results):\n    return []\n\n\n"
+        "def folds(context):\n    return [Fold('Scales', [Note(f'{len(context.bare)} scales')])]\n"
     )
     monkeypatch.syspath_prepend(tmp_path / "own")
     forget()
     files = {"metrics.json": b"{}", "config.json": json.dumps({"task": "weighing"}).encode()}
     result: Any = FakeDataset({}, files, {})
     text = page.render([result, result]).decode()
-    assert "<h1>Weights of objects</h1>" in text and "<p>2 scales</p>" in text
+    assert "Weights of objects" in text and "2 scales" in text
     assert registry.load_report("unheard-of") is None
 
 

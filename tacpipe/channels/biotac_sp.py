@@ -1,6 +1,6 @@
 """The BioTac SP: where its electrodes lie, what a reading of two of them holds, and the ranges touch is scaled by.
 
-A grasp is felt by the thumb (``th``) and the middle finger (``mf``). Of each finger the pressure of the fluid (``pdc``)
+A grasp is measured by the thumb (``th``) and the middle finger (``mf``). Of each finger the pressure of the fluid (``pdc``)
 and 24 impedances (``e``) are predicted: four targets, 50 values.
 """
 
@@ -69,7 +69,7 @@ def columns(target: str) -> list[str]:
 
 
 def value_columns(target: str) -> list[str]:
-    """Return the columns that hold a target where values are told by target: in predictions, and the truth beside them.
+    """Return the columns that hold a target where values are listed by target: in predictions, and the truth beside them.
 
     >>> value_columns("pdc_th"), value_columns("e_mf")[:2]
     (['pdc_th'], ['e_mf_01', 'e_mf_02'])
@@ -79,13 +79,13 @@ def value_columns(target: str) -> list[str]:
 
 
 def normalised(target: str, counts: Floats) -> Floats:
-    """Return counts of a target as shares of its range (`RANGES`): 0 at its low end, 1 at its high one."""
+    """Return counts of a target as fractions of its range (`RANGES`): 0 at its low end, 1 at its high one."""
     low, high = RANGES[target]
     return (np.asarray(counts, np.float64) - low) / (high - low)
 
 
 def counts(target: str, shares: Floats) -> Floats:
-    """Return device counts of shares of a target's range: what `normalised` undoes."""
+    """Return device counts of fractions of a target's range: what `normalised` undoes."""
     low, high = RANGES[target]
     return np.asarray(shares, np.float64) * (high - low) + low
 

@@ -14,8 +14,8 @@ _NAMED = re.compile(r"(.*)([xyzw])((?:[_ .\[(][^xyzw]*)?)", re.IGNORECASE)
 def component(field: pa.Field) -> str:
     """Return the component that a column holds: of its metadata ``component`` or ``axis``, else of its name; else ''."""
     metadata = field.metadata or {}
-    said = metadata.get(b"component", b"") or metadata.get(b"axis", b"")
-    return said.decode().lower() if said else of_name(field.name)[0]
+    declared = metadata.get(b"component", b"") or metadata.get(b"axis", b"")
+    return declared.decode().lower() if declared else of_name(field.name)[0]
 
 
 def of_name(name: str) -> tuple[str, str]:
@@ -30,8 +30,8 @@ def of_name(name: str) -> tuple[str, str]:
 
 def shared_name(field: pa.Field) -> str:
     """Return what the names of the components of one vector have in common; '' of a column that shows no component."""
-    said, name = (field.metadata or {}).get(b"component", b"").decode(), str(field.name)
-    if said and name.endswith(said):
-        return name.removesuffix(said)
+    declared, name = (field.metadata or {}).get(b"component", b"").decode(), str(field.name)
+    if declared and name.endswith(declared):
+        return name.removesuffix(declared)
     part, shared = of_name(name)
-    return shared if part or said else ""
+    return shared if part or declared else ""

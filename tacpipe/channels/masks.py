@@ -21,7 +21,7 @@ _UNIFORM = 1.5
 
 
 def gaps(table: pa.Table) -> Bools:
-    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` says so."""
+    """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` marks it."""
     gap = np.zeros(table.num_rows, dtype=bool)
     for name in table.column_names:
         if name.endswith(GAP):

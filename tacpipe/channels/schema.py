@@ -25,7 +25,7 @@ COMPONENTS = ("x", "y", "z", "w")
 
 
 def time_field(made: str | None = None) -> pa.Field:
-    """Return the field ``t_ns``, int64 nanoseconds; ``made`` says how stamps came about that no clock gave."""
+    """Return the field ``t_ns``, int64 nanoseconds; ``made`` states how stamps came about that no clock gave."""
     import pyarrow as pa
 
     metadata = {"unit": "ns", "quantity": "time", **({"made": made} if made else {})}

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.io.tables import Group, Row, Table
 from tacpipe.metrics import headline
+from tacpipe.store.store import locate
 
 if TYPE_CHECKING:
     from tacpipe.comparison.engine import Comparison
@@ -33,6 +34,7 @@ class Compared:
     results: Mapping[str, Dataset]
     comparisons: Sequence[Comparison]
     pooled: bool
+    places: Mapping[str, str] = field(default_factory=dict)  # where datasets lie, by the digests of their manifests
 
     def paths(self, row: engine.Row) -> list[str]:
         """Return where the results of a row lie."""
@@ -49,10 +51,15 @@ class Compared:
         every = list(rows)
         names = dict.fromkeys(name for row in every for name in row.differing)
         found = {name: [_text(row.differing.get(name, "")) for row in every] for name in names}
-        found["data"] = [_listed(_data(run.dataset) for run in row.method.runs) for row in every]
+        found["data"] = [_listed(self._data(run.dataset) for run in row.method.runs) for row in every]
         if not self.pooled:
             found["result"] = [_below(self.paths(row)[0], list(self.results)) for row in every]
         return {name: cells for name, cells in found.items() if len(set(cells)) > 1}
+
+    def _data(self, result: Dataset) -> str:
+        """Return where the datasets lie that a result was evaluated on; the start of the digest of one that is gone."""
+        given = result.source.inputs.get("datasets", ())
+        return " ".join(self.places.get(one["manifest"], one["dataset"][:8]) for one in given)
 
     def to_json(self) -> dict[str, Any]:
         """Return everything, what is not defined as null."""
@@ -172,7 +179,7 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     for path, one in results.items():
         if METRICS not in one.files:
             raise UsageError(f"{path} was made by {one.source.stage}; give results of `tacpipe evaluate`.")
-    found = Compared(results, engine.compare(list(results.values()), pool=pool), pool)
+    found = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places())
     if not found.comparisons:
         raise UsageError(
             "None of these results holds the errors of single recordings. Run `tacpipe evaluate` again, or give "
@@ -207,9 +214,11 @@ def _style(row: engine.Row) -> str:
     return "green" if row.gain.low > 0 else "red" if row.gain.high < 0 else ""
 
 
-def _data(result: Dataset) -> str:
-    """Return the digests of the datasets that a result was evaluated on, each cut."""
-    return " ".join(one["dataset"][:8] for one in result.source.inputs.get("datasets", ()))
+def _places() -> dict[str, str]:
+    """Return where the store's datasets lie, as seen from the working directory, by the digests of their manifests."""
+    paths = {str(root["manifest"]): Path(root["path"]) for root in locate().roots.all()}
+    here = Path.cwd()
+    return {name: str(path.relative_to(here) if path.is_relative_to(here) else path) for name, path in paths.items()}
 
 
 def _below(path: str, paths: Sequence[str]) -> str:

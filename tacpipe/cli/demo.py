@@ -10,7 +10,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal, termination
 from tacpipe.plugins import extras
 
-LEARNING = ("matplotlib", "safetensors", "scipy", "sklearn", "torch")
+LEARNING = ("jinja2", "matplotlib", "safetensors", "scipy", "sklearn", "torch", "vl_convert")
 LINKS = ("serial", "websockets")
 
 

@@ -65,7 +65,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
-    paths = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend", "init")}
+    paths: dict[str, Any] = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend", "init")}
     request = Request(
         name,
         params,

@@ -51,7 +51,8 @@ def view(
         bool, typer.Option("--all-rows", help="All rows of streams over 30,000 rows, not their envelope; slower.")
     ] = False,
     save: Annotated[
-        Path | None, typer.Option("--save", help="Write a file (.rrd) for the viewer instead of opening it.")
+        Path | None,
+        typer.Option("--save", help="Write a file (.rrd) for the viewer instead, or a folder with one a recording."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Open in the browser instead, until Ctrl-C.")] = False,
     port: Annotated[int | None, typer.Option("--port", help="Port of --web; 9090 or a free one by default.")] = None,
@@ -61,6 +62,10 @@ def view(
     extras.require("tacpipe view", "rerun", "rerun_cli")
     chosen = _chosen(dataset, recording or [], where or [], split, role, fold)
     shown = list(chosen)[:limit]
+    if save is not None and len(shown) > 1 and save.suffix.lower() == ENDING:
+        raise UsageError(
+            f"{save} is one file, for one recording, and {len(shown)} are chosen; name one, or a folder for a file each."
+        )
     if len(shown) < len(chosen):
         terminal.note(f"{len(shown)} of {len(chosen)} recordings; --limit {len(chosen)} shows all.")
     with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.named("tacpipe view"):
@@ -69,7 +74,7 @@ def view(
         drawn = _drawn(shown, _predictions(predictions))
         files = session.write(drawn, Path(folder), str(dataset), several=len(shown) > 1, all_rows=all_rows)
         if save is not None:
-            session.merge(files, save)
+            _save(files, save)
             terminal.result(save)
         elif web:
             _in_browser(files, port)
@@ -85,10 +90,10 @@ def _require(save: Path | None, *, web: bool, port: int | None) -> None:
         raise UsageError("--save and --web contradict each other; give one.")
     if port is not None and not web:
         raise UsageError(f"--port {port} is the port of --web; give --web too.")
-    if save is not None:
-        if save.suffix.lower() != ENDING:
-            raise UsageError(f"{save} must end in {ENDING}, by which Rerun's viewer knows its files.")
+    if save is not None and save.suffix.lower() == ENDING:
         replacing.refuse_foreign(save, MAGIC)
+    elif save is not None and (save.suffix or save.is_file()):
+        raise UsageError(f"{save} must end in {ENDING}, by which Rerun's viewer knows its files, or be a folder.")
 
 
 def conditions(where: Sequence[str]) -> dict[str, Attribute]:
@@ -160,6 +165,20 @@ def predicted(predictions: Dataset, name: str) -> tuple[Any, dict[str, Any] | No
             if rows:
                 return None, {key: value for key, value in rows[0].items() if key != "recording"}
     return None, None
+
+
+def _save(files: Sequence[Path], save: Path) -> None:
+    """Write the only file to ``save``, or files into the folder ``save``; files of other programs are left alone."""
+    from tacpipe.datasets import replacing
+    from tacpipe.io.files import readable_errors, write_whole
+
+    places = [save] if save.suffix.lower() == ENDING else [save / file.name for file in files]
+    for place in places:
+        replacing.refuse_foreign(place, MAGIC)
+    with readable_errors(save.parent):
+        for file, place in zip(files, places, strict=True):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(str(place), file.read_bytes(), f"{place}.draft")
 
 
 def _in_window(files: Sequence[Path]) -> None:

@@ -19,7 +19,7 @@ LARGEST_M = 10.0  # of what a hand's camera sees; a cloud in millimetres is a th
 
 
 def read(path: Path | str) -> Cloud:
-    """Return the cloud of a file, in metres, with colours where it has any; its ending tells the format.
+    """Return the cloud of a file, in metres, with colours where it has any; its ending states the format.
 
     Raises `TacpipeError`, naming the file, where it is missing, no cloud, empty or cut off, where points are not finite, and
     where the cloud is so large that its unit must be another one.
@@ -54,7 +54,7 @@ def _pcd(path: Path) -> Cloud:
     header = pcd.read_header(path, content)
     if header.data != "binary_compressed":
         return pcd.read(path)
-    pcd.require_compressed(path, content, header)  # open3d takes the memory that the file claims
+    pcd.require_compressed(path, content, header)  # open3d takes the memory that the file declares
     return _by_open3d(path, header.points)
 
 
@@ -75,32 +75,33 @@ def _text(path: Path) -> Cloud:
 
 
 def _told(path: Path) -> int:
-    """Return how many points a file of text tells of: its first line, or its lines."""
+    """Return how many points a file of text declares: its first line, or its lines."""
     lines = path.read_bytes().splitlines()
     filled = [line.split() for line in lines if line.strip() and not line.startswith(b"#")]
     if path.suffix.lower() != ".pts":
         return len(filled)
     if not filled or len(filled[0]) != 1 or not filled[0][0].isdigit() or len(filled[0][0]) > DIGITS:
         raise TacpipeError(f"{path} is not a PTS file: its first line must be the number of points alone.")
-    told = int(filled[0][0])
-    if _rows(path) < told:  # open3d takes memory for as many as are told
+    declared = int(filled[0][0])
+    if _rows(path) < declared:  # open3d takes memory for as many as are declared
         raise TacpipeError(
-            f"{path} declares {told} points, and {_rows(path)} can be read: it was cut off. Copy it again from its source."
+            f"{path} declares {declared} points, and {_rows(path)} can be read: it was cut off. Copy it again from its "
+            f"source."
         )
-    return told
+    return declared
 
 
-def _by_open3d(path: Path, told: int) -> Cloud:
-    """Return the cloud that open3d reads, if it is what the file tells."""
+def _by_open3d(path: Path, declared: int) -> Cloud:
+    """Return the cloud that open3d reads, if it is what the file declares."""
     with open3d() as library:
         found = library.io.read_point_cloud(str(path), format=path.suffix.lower()[1:])
         with np.errstate(over="ignore"):  # what no float32 holds is not finite then
             points = np.asarray(found.points).astype(np.float32)  # (point, xyz)
         colours = np.asarray(found.colors)  # (point, rgb) from 0 to 1
     held = _rows(path) if path.suffix.lower() == ".pts" else len(points)
-    if min(held, len(points)) != told or not told:
+    if min(held, len(points)) != declared or not declared:
         raise TacpipeError(
-            f"{path} declares {told} points, and {min(held, len(points))} can be read: it was cut off, or some are not "
+            f"{path} declares {declared} points, and {min(held, len(points))} can be read: it was cut off, or some are not "
             f"numbers. Copy it again from its source."
         )
     _require_finite(path, points)

@@ -1,6 +1,6 @@
 """Clouds of points as PCD files, the format of the Point Cloud Library, version 0.7, read strictly.
 
-A header of lines tells the fields of a point; behind its last line, ``DATA``, the points follow as lines of numbers or as
+A header of lines names the fields of a point; behind its last line, ``DATA``, the points follow as lines of numbers or as
 they lay in memory. Colour is one of the fields, ``rgb``: the bytes of 0x00RRGGBB, most often declared a float. Source: "The
 PCD (Point Cloud Data) file format", documentation of the Point Cloud Library.
 """
@@ -28,12 +28,12 @@ COLOURS = ("rgb", "rgba")  # either name may be declared; of the second the alph
 LONGEST_HEADER = 65_536  # bytes; a file without the line DATA in so many is none
 DIGITS = 18  # of a number in a header
 LARGEST_POINT = 65_536  # bytes, fields that are skipped included
-LZF_MOST = 88  # by which compression makes points smaller at most: three bytes stand for 264
+LZF_MOST = 88  # by which compression makes points smaller at most: three bytes unpack to 264
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of its points."""
+    """What a file declares about its points."""
 
     point: np.dtype[np.void]  # the fields of a point, packed
     points: int
@@ -50,7 +50,7 @@ def read(path: Path) -> Cloud:
     """Return the cloud of a PCD file, its points in the unit of the file, metres by convention; further fields are skipped.
 
     Raises `TacpipeError`, naming the file, where it is no PCD 0.7, has no x, y and z of floats or no points, is shorter
-    than its header says or longer by more than padding, is compressed, or holds points that are not finite.
+    than its header states or longer by more than padding, is compressed, or holds points that are not finite.
     """
     xyz, colours = parsed(path, regular.source(path))
     finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
@@ -86,7 +86,7 @@ def parsed(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
 def read_header(path: Path, content: bytes | None = None) -> Header:
     """Return the header of a PCD file, ``content`` being the file's if it was read already.
 
-    Raises `TacpipeError`, naming the file and what its header lacks or says wrong.
+    Raises `TacpipeError`, naming the file and what its header lacks or states wrongly.
     """
     lines, length = _header_lines(path, regular.source(path) if content is None else content)
     missing = [keyword for keyword in ("VERSION", "FIELDS", "SIZE", "TYPE", "POINTS") if keyword not in lines]
@@ -113,16 +113,16 @@ def read_header(path: Path, content: bytes | None = None) -> Header:
 
 
 def require_compressed(path: Path, content: bytes, header: Header) -> None:
-    """Raise `TacpipeError` where compressed points are not as many as their header says, or more than they can be.
+    """Raise `TacpipeError` where compressed points are not as many as their header states, or more than they can be.
 
-    In front of them stand their size and that of the points they stand for, four bytes each.
+    In front of them stand their size and that of the points once unpacked, four bytes each.
     """
     needed, there = header.points * header.point.itemsize, len(content) - header.length - 8
-    size, told = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
-    if there < size or told != needed or needed > size * LZF_MOST:
+    size, declared = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
+    if there < size or declared != needed or needed > size * LZF_MOST:
         raise TacpipeError(
             f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(there, 0)} bytes "
-            f"follow that declare {size}, and {told} once unpacked: it was cut off or its header is wrong. Copy the "
+            f"follow that declare {size}, and {declared} once unpacked: it was cut off or its header is wrong. Copy the "
             "file again."
         )
 
@@ -170,7 +170,7 @@ def _whole(path: Path, keyword: str, words: list[str]) -> int:
 
 
 def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
-    """Return the fields of a point. Raises `TacpipeError` where they are not told, or position and colour are no such."""
+    """Return the fields of a point. Raises `TacpipeError` where they are not named, or position and colour are no such."""
     names = lines["FIELDS"]
     counts = lines.get("COUNT", ["1"] * len(names))
     for keyword, words in (("SIZE", lines["SIZE"]), ("TYPE", lines["TYPE"]), ("COUNT", counts)):
@@ -185,8 +185,8 @@ def _point(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
         letter, sizes = KINDS.get(kind, ("", ()))
         width, many = _whole(path, "SIZE", [size]), _whole(path, "COUNT", [count])
         if width not in sizes:
-            told = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
-            raise TacpipeError(f"{path} has {told}; there is no such number.")
+            declared = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
+            raise TacpipeError(f"{path} has {declared}; there is no such number.")
         wrong_place = name in POSITION and (letter != "f" or many != 1)
         if wrong_place or (name in COLOURS and (width != 4 or many != 1)):
             right = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"

@@ -94,9 +94,9 @@ def _header(path: Path, content: bytes) -> _Header:
     first = elements[place][0] if elements else []
     before = [_size(element, form) for element in elements[:place]]
     if form not in ORDERS or first[1:2] != ["vertex"] or len(first) != 3 or not _is_count(first[2]) or None in before:
-        told = elements[0][0][1:] if elements else []
+        declared = elements[0][0][1:] if elements else []
         raise TacpipeError(
-            f"{path} has the format {excerpt(form)} and the first element {excerpt(' '.join(told))}; a cloud is of "
+            f"{path} has the format {excerpt(form)} and the first element {excerpt(' '.join(declared))}; a cloud is of "
             f"the format {', '.join(ORDERS)}, and its vertices come first."
         )
     rows = [row for row in elements[place] if row[:1] == ["property"]]
@@ -106,15 +106,15 @@ def _header(path: Path, content: bytes) -> _Header:
 
 def _size(element: list[list[str]], form: str) -> int | None:
     """Return how many bytes an element has, or lines where it is text; None where the header does not give it (lists)."""
-    (_, *told), *rows = element
+    (_, *declared), *rows = element
     kinds = [words[1:] for words in rows if words[:1] == ["property"]]
-    if len(told) != 2 or not _is_count(told[1]):
+    if len(declared) != 2 or not _is_count(declared[1]):
         return None
     if form == "ascii":
-        return int(told[1])
+        return int(declared[1])
     if not all(len(kind) == 2 and kind[0] in LETTERS for kind in kinds):
         return None
-    return int(told[1]) * sum(int(LETTERS[kind[0]][1]) for kind in kinds)
+    return int(declared[1]) * sum(int(LETTERS[kind[0]][1]) for kind in kinds)
 
 
 def _vertex(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.void]:

@@ -116,13 +116,13 @@ def fit(
     codec = Autoencoder(
         rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
     )
-    told = [
+    described = [
         _told(network, one) | {"kept": at == best} for at, (network, one) in enumerate(zip(tried, found, strict=True))
     ]
     measured = {
         "reconstruction": measures.reconstructions(codec, train, val),
         "latent_covariance": measures.covariance(codec, train),
-        "search": told,
+        "search": described,
     }
     return replace(codec, measured=measured)
 

@@ -169,11 +169,11 @@ def fit_and_measure(
     train, val = rows.parts
     kept = len(codec.components)
     if len(val) and len(train) > kept:
-        judged = fit(train, rows.channels, rows.layout, components=kept, representation=representation)
+        evaluated = fit(train, rows.channels, rows.layout, components=kept, representation=representation)
     else:
-        judged, train, val = codec, everything, everything[:0]
+        evaluated, train, val = codec, everything, everything[:0]
     measured = {
-        "reconstruction": measures.reconstructions(judged, train, val),
+        "reconstruction": measures.reconstructions(evaluated, train, val),
         "latent_covariance": measures.covariance(codec, everything),
     }
     return replace(codec, measured=measured)

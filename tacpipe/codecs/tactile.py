@@ -31,8 +31,8 @@ def columns(schema: pa.Schema, quantity: str) -> tuple[str, ...]:
 
 def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
     """Return stream, taxel and axis of each channel, as far as its metadata names them."""
-    told = [metadata(schema.field(name)) for name in channels]
-    return [{key: one[key] for key in LAYOUT if key in one} for one in told]
+    described = [metadata(schema.field(name)) for name in channels]
+    return [{key: one[key] for key in LAYOUT if key in one} for one in described]
 
 
 def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tacpipe.comparison.runs import MODEL, Method, Question, Run, Settings, grouped, separate
 from tacpipe.comparison.specification import Kind, Task, by_task
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
     """How one predictor does on one question."""
 
@@ -50,7 +50,7 @@ class Row:
         return self.method.differing if self.predictor == MODEL else {}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Comparison:
     """All predictors on one question, by kind, those of a kind the best first."""
 
@@ -137,9 +137,9 @@ def comparisons(task: Task, methods: Sequence[Method]) -> list[Comparison]:
 
 
 def questions_of(runs: Sequence[Run]) -> list[Question]:
-    """Return the questions that any run was evaluated on, as most runs order them."""
+    """Return the questions that any run was evaluated on by their places, those of one place as most runs order them."""
     most = sorted(runs, key=lambda run: -len(run.questions))
-    return list(dict.fromkeys(question for run in most for question in run.questions))
+    return sorted(dict.fromkeys(question for run in most for question in run.questions), key=lambda one: one.place)
 
 
 def compare_on(task: Task, methods: Sequence[Method], question: Question) -> Comparison:
@@ -224,7 +224,7 @@ def _row(
 ) -> Row:
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [one for one in method.of(question) if one.questions[question].sums.get(predictor)]
-    each = [_score(measure, list(one.questions[question].sums[predictor].values())) for one in runs]
+    each = [measure.score_of(one.questions[question].sums[predictor].values()) for one in runs]
     baseline, gain, p, n = "", Estimate(math.nan, math.nan, math.nan), math.nan, _counted(sums, clusters)
     if task.kind(predictor) in ("model", "variant"):
         baselines = _baselines(task, method, source, question)
@@ -268,9 +268,3 @@ def _clusters(method: Method, question: Question) -> dict[str, str] | None:
 
 def _counted(sums: Sums, clusters: dict[str, str] | None) -> int:
     return len({clusters[name] if clusters else name for _, name in sums})
-
-
-def _score(measure: Measure, parts: Sequence[Any]) -> float:
-    import numpy as np
-
-    return float(measure.score(measure.error(np.sum(parts, axis=0)[None]))[0])

@@ -9,11 +9,12 @@ Tree = Mapping[str, Any]
 
 
 def distinct_names(
-    named: Sequence[tuple[str, Tree]], usual: Collection[tuple[str, Any]] = ()
+    named: Sequence[tuple[str, Tree]], usual: Collection[str | tuple[str, Any]] = ()
 ) -> list[tuple[str, tuple[str, ...]]]:
     """Return a name for each method, given a first name and all its settings, and the settings that were added to it.
 
-    Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``.
+    Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``:
+    names, or names with values.
 
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', ('deep',)), ('net · no deep', ('no deep',)), ('tree', ())]
@@ -26,7 +27,10 @@ def distinct_names(
         marks = tuple(
             f"{name} {value}" if not isinstance(value, bool) else name if value else f"no {name}"
             for name, value in sorted(settings.items())
-            if (name, value) not in usual and any(other.get(name) != value for other in alike[first]) and value != ""
+            if name not in usual
+            and (name, value) not in usual
+            and any(other.get(name) != value for other in alike[first])
+            and value != ""
         )
         found.append((" · ".join([first, *marks]), marks))
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.comparison.naming import distinct_names
@@ -24,6 +24,7 @@ class Question:
 
     part: str = ""
     target: str = ""
+    place: int = 0  # among the questions of a task: 0 is the main one
 
     @property
     def where(self) -> str:
@@ -40,7 +41,7 @@ class Errors:
     clusters: Mapping[str, str] | None = None  # by recording, what it is resampled with; None: itself
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """One result: a model trained once and evaluated once."""
 
@@ -55,10 +56,10 @@ class Run:
     simulated: bool = False
     control: bool = False  # whether it was trained to show what an effect is worth, as with a wrong plan or fewer data
     published: bool = False  # whether it was evaluated on the recordings of the task's paper alone
-    details: Any = field(default=None, compare=False)  # whatever the task's own sections read
+    details: Any = None  # whatever the task's own sections read
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Method:
     """Runs that differ in seed or fold alone."""
 
@@ -91,11 +92,11 @@ class Method:
         return list(dict.fromkeys(name for run in self.of(question) for name in run.questions[question].sums))
 
 
-def grouped(runs: Sequence[Run], usual: Collection[tuple[str, Any]] = ()) -> list[Method]:
+def grouped(runs: Sequence[Run], usual: Collection[str | tuple[str, Any]] = ()) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
     Runs of one task whose method and settings are alike are one method. Names state the settings in which methods of the
-    same first name differ, but for empty ones and those in ``usual``.
+    same first name differ, but for empty ones and those in ``usual``: names, or names with values.
     """
     found: dict[str, list[Run]] = {}
     for run in runs:
@@ -109,7 +110,7 @@ def grouped(runs: Sequence[Run], usual: Collection[tuple[str, Any]] = ()) -> lis
         differing = {
             key: value
             for key, value in first.settings.items()
-            if (key, value) not in usual and any(other.get(key) != value for other in alike)
+            if key not in usual and (key, value) not in usual and any(other.get(key) != value for other in alike)
         }
         made.append(Method(name, first.family or first.method, first.settings, differing, tuple(same)))
     return sorted(made, key=lambda one: one.name)
@@ -121,8 +122,8 @@ def separate(runs: Sequence[Run]) -> list[Method]:
     for method in grouped(runs):
         for run in method.runs:
             about = {name: getattr(run, name) for name in ("seed", "fold") if getattr(run, name) is not None}
-            told = [f"{name} {value}" for name, value in about.items()] if len(method.runs) > 1 else []
-            name = " · ".join([method.name, *told])
+            marks = [f"{name} {value}" for name, value in about.items()] if len(method.runs) > 1 else []
+            name = " · ".join([method.name, *marks])
             found.append(Method(name, method.family, run.settings, {**method.differing, **about}, (run,)))
     order = {id(run): place for place, run in enumerate(runs)}
     return sorted(found, key=lambda one: order[id(one.runs[0])])

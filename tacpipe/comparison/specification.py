@@ -21,10 +21,10 @@ CONFIG = "config.json"
 
 
 class Specification(Protocol):
-    """How results of one task are read. Names in capitals are of modules; all but `read` may be left out."""
+    """How results of one task are read, compared and reported. All but `read` may be left out."""
 
     TITLE: str  # what the task predicts, in a few words
-    USUAL: Sequence[tuple[str, Any]]  # settings that no name states
+    USUAL: Sequence[str | tuple[str, Any]]  # settings that no name states, or these values of them
 
     def read(self, results: Sequence[Dataset]) -> list[Run]:
         """Return the runs of results that can be compared, in their order; others are left out."""
@@ -39,6 +39,30 @@ class Specification(Protocol):
 
     def called(self, predictor: str) -> str:
         """Return what tables call a predictor; without this, its name with spaces."""
+        ...
+
+    def reads(self, dataset: Dataset) -> bool:
+        """Return whether the page can use a dataset that is not a result; without this, none."""
+        ...
+
+    def columns(self, context: Any, comparison: Any) -> Any:
+        """Return more columns of the table of all methods: pairs of a head and a function of a row to a `Cell`."""
+        ...
+
+    def sentence(self, context: Any) -> tuple[str, str]:
+        """Return the sentence that the section opens with, and its verdict."""
+        ...
+
+    def folds(self, context: Any) -> Any:
+        """Return what the section of the task holds beyond the comparison, `tacpipe.report.blocks.Fold` each."""
+        ...
+
+    def caveats(self, context: Any) -> Sequence[str]:
+        """Return what must be known about the numbers."""
+        ...
+
+    def about_run(self, run: Run) -> Any:
+        """Return more columns of the table of runs, by their heads."""
         ...
 
 
@@ -71,7 +95,7 @@ class Task:
         return predictor.replace("_", " ") if found is None else str(found(predictor))
 
     @property
-    def usual(self) -> Sequence[tuple[str, Any]]:
+    def usual(self) -> Sequence[str | tuple[str, Any]]:
         """The settings that no name states."""
         return tuple(getattr(self.module, "USUAL", ()))
 

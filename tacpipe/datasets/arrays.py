@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import torch
 
 TIME = "t_ns"
-CLOCKS = (TIME, "t_device_ns", "seq", "device_seq")  # clocks and counters, where no metadata says what a column is
+CLOCKS = (TIME, "t_device_ns", "seq", "device_seq")  # clocks and counters, where no metadata states what a column is
 NOT_CHANNELS = ("time", "sequence", "mask", "label", "status", "text")  # quantities of columns that no sensor measured
 EXACT = 1 << 53  # up to here a float64 holds every whole number
 

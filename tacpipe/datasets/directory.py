@@ -136,7 +136,7 @@ def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what the file system says of an output into a sentence."""
+    """Turn what the file system reports about an output into a sentence."""
     try:
         yield
     except OSError as error:

@@ -54,9 +54,9 @@ def validated(what: str) -> Iterator[None]:
     except TacpipeError:
         raise
     except (*_MISFITS, RecursionError) as error:
-        told = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        described = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise TacpipeError(
-            f"The files of {what} do not fit one another ({plain(told, 200)}). Copy them again from whoever made them, "
+            f"The files of {what} do not fit one another ({plain(described, 200)}). Copy them again from whoever made them, "
             f"or train one."
         ) from error
 
@@ -107,8 +107,8 @@ def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, An
 
     with _readable(name, SafetensorError):
         found: dict[str, AnyArray] = load(content)
-        told = {key: value for key, value in found.items() if but is None or not key.endswith(but)}
-        _require_finite(name, {key: bool(np.isfinite(value).all()) for key, value in told.items()})
+        described = {key: value for key, value in found.items() if but is None or not key.endswith(but)}
+        _require_finite(name, {key: bool(np.isfinite(value).all()) for key, value in described.items()})
     return found
 
 
@@ -164,9 +164,11 @@ def _require(name: str, path: str, value: Any, kind: Kind) -> None:
     kinds = kind if isinstance(kind, tuple) else (kind,)
     right = any(_is(value, one) for one in kinds)
     if not right:
-        told = "is missing" if value is None else f"is {excerpt(value)}"
+        described = "is missing" if value is None else f"is {excerpt(value)}"
         wanted = " or ".join(_KINDS[one] for one in kinds if one is not NONE)
-        raise TacpipeError(f"{name}: {path} {told}; it must be {wanted}. Copy the model again from whoever made it.")
+        raise TacpipeError(
+            f"{name}: {path} {described}; it must be {wanted}. Copy the model again from whoever made it."
+        )
     if isinstance(value, int) and not 0 <= value <= MOST:
         raise TacpipeError(f"{name}: {path} is {excerpt(value)}; it must be from 0 to {MOST}.")
 

@@ -51,7 +51,7 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     blocked        in the order of names, which is that of time for most sets: train, then val, then test;
                    with ``reverse`` test, then val, then train
     leave-one-out  in fold k the recordings of the k-th value of ``by`` are tested
-    authors        what the attribute ``authors_role`` says; with no val among them, ``val`` of train is drawn.
+    authors        what the attribute ``authors_role`` states; with no val among them, ``val`` of train is drawn.
                    Where some have ``authors_fold``, a fold a block: see below
     ============== =====================================================================================
 

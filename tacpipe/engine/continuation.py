@@ -8,6 +8,7 @@ from pathlib import Path
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import execution
 from tacpipe.engine.by_recording import ByRecording
+from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request
 from tacpipe.io.hashing import bytes_digest
@@ -26,7 +27,8 @@ def continued(recordings: Dataset, model: Dataset) -> Dataset:
     given = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
     beside = (str(recordings.path), str(model.path))
     store = locate(recordings.path)
-    mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()))
-    with store.at_work([bytes_digest(source.content), bytes_digest(model.source.content)]):
+    manifests = [bytes_digest(source.content), bytes_digest(model.source.content)]
+    with Chosen("", 0) as chosen, store.at_work(manifests):
+        mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()), chosen)
         made = mapping.replay(given, model.source, beside, str(recordings.path))
     return Dataset(made, execution.reader(store, beside))

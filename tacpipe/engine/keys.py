@@ -20,7 +20,7 @@ def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) ->
 
 
 def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
-    """Return what a key says of a recording: digests of its streams, and the attributes in ``reads`` (None: all)."""
+    """Return what a key holds of a recording: digests of its streams, and the attributes in ``reads`` (None: all)."""
     attributes = entry["attributes"]
     if reads is not None and reads != ALL:
         attributes = {name: attributes[name] for name in reads if name in attributes}
@@ -31,7 +31,7 @@ def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
 
 
 def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, Entry]) -> dict[str, Any]:
-    """Return what a whole-dataset key says of the ``chosen`` recordings: names, attributes, digests, chain, files."""
+    """Return what a whole-dataset key holds of the ``chosen`` recordings: names, attributes, digests, chain, files."""
     return {
         "lineage": {
             "stage": manifest.stage,

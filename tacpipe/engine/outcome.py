@@ -12,7 +12,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed
 
 _NAMED = 5  # recordings that a note names
-_FROM_RECORDS = ("said", "code", "unlike")  # fields that `describe_results` puts into words
+_FROM_RECORDS = ("stated", "code", "unlike")  # fields that `describe_results` puts into words
 
 
 @dataclass
@@ -28,7 +28,7 @@ class Outcome:
     bad: dict[str, str] = field(default_factory=dict)
     differs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    said: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
+    stated: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
     unlike: list[str] = field(default_factory=list)  # in what the computers of results that differ are not the same
 
@@ -41,7 +41,7 @@ class Outcome:
         """Add what the record of one result holds besides it: notes, and the code that it was computed by."""
         made = record["provenance"]
         for note in made.get("notes") or ():
-            self.said.setdefault(note, []).append(recording)
+            self.stated.setdefault(note, []).append(recording)
         if made.get("code"):
             counts = self.code.setdefault(stage, {})
             counts[made["code"]] = counts.get(made["code"], 0) + 1
@@ -55,11 +55,11 @@ class Outcome:
 
     def of_results(self) -> dict[str, Any]:
         """Return what `add_record` added, as the record of a whole run keeps it."""
-        return {"code": self.code, "notes": self.said}
+        return {"code": self.code, "notes": self.stated}
 
     def restore(self, kept: Mapping[str, Any]) -> None:
         """Take over what `of_results` returned; nothing of an older record, which has none."""
-        self.code, self.said = kept.get("code") or {}, kept.get("notes") or {}
+        self.code, self.stated = kept.get("code") or {}, kept.get("notes") or {}
 
     def describe_differences(self) -> str:
         """Return what differs from what is stored, and whether another computer's rounding may be why."""
@@ -70,7 +70,7 @@ class Outcome:
         """Return the notes of stages, and how many results were computed by other code than their stage has now."""
         count = self.ran + self.reused
         found = []
-        for text, names in self.said.items():
+        for text, names in self.stated.items():
             some = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
             some = f"all {count} recordings" if len(names) == count else some
             found.append(f"{some}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)

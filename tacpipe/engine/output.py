@@ -156,7 +156,7 @@ class _Directory(_Place):
     def _occupant(self) -> Manifest | None:
         """Return the manifest that is there; None also where both it and its root are damaged.
 
-        Recordings are not written there then, as `settled` says; what is computed from others is computed again.
+        Recordings are not written there then, as `settled` states; what is computed from others is computed again.
         """
         try:
             return replacing.occupant(self.store, self.request.output)

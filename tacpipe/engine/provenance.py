@@ -62,7 +62,7 @@ def worker(name: str) -> Iterator[None]:
 
 
 def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return in what two computers differ that changes how numbers round; nothing where ``stored`` does not say.
+    """Return in what two computers differ that changes how numbers round; nothing where ``stored`` does not state it.
 
     >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
     ['threads: 1, now 2']

@@ -18,11 +18,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.masks import GRID
-from tacpipe.channels.streams import TRUTH
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
+from tacpipe.exports import lerobot_statistics as statistics
 from tacpipe.exports.contents import TIME
 from tacpipe.exports.files import Content, Files
+from tacpipe.exports.lerobot_features import ACTION, ORIGINALS, Feature, features
 from tacpipe.plugins.constraints import Names, Rate
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 from tacpipe.printable import listed, plain
@@ -30,18 +31,12 @@ from tacpipe.printable import listed, plain
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Floats
     from tacpipe.datasets.dataset import Dataset, Recording
 
     Parts = Dataset
 
 VERSION = "v3.0"
-ORIGINALS = "tacpipe"
 RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the second is JSON
-ACTION = "action"
-STATS = "stats"  # table of a part
-QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
 CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # of LeRobot's own writer
 _PLACE = re.compile(r"\{([^{}]+)\}")
 _NUMPY = {"float": "float32", "double": "float64", "halffloat": "float16"}  # of arrow, where numpy's name differs
@@ -76,28 +71,6 @@ class Params:
     originals: bool = True  # put the shards as they were given under tacpipe/
 
 
-@dataclass(frozen=True)
-class Feature:
-    """One feature of a frame: its values (time,) or (time, channel), and the channels' names, units and quantities."""
-
-    name: str
-    values: AnyArray
-    names: Sequence[str]
-    columns: Sequence[str]  # of the synchronized table
-    units: Sequence[str] = ()
-    quantities: Sequence[str] = ()
-
-    @property
-    def dtype(self) -> str:
-        """The type, as info.json names it."""
-        return "string" if self.values.dtype.kind in "OUT" else str(self.values.dtype)
-
-    @property
-    def shape(self) -> list[int]:
-        """The shape of one frame."""
-        return list(self.values.shape[1:]) or [1]
-
-
 def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
@@ -121,12 +94,14 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     losses = list(_losses(params, table, str(recording.attributes[GRID])))
     params = params if not params.actions or _has(table, params.actions) else replace(params, actions="")
     rows = [
-        (one.name == ACTION, column, *values) for one in features(params, table) for column, values in _statistics(one)
+        (one.name == ACTION, column, *values)
+        for one in features(params, table)
+        for column, values in statistics.by_column(one)
     ]
     columns = list(zip(*rows, strict=True))
-    names = [ACTION, "column", *STATISTICS]
+    names = [ACTION, "column", *statistics.STATISTICS]
     made = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
-    return RecordingOutput({**contents.part(recording, losses), STATS: made})
+    return RecordingOutput({**contents.part(recording, losses), statistics.TABLE: made})
 
 
 @stage(version=1, part=part, first=first, originals=shards)
@@ -166,61 +141,12 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     )
     files["meta/tasks.parquet"] = _task_table(tasks)
     files["meta/info.json"] = _json(_info(params, made, lengths, tasks, fps))
-    files["meta/stats.json"] = _json(_all_stats(parts, made, starts, lengths, tasks, fps))
+    order = _task_order(tasks)
+    indices = {name: order[task] for name, task in tasks.items()}
+    files["meta/stats.json"] = _json(statistics.of_all(parts, made, starts, lengths, indices, fps))
     files["meta/tacpipe.json"] = _json(_about(made, found))
     files[readme.NAME] = readme.text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, found)
     return Result(files=Files(files), notes=readme.notes(recordings, found))
-
-
-def features(params: Params, table: pa.Table) -> list[Feature]:
-    """Return the features of a synchronized table, in a fixed order."""
-    import numpy as np
-
-    from tacpipe.exports import frames
-
-    every = frames.channels(table)
-    state = frames.state_of(every, [one.strip() for one in params.state.split(",") if one.strip()])
-    taxels = [one for one in every if one.signal and one.quantity == frames.TACTILE]
-    state = [one for one in state if one not in taxels]
-
-    def vector(name: str, chosen: Sequence[frames.Channel], values: AnyArray | None = None) -> Feature:
-        values = frames.matrix(table, chosen, np.dtype(np.float32)) if values is None else values
-        several = {one.stream for one in chosen}
-        names = [one.short if len(several) == 1 else one.name for one in chosen]
-        flat = values[:, 0] if values.shape[1] == 1 else values
-        return Feature(
-            name,
-            flat,
-            names,
-            [one.name for one in chosen],
-            [one.unit for one in chosen],
-            [one.quantity for one in chosen],
-        )
-
-    found: list[Feature] = []
-    whole = [*state, *taxels] if params.tactile_in_state else state
-    found += [vector("observation.state", whole)] if whole else []
-    if params.actions:
-        found.append(vector(ACTION, *frames.action_of(table, every, params.actions)))
-    rest = [one for one in every if one.signal and one not in state]
-    for stream in dict.fromkeys(one.stream for one in rest):
-        touch = [one for one in rest if one.stream == stream and one in taxels]
-        other = [one for one in rest if one.stream == stream and one not in taxels]
-        found += [vector(f"observation.tactile.{stream}", touch)] if touch else []
-        found += [vector(f"observation.{stream}", other)] if other else []
-    latents = [one for one in every if one.quantity == "latent"]
-    found += [vector("observation.latents", latents)] if latents else []
-    truth = [one for one in every if one.name.startswith(TRUTH) and one.type in ("float", "double")]
-    found += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
-    found.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
-    taken = {one.name for one in (*state, *rest, *latents, *truth)}
-    for one in every:
-        if one.name not in taken:
-            name = f"{one.short}.{one.stream}" if one.stream else one.short
-            values = table.column(one.name).to_numpy()
-            name = f"{ORIGINALS}.{name.replace('/', '_')}"
-            found.append(Feature(name, values, [one.name], [one.name], [one.unit], [one.quantity]))
-    return found
 
 
 def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[str]:
@@ -242,27 +168,6 @@ def _has(table: pa.Table, stream: str) -> bool:
     from tacpipe.exports import frames
 
     return any(one.stream == stream for one in frames.channels(table))
-
-
-def _statistics(one: Feature) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield each column of a feature with its statistics; none of text, and NaN where nothing was measured."""
-    import numpy as np
-
-    if one.dtype == "string":
-        return
-    values = one.values.reshape(len(one.values), -1).astype(np.float64)
-    for channel, column in enumerate(one.columns):
-        yield column, _numbers(values[:, channel])
-
-
-def _numbers(values: Floats) -> tuple[float, ...]:
-    import numpy as np
-
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return (0.0,) * len(STATISTICS)
-    ends = (float(finite.min()), float(finite.max()), float(finite.mean()), float(finite.std()))
-    return (*ends, *(float(one) for one in np.quantile(finite, list(QUANTILES.values()))))
 
 
 def _rows(parts: Dataset, name: str) -> int:
@@ -399,79 +304,13 @@ def _episodes(
             RECORDING: one.name,
             ATTRIBUTES: json.dumps(dict(originals[one.name].attributes), sort_keys=True),
         }
-        stats = _episode_stats(made, parts[one.name], lengths[one.name])
-        stats |= _index_stats(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
+        stats = statistics.of_episode(made, parts[one.name], lengths[one.name])
+        stats |= statistics.of_index(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
         row |= {f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()}
         rows.append(row)
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
     return bytes(sink.getvalue().to_pybytes())
-
-
-Stats = dict[str, dict[str, list[Any]]]  # feature to statistic to a value a channel
-
-
-def _episode_stats(made: Sequence[Feature], part: Recording, rows: int) -> Stats:
-    known = {(row[ACTION], row["column"]): row for row in part.table(STATS).to_pylist()}
-    found: Stats = {}
-    for one in made:
-        if one.dtype != "string":
-            mine = [known[one.name == ACTION, column] for column in one.columns]
-            found[one.name] = {**{name: [row[name] for row in mine] for name in STATISTICS}, "count": [rows]}
-    return found
-
-
-def _index_stats(rows: int, episode: int, start: int, task: int, fps: float) -> Stats:
-    import numpy as np
-
-    frame = np.arange(rows, dtype=np.float64)
-    columns = {
-        "timestamp": frame / fps,
-        "frame_index": frame,
-        "episode_index": np.full(rows, float(episode)),
-        "index": frame + start,
-        "task_index": np.full(rows, float(task)),
-    }
-    return {
-        name: {**{key: [value] for key, value in zip(STATISTICS, _numbers(values), strict=True)}, "count": [rows]}
-        for name, values in columns.items()
-    }
-
-
-def _all_stats(
-    parts: Dataset,
-    made: Sequence[Feature],
-    starts: Mapping[str, int],
-    lengths: Mapping[str, int],
-    tasks: Mapping[str, str],
-    fps: float,
-) -> Stats:
-    """Return the statistics over all episodes, put together as LeRobot does: of quantiles the mean over frames."""
-    import numpy as np
-
-    order = _task_order(tasks)
-    every = [
-        {
-            **_episode_stats(made, parts[name], rows),
-            **_index_stats(rows, episode, starts[name], order[tasks[name]], fps),
-        }
-        for episode, (name, rows) in enumerate(lengths.items())
-    ]
-    weights = np.array(list(lengths.values()), float)[:, None] / sum(lengths.values())
-    found: Stats = {}
-    for feature in every[0]:
-        stacked = {name: np.array([one[feature][name] for one in every]) for name in STATISTICS}  # (episode, channel)
-        mean = (weights * stacked["mean"]).sum(0)
-        spread = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(0)
-        found[feature] = {
-            "min": stacked["min"].min(0).tolist(),
-            "max": stacked["max"].max(0).tolist(),
-            "mean": mean.tolist(),
-            "std": np.sqrt(spread).tolist(),
-            "count": [sum(lengths.values())],
-            **{name: (weights * stacked[name]).sum(0).tolist() for name in QUANTILES},
-        }
-    return found
 
 
 def _info(

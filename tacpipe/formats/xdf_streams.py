@@ -265,7 +265,7 @@ def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | s
         if not len(measured) and back_ns.max() > clocks.STEP_NS and rows > len(t_ns) // 2:
             row = int(back_ns.argmax())
             return (
-                f"its clock went back by {back_ns[row] / 1e9:.6g} s at sample {row + 1}, and no clock offset says by how "
+                f"its clock went back by {back_ns[row] / 1e9:.6g} s at sample {row + 1}, and no clock offset states by how "
                 "much it was set"
             )
         described.append(

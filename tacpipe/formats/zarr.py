@@ -20,7 +20,7 @@ COMMAND = contained.Command("zarr")
 
 @dataclass(frozen=True)
 class Params(contained.Params):
-    """What the stores do not say of themselves."""
+    """What the stores do not declare."""
 
     fill_missing_chunks: bool = False  # read chunks that are not there as fill values, which zarr 3 does not write
 

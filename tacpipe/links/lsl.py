@@ -1,7 +1,7 @@
 """Streams of Lab Streaming Layer (LSL): what an outlet sends, a packet of samples an entry, as `tacpipe.sensors.lsl` reads.
 
 Samples are given out as they come, with the stamps of the sender's clock; LSL moves none of them. What its own measurement
-says of that clock stands beside them in each packet. An outlet that ends loses the link, which is then opened anew, as a
+reports about that clock comes with them in each packet. An outlet that ends loses the link, which is then opened anew, as a
 cable would be.
 """
 

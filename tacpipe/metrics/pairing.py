@@ -7,18 +7,19 @@ the same ones (paired cluster bootstrap, `tacpipe.metrics.forecast`), and the se
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.metrics import forecast
+from tacpipe.metrics.forecast import Interval
 from tacpipe.metrics.headline import Headline, Row
 
 Sums = Mapping[tuple[Hashable, str], AnyFloats]  # by seed and recording, (part,): what adds up over recordings
 ENUMERATED, SWAPS = 12, 9_999  # clusters that are exchanged in all ways; random ways of more
-_draws = functools.lru_cache(maxsize=8)(forecast.draws)
+_draws = functools.lru_cache(maxsize=16)(forecast.draws)
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class Measure:
     score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # what charts draw, from errors (draw,) to (draw,)
     scored: str = "error"  # what ``score`` is, with its unit
     rises: bool = False  # whether a higher score is better
+
+    def score_of(self, parts: Iterable[AnyFloats]) -> float:
+        """Return the score of sums that are added up, each (part,)."""
+        return float(self.score(self.error(np.sum(list(parts), axis=0)[None]))[0])
 
 
 @dataclass(frozen=True)
@@ -201,15 +206,39 @@ def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tup
     return found, list(places)
 
 
+def intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:
+    """Return several values of one predictor's sums and their 95 % intervals, from sums (draw, part) to (draw, value)."""
+    own, _ = _beside(sums, sums, None)
+    width = own.shape[2] // 2
+    return _intervals(own[:, :, :width], statistic)
+
+
+def paired_intervals(first: Sums, second: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval | None:
+    """Return by how much several values of one predictor exceed those of another on the recordings of both.
+
+    Each resample draws the same recordings for both. None where they share none.
+    """
+    pairs, names = _beside(first, second, None)
+    width = pairs.shape[2] // 2
+    if not names:
+        return None
+    return _intervals(pairs, lambda drawn: statistic(drawn[:, :width]) - statistic(drawn[:, width:]))
+
+
 def _interval(sums: AnyFloats, statistic: Callable[[AnyFloats], AnyFloats]) -> tuple[float, float, float]:
     """Return a statistic of sums (seed, cluster, part) and its 95 % interval; NaN bounds with fewer than two clusters."""
-    mean = float(statistic(sums.sum(axis=(0, 1))[None])[0])
+    found = _intervals(sums, lambda drawn: statistic(drawn)[:, None])
+    return float(found.mean[0]), float(found.low[0]), float(found.high[0])
+
+
+def _intervals(sums: AnyFloats, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:
+    """Return values of sums (seed, cluster, part) and their intervals, each (value,)."""
+    mean = statistic(sums.sum(axis=(0, 1))[None])[0]
     seeds, clusters, _ = sums.shape
     if clusters < 2:
-        return mean, float("nan"), float("nan")
+        return Interval(mean, np.full(len(mean), np.nan), np.full(len(mean), np.nan))
     weights = _draws(clusters).astype(np.float64)  # (draw, cluster)
     by_seed = np.stack([weights @ one for one in sums])  # (seed, draw, part)
-    drawn = forecast.draws(seeds, seed=1).astype(np.float64)  # (draw, seed); of a single seed, that one
+    drawn = _draws(seeds, seed=1).astype(np.float64)  # (draw, seed); of a single seed, that one
     totals = np.einsum("ds,sdp->dp", drawn, by_seed)
-    low, high = forecast.bounds(statistic(totals)[:, None])
-    return mean, float(low[0]), float(high[0])
+    return Interval(mean, *forecast.bounds(statistic(totals)))

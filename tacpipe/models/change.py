@@ -21,7 +21,7 @@ CLIPPED = 8.0  # standard deviations to which inputs are clipped: a jump of a se
 class ChangeForecast(nn.Module):
     """What all of them share: scales fitted on training windows, the loss, and the step from change to touch.
 
-    ``increments`` says that features are changes from row to row already; then the change itself is predicted.
+    ``increments`` means that features are changes from row to row already; then the change itself is predicted.
     """
 
     change_only = True
@@ -77,7 +77,7 @@ class ChangeForecast(nn.Module):
 class SequenceForecast(ChangeForecast):
     """A recurrent or convolutional network over past and plan.
 
-    ``gru`` and ``lstm``: one reads the past, another goes on over the plan from its state. ``tcn``: causal dilated
+    ``gru`` and ``lstm``: one reads the past, another continues over the plan from its state. ``tcn``: causal dilated
     convolutions over both (Bai, Kolter and Koltun, 2018), touch being zero where it is to come. Each step's prediction
     rests on the plan up to that step.
     """

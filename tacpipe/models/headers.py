@@ -126,10 +126,10 @@ def chosen(given: str, sensors: Mapping[str, int]) -> dict[str, str]:
     >>> chosen("biotac=mlp", {"biotac": 19, "roboskin": 60})
     {'biotac': 'mlp', 'roboskin': 'cnn'}
     """
-    said = dict(part.strip().partition("=")[::2] for part in given.split(",") if part.strip())
-    unknown = sorted(set(said) - set(sensors))
+    stated = dict(part.strip().partition("=")[::2] for part in given.split(",") if part.strip())
+    unknown = sorted(set(stated) - set(sensors))
     if unknown:
         raise TacpipeError(f"headers names the sensor {unknown[0]}; the recordings have {', '.join(sensors)}.")
     return {
-        name: said.get(name, "cnn" if channels == GRID[0] * GRID[1] else "none") for name, channels in sensors.items()
+        name: stated.get(name, "cnn" if channels == GRID[0] * GRID[1] else "none") for name, channels in sensors.items()
     }

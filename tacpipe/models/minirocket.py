@@ -3,7 +3,7 @@
 Dempster, Schmidt and Webb, MiniRocket: A Very Fast (Almost) Deterministic Transform for Time Series Classification, 2021
 (arXiv 2012.08791), section 3, in its form for several channels. A pattern is one of 84 kernels of nine weights, three of
 them 2 and six -1, stretched by a dilation and laid over the sum of a few channels drawn at random. A feature is the
-share of positions at which the kernel's answer exceeds a bias, and biases are quantiles of the answers to training
+fraction of positions at which the kernel's answer exceeds a bias, and biases are quantiles of the answers to training
 slides. Every other kernel looks only where it fits into the slide; the rest see zeros beyond its ends.
 
 Nothing is learned but the biases, so few slides suffice; what the features mean is left to a linear readout.

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 EPSILON = 1e-5  # added to a variance, as in torch
-MOMENTUM = 0.1  # share of a batch in the running mean and variance, as in torch
+MOMENTUM = 0.1  # weight of a batch in the running mean and variance, as in torch
 
 
 class NormalisedLinear(nn.Module):

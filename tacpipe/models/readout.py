@@ -43,7 +43,7 @@ class Readout:
     def fit(cls, features: AnyFloats, labels: Ints, shares: AnyFloats | None = None) -> Readout:
         """Return the readout of training slides (slide, feature) and their classes (slide,).
 
-        ``shares`` (feature,) says how much each feature counts beside the others once they are standardised; all alike
+        ``shares`` (feature,) states how much each feature counts beside the others once they are standardised; all alike
         without it, and 0 is as good as no feature. Raises `TacpipeError` where arrays do not fit one another, a value
         is not finite, or there are fewer than two classes.
         """

@@ -32,7 +32,7 @@ class TaxelwiseForecast(ChangeForecast):
     told_scale: Tensor
 
     def __init__(self, layout: Sequence[Mapping[str, str]], *, hidden: int, **shared: Any) -> None:
-        """Make a model of random weights for channels that lie as ``layout`` says, taxel by taxel."""
+        """Make a model of random weights for channels that lie as ``layout`` states, taxel by taxel."""
         super().__init__(len(layout), **shared)
         self.sensors, self.taxels, self.axes = grid(layout)
         self.lags = [lag for lag in LAGS if lag < self.context]
@@ -71,7 +71,7 @@ class TaxelwiseForecast(ChangeForecast):
             getattr(self, f"{name}_scale").copy_(spread(flat) + 1e-3)
 
     def forward(self, windows: Windows) -> Tensor:
-        """Return the touch to come (horizon, window, channel), in counts above rest."""
+        """Return the future touch (horizon, window, channel), in counts above rest."""
         own, whole_inputs = (
             ((values - getattr(self, f"{name}_mean")) / getattr(self, f"{name}_scale")).clamp(-CLIPPED, CLIPPED)
             for name, values in zip(("own", "told"), self._read(windows), strict=True)

@@ -26,6 +26,7 @@ PACKAGES = {  # modules whose package has another name
     "mpl_toolkits": "matplotlib",
     "serial": "pyserial",
     "sklearn": "scikit-learn",
+    "vl_convert": "vl-convert-python",
 }
 REQUIREMENT = re.compile(r"""\s*([\w.-]+)[^;]*;.*\bextra\s*==\s*["']([\w.-]+)["']""")
 TOGETHER = "all"  # the extra that brings all others: a user wants the one that is missing

@@ -129,10 +129,9 @@ def load_task(name: str) -> Any:
 
 
 def load_report(task: str) -> Any:
-    """Return the module that reports the results of a task, None where the task brings none.
+    """Return the module that states how results of a task are compared and reported, None where the task brings none.
 
-    It has ``TITLE``, what the task predicts in a few words; ``report(results, others, traces)``, which returns a part of a
-    page as HTML; and ``reads(dataset)``, whether that part can use a dataset that is not a result.
+    `tacpipe.comparison.specification.Specification` lists what it may hold.
     """
     target = entry_points()[REPORTS].get(task)
     return None if target is None else _import(task, target)

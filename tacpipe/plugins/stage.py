@@ -1,7 +1,7 @@
 """What a stage is: a typed function whose signature is its declaration.
 
-The first parameter is ``params``, a frozen dataclass or a union of several (`tacpipe.plugins.params`). Each further one says
-by its annotation what the stage reads:
+The first parameter is ``params``, a frozen dataclass or a union of several (`tacpipe.plugins.params`). Each further one
+states by its annotation what the stage reads:
 
 =================  ==================================================================================================
 ``Recording``      one recording at a time; the stage is run, keyed and stored for each recording alone

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from html import escape
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+from tacpipe.comparison.specification import Task, by_task
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins import registry
-from tacpipe.report import contents, markup, plain
+from tacpipe.report import html
+from tacpipe.report.blocks import listed
+from tacpipe.report.sections import section
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -27,44 +28,21 @@ def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> byt
 
 
 def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
-    results: dict[str, list[Dataset]] = {}
-    others = []
-    for one in given:
-        if "metrics.json" in one.files:
-            results.setdefault(_task(one), []).append(one)
-        else:
-            others.append(one)
-    loaded = {name: registry.load_report(name) for name in results}
-    packages: dict[str, Any] = {name: package for name, package in loaded.items() if package is not None}
-    if not results or not all(_users(one, packages) for one in others):
+    results = [one for one in given if "metrics.json" in one.files]
+    others = [one for one in given if "metrics.json" not in one.files]
+    tasks = {name: Task(name) for name in by_task(results)}
+    if not results or not all(_users(one, tasks) for one in others):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
-    title = title or _title(results, packages)
-    parts = []
-    for name, found in results.items():
-        if name in packages:
-            besides = [one for one in others if name in _users(one, packages)]
-            parts.append(packages[name].report(found, besides, traces))
-        else:
-            parts += [plain.render(one, number, len(found)) for number, one in enumerate(found, 1)]
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{markup.STYLE}</style></head>\n'
-        f"<body><h1>{escape(title)}</h1>\n{''.join(parts)}</body></html>\n"
-    ).encode()
+    sections = []
+    for name, found in by_task(results).items():
+        beside = [one for one in others if name in _users(one, tasks)]
+        sections.append(section(tasks[name], found, beside, traces))
+    titles = [one.title for one in sections]
+    return html.page(
+        sections, title or listed([*titles[:1], *(one[:1].lower() + one[1:] for one in titles[1:])]), title
+    )
 
 
-def _title(tasks: Iterable[str], packages: dict[str, Any]) -> str:
-    """Return what the tasks on a page are about."""
-    titles = [str(packages[name].TITLE) if name in packages else name.replace("_", " ") for name in tasks]
-    title = markup.listed([one for one in titles if one]) or "results"
-    return f"{title[0].upper()}{title[1:]}"
-
-
-def _task(result: Dataset) -> str:
-    """Return the task of a result, empty where it does not state."""
-    return str(contents.tree(result, "config.json").get("task", ""))
-
-
-def _users(dataset: Dataset, packages: dict[str, Any]) -> list[str]:
-    """Return the tasks whose part of the page can use a dataset that is not a result."""
-    return [name for name, package in packages.items() if package.reads(dataset)]
+def _users(dataset: Dataset, tasks: Mapping[str, Task]) -> list[str]:
+    """Return the tasks whose section can use a dataset that is not a result."""
+    return [name for name, task in tasks.items() if getattr(task.module, "reads", lambda _: False)(dataset)]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets.origin import PUBLISHED
 from tacpipe.plugins import params as params_of
-from tacpipe.report import markup
+from tacpipe.report.blocks import Block, table
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -37,7 +36,7 @@ def _params(step: Tree) -> dict[str, Any]:
     return params_of.named(str(step.get("stage")), step.get("params") or {})
 
 
-def section(manifest: Tree) -> str:
+def parts(manifest: Tree) -> list[Block]:
     """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
     steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
     rows = []
@@ -45,10 +44,12 @@ def section(manifest: Tree) -> str:
         params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in _params(step).items())
         fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
         rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
-    table = markup.table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows)
     named = [("this result", str(manifest.get("digest", "")))]
     for argument, inputs in manifest.get("inputs", {}).items():
         several = inputs if isinstance(inputs, list) else [inputs]
         named += [(argument, one["dataset"] if isinstance(one, dict) else str(one)) for one in several]
-    items = "".join(f"<li>{escape(name)}: <code>{escape(digest)}</code></li>" for name, digest in named if digest)
-    return f'<h3>Where it comes from</h3><div class="words">{table}</div><ul>{items}</ul>'
+    digests = [[name, digest] for name, digest in named if digest]
+    return [
+        table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows, words=True),
+        table("Digests of datasets", ["", "digest"], digests, words=True),
+    ]

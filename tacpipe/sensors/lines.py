@@ -62,7 +62,7 @@ class Lines(Sensor):
     columns: tuple[Column, ...]  # of a line, in their order
     separator: str = ","  # between them, one character, which may have spaces around it; a space: spaces or tabs
     decimal: Literal[".", ","] = "."  # mark of a float's decimals
-    missing: tuple[str, ...] = ()  # what stands for a value that is missing: "nan", "" for nothing; it becomes NaN
+    missing: tuple[str, ...] = ()  # text of a value that is missing: "nan", "" for nothing; it becomes NaN
     prefix: str = ""  # text that each line begins with: "$SKIN,"
     suffix: str = ""  # text that each line ends with, before the sum: "," where one follows the last number too
     comments: tuple[str, ...] = ()  # what lines begin with that hold no sample: "#"

@@ -15,8 +15,8 @@ from tacpipe.arrays import AnyArray
 def scramble(slides: AnyArray) -> AnyArray:
     """Return ``slides`` (…, triangle, taxel, time) in the published arrangement, of the same shape.
 
-    >>> felt = np.array([[[0, 1, 2, 3]], [[10, 11, 12, 13]]])  # (triangle, taxel, time)
-    >>> scramble(felt).tolist()
+    >>> measured = np.array([[[0, 1, 2, 3]], [[10, 11, 12, 13]]])  # (triangle, taxel, time)
+    >>> scramble(measured).tolist()
     [[[0, 10, 1, 11]], [[2, 12, 3, 13]]]
     """
     triangles, taxels, frames = slides.shape[-3:]

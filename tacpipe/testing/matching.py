@@ -1,4 +1,4 @@
-"""Samples of a recording held against those that a ledger says were sent: all that each says, and where they stand."""
+"""Samples of a recording compared with those that a ledger lists as sent: all their values, and where they stand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def recorded_columns(table: pa.Table) -> list[AnyArray]:
 
 
 def keys(columns: Sequence[AnyArray]) -> list[bytes]:
-    """Return all that each sample says as bytes (sample,); of texts their hash, good within one process."""
+    """Return all values of each sample as bytes (sample,); of texts their hash, good within one process."""
     texts = [column for column in columns if column.dtype.kind == "O"]
     parts = [column for column in columns if column.dtype.kind != "O"]
     parts += [np.array([hash(str(cell)) for cell in column.tolist()]) for column in texts]
@@ -45,7 +45,7 @@ def keys(columns: Sequence[AnyArray]) -> list[bytes]:
 def start_of(table: pa.Table, samples: Samples) -> int | None:
     """Return the row of ``samples`` from which on they are those of a recorded stream, one by one; None if nowhere.
 
-    The stream must be one of a sensor that counts: its first count tells where to look.
+    The stream must be one of a sensor that counts: its first count shows where to look.
     """
     assert samples.seq is not None
     recorded, sent = recorded_columns(table), sent_columns(samples)

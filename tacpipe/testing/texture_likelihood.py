@@ -1,13 +1,13 @@
-"""Which material a simulated slide is of, told by who knows the spectra: a yardstick for classifiers that have to learn.
+"""Which material a simulated slide is of, classified with known spectra: a yardstick for classifiers that have to learn.
 
 Known are the spectra of all materials, where the sensor was on its way, how sensitive each channel is and how hard it was
-pressed; not known are phases, backgrounds, wear, the session's gain and offsets, and noise. All channels feel one
+pressed; not known are phases, backgrounds, wear, the session's gain and offsets, and noise. All channels measure one
 surface, each displaced by where it lies, so they are put together again as a track: at each place the mean of what all
-channels felt there, weighted by the squares of their gains. The track's periodogram P is compared with the one expected
+channels measured there, weighted by the squares of their gains. The track's periodogram P is compared with the one expected
 of each material, E, by Whittle's likelihood (P. Whittle, Arkiv för Matematik 2, 1953): minus the sum of log E + P / E
 over wave numbers. Of a few gains common to all channels the best counts.
 
-Levels are taken off: only texture tells. The likelihood is meant for Gaussian surfaces; a grating of random phase is none,
+Levels are taken off: only texture counts. The likelihood is meant for Gaussian surfaces; a grating of random phase is none,
 so this is close to the best classifier of texture, but no strict bound; and one that also reads the offsets of a session
 can beat it.
 """
@@ -26,23 +26,23 @@ FRAMES = 400  # from the middle of a BioTac's slide, as classifiers are given th
 STEP_M = 0.0005  # of a track
 SHORTEST_M = {"biotac": 0.002, "roboskin": 0.0035}  # wavelength that is compared; shorter ones do not pass the aperture
 LONGEST_M = 0.020  # longer ones went with the levels
-LEAST = 0.02  # of the largest weight of a place of a track; what was felt less does not count
+LEAST = 0.02  # of the largest weight of a place of a track; what was measured less does not count
 GAINS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
-MISFIT = 0.003  # share of a texture's power at other wave numbers than expected, of stretch, wear and levels
+MISFIT = 0.003  # fraction of a texture's power at other wave numbers than expected, of stretch, wear and levels
 FINE = 16  # wave numbers at which a taper's spectrum is known, between two of the periodogram
 
 
 @dataclass(frozen=True)
 class Track:
-    """What was felt along the way; arrays are (place,)."""
+    """What was measured along the way; arrays are (place,)."""
 
     texture_n: Floats
     noise_n2: Floats  # variance
-    taper: Floats  # its squares add up to one; 0 where nothing was felt
+    taper: Floats  # its squares add up to one; 0 where nothing was measured
 
 
 def likelihood_accuracy(seed: int, indices: Sequence[int], rig: slide.Rig) -> float:
-    """Return the share of trials ``indices`` of the rig whose material is told rightly."""
+    """Return the fraction of trials ``indices`` of the rig whose material is classified correctly."""
     wanted = [slide.place(index, rig).material for index in indices]
     return float(np.mean(likelihood_materials(seed, indices, rig) == np.array(wanted)))
 
@@ -74,7 +74,7 @@ def log_likelihoods(seed: int, index: int, rig: slide.Rig) -> Floats:
 
 
 def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
-    """Return the track of trial ``index``: what each channel felt, less its mean, put together where it was felt."""
+    """Return the track of trial ``index``: what each channel measured, less its mean, put together where it was measured."""
     scene = slide.perform(seed, index, rig)
     sensor = scene.place.sensor
     table = slide.simulate_trial(seed, index, replace(rig, pac=False, arm_every=0)).streams[sensor]
@@ -89,7 +89,7 @@ def felt_track(seed: int, index: int, rig: slide.Rig) -> Track:
         weight, noise, rounding = gain**2, fingertip.NOISE_COUNT, 1 / 12
     else:
         weight, noise, rounding = gain**2 * (counts > 0), forearm.NOISE_COUNT, 0.0
-        counts += forearm.DEAD_COUNT  # which the sensor takes off what it feels
+        counts += forearm.DEAD_COUNT  # which the sensor takes off what it measures
     texture_n = counts / gain - pressed_n
     texture_n -= (weight * texture_n).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
     at_m = scene.position_m[rows, None] + along_m

@@ -1,4 +1,4 @@
-"""Recordings written for Rerun's viewer as one file, and the viewer opened on it."""
+"""Recordings written for Rerun's viewer, a file each, and the viewer opened on them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from tacpipe.errors import TacpipeError
 from tacpipe.viewer.contents import Contents
 
 NAME = "tacpipe"
 ENDING = ".rrd"
+UNSAFE = r"[/\\:\x00]"  # in the name of a file
 
 
 def write(
@@ -29,10 +29,10 @@ def write(
 
     looks: dict[str, str] = {}
     written = []
-    for number, contents in enumerate(recordings):
+    for contents in recordings:
         look = repr(layout.signature(contents))
         name = looks.setdefault(look, application(dataset, len(looks)))
-        written.append(folder / f"{number:04d}{ENDING}")
+        written.append(folder / f"{re.sub(UNSAFE, '-', contents.name)}{ENDING}")
         recording = rr.RecordingStream(name, recording_id=contents.name)
         recording.save(written[-1])
         recording.send_recording_name(contents.name)
@@ -40,14 +40,6 @@ def write(
         stream.Stream(recording, contents.ends_ns[0], all_rows=all_rows).send(contents)
         recording.disconnect()  # writes what is left
     return written
-
-
-def merge(files: Sequence[Path], path: Path) -> None:
-    """Write several files of Rerun's as one. Raises `TacpipeError` where Rerun's program fails."""
-    command = [program(), "rrd", "merge", *map(str, files), "-o", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment())
-    if done.returncode:
-        raise TacpipeError(f"Rerun could not put {len(files)} recordings into one file: {done.stderr.strip()[-300:]}")
 
 
 def program() -> str:

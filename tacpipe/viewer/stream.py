@@ -368,7 +368,7 @@ def _shades(colour: str, count: int) -> list[tuple[int, int, int]]:
 
 def _labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> Any:
     """Return texts at places of a two-dimensional view."""
-    return _rerun().Points2D(places, labels=texts, show_labels=True, radii=0.01, colors=[(230, 230, 230)])
+    return _rerun().Points2D(places, labels=texts, show_labels=True, radii=0.01, colors=[palette.rgb(palette.MEASURED)])
 
 
 def _rerun() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import tarfile
@@ -29,7 +30,7 @@ SMALL, LARGE = [1.0, 1.5, 1.0, 1.5, 1.0, 1.5, 1.0, 1.5], [2.0, 2.5, 2.0, 2.5, 2.
 
 
 def dataset(data: str = "d" * 64) -> Any:
-    return SimpleNamespace(source=SimpleNamespace(inputs={"datasets": [{"dataset": data}]}))
+    return SimpleNamespace(source=SimpleNamespace(inputs={"datasets": [{"dataset": data, "manifest": data}]}))
 
 
 def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) -> tuple[str, Run]:
@@ -78,6 +79,8 @@ def test_data_is_a_column_where_results_are_of_other_data() -> None:
 
     assert "data" not in lines(alike)[0]
     assert lines(other)[0][0] == "data" and lines(other)[2][1] == "2" * 8
+    placed = dataclasses.replace(other, places={"2" * 64: "data/fresh"})
+    assert lines(placed)[2][1] == "data/fresh" and lines(placed)[3][1] == "1" * 8  # one that is gone
 
 
 def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interval() -> None:

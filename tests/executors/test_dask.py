@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tacpipe.engine.execution import Task
 from tacpipe.engine.executors import agreement, dask
 from tests.conftest import Lab
 
@@ -89,7 +90,7 @@ def test_a_collection_beside_a_worker_takes_nothing_that_it_made(lab: Lab, sched
 
 
 def test_tasks_are_named_by_absolute_paths() -> None:
-    task = dask.Task("store", "ingest.numbers", {}, files={"a": "raw/a.txt"})
+    task = Task("store", "ingest.numbers", {}, files={"a": "raw/a.txt"})
     files = dask._absolute(task).files
     assert files is not None and files["a"].startswith("/") and files["a"].endswith("raw/a.txt")
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -87,7 +88,7 @@ def test_after_a_kill_of_any_of_them_the_result_is_that_of_one_process(lab: Lab,
     command = begun(lab, f"{SLOW} --executor {cluster.executor}")
     wait_for_one_more(lab, records(lab))
     time.sleep(chance.uniform(0.0, 1.5))
-    victim = chance.choice([*cluster.workers.values(), cluster.scheduler, command])
+    victim: subprocess.Popen[Any] = chance.choice([*cluster.workers.values(), cluster.scheduler, command])
     victim.send_signal(signal.SIGKILL)
     _, printed = command.communicate(timeout=GIVE_UP_S)
     assert "Traceback" not in printed

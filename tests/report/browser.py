@@ -45,7 +45,8 @@ class Browser:
     _session: str | None = None
 
     def show(self, page: bytes, width: int) -> None:
-        """Show a page in a window of so many CSS pixels, and wait until it is loaded and its fonts are there."""
+        """Show a page in a window of so many CSS pixels, and wait until it is loaded, its fonts are there and the charts
+        in view are drawn."""
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
         self._call("Emulation.setDeviceMetricsOverride", size)
         file = self._folder / f"page-{self._number}.html"
@@ -53,6 +54,16 @@ class Browser:
         self._call("Page.navigate", {"url": file.as_uri()})
         self._wait(lambda message: message.get("method") == "Page.loadEventFired")
         self.run("document.fonts.ready.then(() => true)")
+        self.run("(window.drawn ? window.drawn() : Promise.resolve()).then(() => true)")
+
+    def dark(self, wanted: bool) -> None:
+        """Show pages as those who prefer dark ones see them."""
+        feature = {"name": "prefers-color-scheme", "value": "dark" if wanted else "light"}
+        self._call("Emulation.setEmulatedMedia", {"features": [feature]})
+
+    def media(self, name: str) -> None:
+        """Show pages as on another medium, such as ``print``; empty: on the screen."""
+        self._call("Emulation.setEmulatedMedia", {"media": name})
 
     def run(self, script: str) -> Any:
         """Return the value of a JavaScript expression, a promise's once it is kept."""

@@ -1,17 +1,11 @@
-"""Pages without their figures' drawings, for tests that read what a page says beside them."""
-
-from typing import Any
+"""Pages without the library of charts, for tests that read what a page holds: bundling it takes a second."""
 
 import pytest
 
+from tacpipe.report import html
+
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made and filled, but saved as empty ones: laying out letters and lines takes most of a page's time."""
-    from matplotlib.figure import Figure
-
-    def save(figure: Figure, content: Any, **_: Any) -> None:
-        assert figure.axes, "a figure without axes"
-        content.write("<svg></svg>")
-
-    monkeypatch.setattr(Figure, "savefig", save)
+def unbundled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages hold a mark in place of the library of charts."""
+    monkeypatch.setattr(html, "bundle", lambda: "/* library */")

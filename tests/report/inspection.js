@@ -2,7 +2,6 @@
 (() => {
   const SLACK = 1.5; // CSS pixels: rounding, and what letters' side bearings take
   const found = new Set();
-  document.querySelectorAll("details").forEach((one) => { one.open = true; });
   const seen = (element) => {
     const box = element.getBoundingClientRect();
     const style = getComputedStyle(element);
@@ -55,7 +54,7 @@
     const frame = svg.getBoundingClientRect();
     if (!frame.width) continue;
     const label = svg.getAttribute("aria-label") || "a figure";
-    const boxes = [...svg.querySelectorAll("text")].filter((one) => one.textContent.trim()).map((one) => {
+    const boxes = [...svg.querySelectorAll("text")].filter((one) => one.textContent.trim() && one.getAttribute("opacity") !== "0").map((one) => {
       const box = one.getBoundingClientRect();
       return { text: short(one.textContent), left: box.left, right: box.right, top: box.top, bottom: box.bottom,
                turned: /rotate\((?!0[ )])/.test(one.getAttribute("transform") || "") };
@@ -64,7 +63,8 @@
       const out = Math.max(frame.left - one.left, one.right - frame.right, frame.top - one.top, one.bottom - frame.bottom);
       if (out > SLACK) found.add(`outside its figure (${label}) by ${out.toFixed(0)} px: ${one.text}`);
     }
-    if (label.startsWith("Latents of")) continue; // numbers of materials stand where their latents lie, also together
+    // names of materials stand where their latents lie, and electrodes where they are, also together
+    if (/latents of both|electrode|predicted:/.test(label)) continue;
     for (let i = 0; i < boxes.length; i++) {
       for (let j = i + 1; j < boxes.length; j++) {
         const [a, b] = [boxes[i], boxes[j]];
@@ -75,6 +75,14 @@
         if (across > SLACK && down > 0.35 * high) found.add(`over each other (${label}): "${a.text}" and "${b.text}"`);
       }
     }
+  }
+  // 5. charts: each that has room is drawn and shows something
+  for (const plot of document.querySelectorAll(".plot")) {
+    if (!plot.clientWidth || plot.getBoundingClientRect().top > innerHeight && !plot.drawn) continue;
+    const title = plot.dataset.title;
+    if (!plot.querySelector("svg")) found.add(`a chart that is not drawn: ${title}`);
+    else if (!plot.querySelector(".role-mark path[d], .role-mark text, .role-mark line")) found.add(`an empty chart: ${title}`);
+    if (plot.scrollWidth > plot.clientWidth + SLACK) found.add(`a chart wider than its column: ${title}`);
   }
   return [...found].sort();
 })()

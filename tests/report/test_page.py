@@ -1,19 +1,62 @@
-"""One page for results of all tasks."""
+"""One page for results of all tasks, whole and loading nothing."""
 
 from __future__ import annotations
 
 import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tacpipe.comparison import engine
 from tacpipe.errors import TacpipeError
-from tacpipe.report import page
+from tacpipe.plugins import registry
+from tacpipe.report import html, page
+from tacpipe.report.blocks import Chart, Fold, Note, Section, table
 from tests.fake_recordings import FakeDataset, FakeShard, dataset
-from tests.report import elements
 from tests.report.forward import result_fakes
 from tests.report.material import material_fakes
+from tests.report.touch import touch_fakes
 from tests.stages.learning_fakes import motion
+
+pytestmark = pytest.mark.usefixtures("unbundled")
+VOID = ("meta", "br")
+PLUGIN = Path(__file__).parents[1] / "plugin"
+
+
+class Elements(HTMLParser):
+    """Collects what a page loads, and checks that its elements close."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.text += data
+
+
+def check(content: bytes) -> str:
+    """A page is whole, loads nothing, and shows no number that is none; return its text."""
+    elements = Elements()
+    elements.feed(content.decode())
+    assert elements.open == []
+    assert all(one.startswith("#") for one in elements.loads)
+    assert not re.search(r"\bnan\b", elements.text, re.IGNORECASE)
+    return elements.text
 
 
 def other(task: str, **attributes: Any) -> Any:
@@ -28,45 +71,111 @@ def other(task: str, **attributes: Any) -> Any:
     return FakeDataset(shards, files, result_fakes.MANIFEST)
 
 
-def test_each_task_tells_of_its_own_results_in_the_order_in_which_they_come() -> None:
-    material = material_fakes.result("minirocket", wrong={"biotac": 1})
-    text = page.render([material, other("touch"), result_fakes.result()], title="a <b>").decode()
-    elements.check(text)
-    places = [text.index(told) for told in ("<h2>MiniRocket", "<h2>touch: graph net", "<h2>forward: recurrent")]
-    assert places == sorted(places)
-    assert "<h1>a &lt;b&gt;</h1>" in text
+def everything() -> list[Any]:
+    wrong = {"biotac": 1, "roboskin": 2}
+    return [
+        result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}),
+        result_fakes.codec(8),
+        material_fakes.result("minirocket", wrong=wrong),
+        material_fakes.result(wrong=wrong, joint=True, epochs=3),
+        material_fakes.recorded(),
+        touch_fakes.result(novel=touch_fakes.NOVEL),
+        touch_fakes.recorded(),
+        other("graph"),
+    ]
 
 
-def test_a_task_without_a_part_of_its_own_has_its_numbers_told_by_name_and_where_they_come_from() -> None:
-    text = page.render([other("touch", simulated=True)], title="t").decode()
-    elements.check(text)
-    assert elements.cells(text, "model, error, near") == ["0.25"]
-    assert elements.cells(text, "model, error, far") == ["–"]
-    assert elements.cells(text, "counts, trials") == ["12"]
-    assert '<span class="badge">simulated</span>' in text
-    assert "cd" * 32 in text
+def test_a_page_of_all_tasks_is_whole_and_the_same_results_give_the_same_bytes() -> None:
+    content = page.render(everything(), title="a <b>")
+    text = check(content)
+    assert content == page.render(everything(), title="a <b>")
+    ids = re.findall(r'<section id="(\w+)"', content.decode())
+    assert ids == ["forward", "material", "touch", "graph"]
+    assert "a <b>" in text
 
 
-def test_several_results_of_such_a_task_are_numbered() -> None:
-    text = page.render([other("touch"), other("touch")], title="t").decode()
-    assert "<h2>1. touch: graph net" in text and "<h2>2. touch: graph net" in text
+def test_each_section_opens_with_one_sentence_one_chart_and_one_table_of_at_most_seven_rows() -> None:
+    content = page.render(everything()).decode()
+    for name in ("forward", "material", "touch"):
+        section = content[content.index(f'<section id="{name}"') :]
+        first = section[: section.index('<div class="folds">')]
+        assert (first.count('class="answer'), first.count("<figure"), first.count("<table")) == (1, 1, 1)
+        assert 1 <= first[first.index("<tbody>") :].count("<tr") <= 7
 
 
-@pytest.mark.parametrize("task", ["page", "markup", "", "material.methods"])
-def test_a_task_named_like_a_module_of_the_page_is_one_without_a_part_of_its_own(task: str) -> None:
-    assert elements.cells(page.render([other(task)], title="t").decode(), "counts, trials") == ["12"]
+def test_every_fold_has_its_place_in_the_contents() -> None:
+    content = page.render(everything()).decode()
+    linked = set(re.findall(r'<li><a href="#([\w-]+)"', content))
+    assert linked and linked == set(re.findall(r'<details class="fold" id="([\w-]+)"', content))
 
 
-def test_what_is_no_result_is_refused() -> None:
+def test_a_task_without_a_specification_has_its_numbers_by_name_and_where_they_come_from() -> None:
+    text = check(page.render([other("weighing", simulated=True), other("weighing")]))
+    assert "model, error, near" in text and "0.25" in text and "simulated" in text and "cd" * 32 in text
+    assert "1. weighing: graph net" in text and "2. weighing: graph net" in text
+
+
+@pytest.mark.parametrize("task", ["page", "blocks", "", "material.methods"])
+def test_a_task_named_like_a_module_of_the_page_is_one_without_a_specification(task: str) -> None:
+    assert "counts, trials" in check(page.render([other(task)]))
+
+
+@pytest.fixture
+def weighing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task of the plug-in of a third party, as its entry point gives it."""
+    monkeypatch.syspath_prepend(PLUGIN)
+    monkeypatch.setitem(registry.entry_points()[registry.REPORTS], "weighing", "toy_report")
+
+
+def weighed(name: str, off: float, seed: int = 0) -> Any:
+    things = [f"w{place}" for place in range(9)]
+    model = {thing: off + 0.01 * place for place, thing in enumerate(things)}
+    errors = {"model": model, "mean_weight": dict.fromkeys(things, 1.0)}
+    config = {"task": "weighing", "architecture": name, "params": {"springs": 2}, "seed": seed}
+    files = {"metrics.json": {}, "config.json": config, "errors.json": errors}
+    return FakeDataset({}, {path: json.dumps(one).encode() for path, one in files.items()}, result_fakes.MANIFEST)
+
+
+@pytest.mark.usefixtures("weighing")
+def test_a_third_partys_task_gets_the_same_page_by_its_specification() -> None:
+    content = page.render([weighed("scale", 0.5), weighed("scale", 0.6, seed=1), weighed("spring", 1.5)])
+    text = check(content)
+    assert "Weights of things" in text and "light things" in text and "mean weight" in text
+    assert '<p class="answer better">' in content.decode() and "tacpipe view DATASET w8" in content.decode()
+    (compared,) = engine.compare([weighed("scale", 0.5), weighed("scale", 0.6, seed=1), weighed("spring", 1.5)])
+    assert [(one.name, one.runs) for one in compared.models] == [("scale", 2), ("spring", 1)]
+    assert compared.models[0].gain.mean == pytest.approx(1 - 0.59)
+
+
+def test_the_documentation_shows_that_very_specification() -> None:
+    shown = (PLUGIN.parents[1] / "docs" / "howto" / "report.md").read_text()
+    assert (PLUGIN / "toy_report.py").read_text() in shown
+
+
+def test_what_is_not_a_result_is_refused() -> None:
     with pytest.raises(TacpipeError, match=r"no metrics\.json"):
         page.render([dataset()], title="t")
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_a_dataset_that_no_task_on_the_page_can_use_is_refused() -> None:
     material = material_fakes.result("minirocket", wrong={"biotac": 1})
-    page.render([material, material_fakes.recorded()], title="t")
-    page.render([result_fakes.result(), result_fakes.codec(8)], title="t")
     for one, besides in ((material, result_fakes.codec(8)), (result_fakes.result(), material_fakes.recorded())):
         with pytest.raises(TacpipeError, match=r"no metrics\.json"):
             page.render([one, besides], title="t")
+
+
+def test_text_that_looks_like_markup_stays_text() -> None:
+    name = "</script><b>& `rm x`"
+    spec = {"data": {"values": [{"name": name, "x": 1.5}]}, "mark": "point"}
+    section = Section(
+        "t", name, name, chart=Chart(name, spec, name), folds=[Fold(name, [Note(name), table(name, [name], [[name]])])]
+    )
+    content = html.page([section], name)
+    assert name.replace("`", "") in check(content).replace("`", "")
+    (data,) = re.findall(r'application/json">(.*?)</script>', content.decode())
+    assert json.loads(data)["data"]["columns"]["name"]["of"] == [name]
+
+
+def test_a_number_that_is_not_defined_cannot_enter_a_chart() -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        html.page([Section("t", "t", "", chart=Chart("t", {"data": {"values": [{"x": float("nan")}]}}))], "t")

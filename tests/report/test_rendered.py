@@ -106,15 +106,78 @@ PAGES: dict[str, Callable[[], list[Any]]] = {
 }
 
 
-@pytest.fixture(scope="module", params=sorted(PAGES))
-def rendered(request: pytest.FixtureRequest) -> bytes:
-    return page.render(PAGES[request.param](), title="")
+def inspected(chromium: Browser, content: bytes, width: int, *, dark: bool) -> list[str]:
+    """What is wrong with a page as it opens, and again with all folds open."""
+    chromium.dark(dark)
+    chromium.show(content, width)
+    found: list[str] = chromium.run(INSPECTION)
+    chromium.run("showAll().then(() => true)")
+    return [*found, *chromium.run(INSPECTION)]
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-def test_what_a_reader_sees_of_a_page_is_whole_text(chromium: Browser, rendered: bytes, width: int) -> None:
-    chromium.show(rendered, width)
-    assert chromium.run(INSPECTION) == []
+def test_a_page_of_all_tasks_is_whole_as_a_reader_sees_it(chromium: Browser) -> None:
+    content = page.render(mixed(), title="")
+    assert inspected(chromium, content, 400, dark=False) == []
+    assert (
+        chromium.run("document.querySelectorAll('section')[0].querySelector('table').getBoundingClientRect().top") > 0
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", sorted(PAGES))
+def test_pages_are_whole_at_both_widths_light_and_dark(chromium: Browser, name: str) -> None:
+    content = page.render(PAGES[name](), title="")
+    for width in WIDTHS:
+        for dark in (False, True):
+            assert inspected(chromium, content, width, dark=dark) == [], (width, dark)
+
+
+@pytest.mark.long
+def test_the_answer_is_on_the_first_screen_at_both_widths(chromium: Browser) -> None:
+    for name in ("forward_many", "material_many", "touch_many"):
+        content = page.render(PAGES[name](), title="")
+        for width in WIDTHS:
+            chromium.show(content, width)
+            wanted = (".answer", "figure .plot", *(["table"] if width > 400 else []))
+            ends = [chromium.run(f"document.querySelector('{one}').getBoundingClientRect().bottom") for one in wanted]
+            assert max(ends) <= 800, (name, width, ends)
+
+
+def test_tables_sort_families_unfold_and_charts_answer_the_cursor(chromium: Browser) -> None:
+    content = page.render(
+        [*(result_fakes.result("raw", params={"hidden": width}, ratio=width / 100) for width in (25, 75, 50))]
+    )
+    chromium.show(content, 1280)
+    chromium.run("showAll().then(() => true)")
+    table = "document.querySelector('#forward-1 table')"
+    shown = f"[...{table}.tBodies[0].rows].filter((row) => !row.hidden).map((row) => row.cells[0].firstChild.data)"
+    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["25"]
+    chromium.run(f"{table}.querySelector('button.more').click()")
+    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["25", "50", "75"]
+    chromium.run(f"{table}.tHead.rows[0].cells[1].click()")
+    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["75", "50", "25"]
+    chromium.run(f"{table}.tHead.rows[0].cells[1].click()")
+    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["25", "50", "75"]
+    script = """(() => {
+      const point = document.querySelector(".plot svg .mark-symbol path"), box = point.getBoundingClientRect();
+      const at = { bubbles: true, clientX: box.left + 3, clientY: box.top + 3 };
+      point.dispatchEvent(new PointerEvent("pointermove", at));
+      point.dispatchEvent(new MouseEvent("mousemove", at));
+    })()"""
+    chromium.run(script)
+    assert "recurrent" in chromium.run("document.getElementById('tip').textContent")
+
+
+def test_paper_shows_what_is_folded_on_the_screen(chromium: Browser) -> None:
+    chromium.show(page.render(forward_single()), 1280)
+    chromium.run("window.dispatchEvent(new Event('beforeprint'))")
+    assert chromium.run("[...document.querySelectorAll('details.fold')].every((one) => one.open)")
+    assert chromium.run("getComputedStyle(document.querySelector('nav')).display") != "none"
+    chromium.media("print")
+    try:
+        assert chromium.run("getComputedStyle(document.querySelector('nav')).display") == "none"
+    finally:
+        chromium.media("")
 
 
 @pytest.mark.parametrize(

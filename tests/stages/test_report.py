@@ -18,7 +18,7 @@ def test_a_report_is_one_file_with_the_title_asked_for() -> None:
     assert set(made) == {"report.html"}
     assert b"<h1>Monday</h1>" in made["report.html"]
     assert b"No recording was left" in made["report.html"]
-    assert b"<h1>Forecasts of tactile signals</h1>" in REPORT(REPORT.params(), (nothing,)).files["report.html"]
+    assert b"<title>Forecasts of tactile signals</title>" in REPORT(REPORT.params(), (nothing,)).files["report.html"]
 
 
 def test_what_is_no_result_is_refused() -> None:

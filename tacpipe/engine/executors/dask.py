@@ -75,6 +75,7 @@ class Dask:
 
     def __init__(self, client: Client) -> None:
         self.client = client
+        self._scheduler = str(client.scheduler_info(n_workers=0)["address"])
 
     def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
         """Yield ``compute(task)`` of every task, in any order.
@@ -94,25 +95,25 @@ class Dask:
                 yield from self._results(futures, tasks[0].name)
             finally:
                 with contextlib.suppress(Exception):  # the scheduler forgets them in any case when the client goes
-                    self.client.cancel(futures)
+                    self.client.cancel(futures)  # type: ignore[no-untyped-call]
 
     def _workers(self) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
         if not found:
             raise TacpipeError(
-                f"The scheduler at {self.client.scheduler.address} has no worker. Start some, as with `dask worker "
-                f"{self.client.scheduler.address} --nthreads 1`."
+                f"The scheduler at {self._scheduler} has no worker. Start some, as with `dask worker "
+                f"{self._scheduler} --nthreads 1`."
             )
         return found
 
-    def _results(self, futures: Sequence[Future], stage: str) -> Iterator[Done]:
+    def _results(self, futures: Sequence[Future[Any]], stage: str) -> Iterator[Done]:
         from concurrent.futures import CancelledError
 
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
         try:
-            for future in as_completed(futures, loop=self.client.loop):
+            for future in as_completed(futures, loop=self.client.loop):  # type: ignore[no-untyped-call]
                 if future.status == "error":
                     raise future.exception()
                 made = future.result()
@@ -127,8 +128,7 @@ class Dask:
             ) from error
         except CancelledError as error:
             raise TacpipeError(
-                f"The scheduler at {self.client.scheduler.address} is gone. What was finished is kept: run the same command "
-                f"again."
+                f"The scheduler at {self._scheduler} is gone. What was finished is kept: run the same command again."
             ) from error
         except ModuleNotFoundError as error:
             raise TacpipeError(
@@ -144,7 +144,7 @@ def _started(workers: int) -> Iterator[Dask]:
         import dask
         from distributed import Client, LocalCluster, Security
 
-    security = Security.temporary()
+    security = Security.temporary()  # type: ignore[no-untyped-call]
     with (
         _quiet(),
         dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
@@ -160,7 +160,7 @@ def _started(workers: int) -> Iterator[Dask]:
             silence_logs=logging.CRITICAL,
             security=security,
         ) as cluster,
-        Client(cluster, security=security, set_as_default=False) as client,
+        Client(cluster, security=security, set_as_default=False) as client,  # type: ignore[no-untyped-call]
     ):
         yield Dask(client)
 
@@ -172,7 +172,9 @@ def _client(address: str) -> Iterator[Client]:
 
     with _quiet():
         try:
-            client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="tacpipe")
+            client = Client(  # type: ignore[no-untyped-call]
+                address, timeout=_CONNECT_S, set_as_default=False, name="tacpipe"
+            )
         except (OSError, TimeoutError, ValueError, RuntimeError, TypeError) as error:
             raise TacpipeError(f"No scheduler of Dask answers at {address}: {error}") from error
         with client:

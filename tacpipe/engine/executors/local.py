@@ -122,7 +122,7 @@ def _start_server() -> None:
 def _work(tasks: Connection, alive: Connection) -> None:
     """Compute what comes over ``tasks`` for as long as the process at the other end of ``alive`` lives.
 
-    The kernel tells of its end by a signal that ends this process too, in the middle of a long call in C as well.
+    The kernel reports its end by a signal that ends this process too, in the middle of a long call in C as well.
     """
     import fcntl
     import signal

@@ -32,7 +32,7 @@ class Episode:
     number: int = 0  # among those that share arrays, of which there are ``count``
     count: int = 0
     total: int = 0  # rows of all of them
-    beside: str | None = None  # the group of the array that says where they end
+    beside: str | None = None  # the group of the array that states where they end
     labels: Mapping[str, Any] = field(default_factory=dict)
     stated: bool = False  # whether its name is one that the file states
 

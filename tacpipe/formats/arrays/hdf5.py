@@ -125,7 +125,7 @@ class Hdf5Tree:
         found: list[bytes] = []
         place = group.id  # kept: the links do not
         with contextlib.suppress(*BROKEN):
-            place.links.iterate(found.append)  # a callback that returns nothing goes on
+            place.links.iterate(found.append)  # a callback that returns nothing continues
         return [name.decode(errors="surrogateescape") for name in found]
 
     def _addresses(self, group: str) -> set[Any]:

@@ -1,7 +1,7 @@
 """What arrays of known names hold: quantity, unit and component of each column, by the conventions of robot learning.
 
 Lengths are metres, angles radians, quaternions without unit, as robosuite, ALOHA, UMI, DROID and LeRobot write them. What
-a name does not show is left empty: a layout file says it.
+a name does not show is left empty: a layout file states it.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def meanings(name: str, width: int, whole: bool = False) -> list[Meaning]:
 
 
 def of_name(name: str, kind: str) -> Meaning:
-    """Return what a column of one value holds where its name says both quantity and unit.
+    """Return what a column of one value holds where its name states both quantity and unit.
 
     >>> of_name("joint1_rad", "float32"), of_name("fx", "float64")
     (Meaning(quantity='joint_position', unit='rad', component=''), Meaning(quantity='', unit='', component=''))

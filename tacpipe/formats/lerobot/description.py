@@ -23,7 +23,7 @@ from tacpipe.printable import excerpt, plain
 INFO = "meta/info.json"
 MOST_BYTES = 1 << 28  # of a file in meta
 VERSIONS = ("v2.0", "v2.1", "v3.0")
-DATA_PATHS = {  # where versions keep the frames, if info.json does not say
+DATA_PATHS = {  # where versions keep the frames, if info.json does not state it
     "v2": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
@@ -33,7 +33,7 @@ OWN = (
     "videos/",
     "meta/",
     "dataset_",
-)  # how columns of meta/episodes begin that say where things are
+)  # how columns of meta/episodes begin that state where things are
 NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with what an episode was before its export
 ABOUT = "meta/tacpipe.json"  # the name, unit and quantity of each value of a feature, of exported datasets
 _PLACE = re.compile(r"\{(\w+)(?::(\d+)d)?\}")

@@ -1,4 +1,4 @@
-"""Which results are runs of the same method, and which method is the paper's."""
+"""What makes a method of forecasting, and which method is the paper's."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tacpipe.report.forward import error_sums
 from tacpipe.report.forward.error_sums import ErrorSums
 
 if TYPE_CHECKING:
+    from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
@@ -40,68 +41,9 @@ class Run:
         return cls(dataset, config, metrics, error_sums.read(dataset.files[error_sums.FILE]))
 
 
-@dataclass(frozen=True)
-class Method:
-    """Runs that differ in seed or split alone."""
-
-    name: str
-    runs: tuple[Run, ...]
-
-    @property
-    def config(self) -> Tree:
-        """What the runs have in common, and the first one's seed."""
-        return self.runs[0].config
-
-    @property
-    def codec(self) -> Tree:
-        """Kind, width and name of the representation."""
-        found: Tree = self.config["codec"]
-        return found
-
-    @property
-    def actions(self) -> str:
-        """What the model is informed of the motion to come: ``planned``, ``none`` or ``shuffled``."""
-        return actions(self.config)
-
-    @property
-    def timeline(self) -> str:
-        """What rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
-        return timeline(self.config)
-
-    @property
-    def recurrent(self) -> bool:
-        """Whether the model is the paper's encoder and decoder."""
-        return str(self.config["architecture"]).startswith("recurrent")
-
-    def key_without(self, what: str) -> str:
-        """Return what methods share that differ in their ``actions`` or in their ``timeline`` alone."""
-        return _key(self.config, params=True, without=what)
-
-
 def comparable(dataset: Dataset) -> bool:
     """Return whether a result holds what a comparison reads: only those of the task ``forward`` do."""
     return all(name in dataset.files for name in ("metrics.json", "config.json", error_sums.FILE))
-
-
-def grouped(runs: Sequence[Run]) -> list[Method]:
-    """Return the methods of runs, sorted by name.
-
-    A method is architecture, representation, actions, timeline and all params but the seed. Its name states a timeline
-    that is not that of most runs, and the params in which it differs from others that are the same but for these.
-    """
-    found: dict[str, list[Run]] = {}
-    for run in runs:
-        found.setdefault(_key(run.config, params=True), []).append(run)
-    alike: dict[str, list[Tree]] = {}
-    for same in found.values():
-        alike.setdefault(_key(same[0].config, params=False), []).append(_params(same[0].config))
-    usual = main_timeline(runs)
-    made = []
-    for same in found.values():
-        config = same[0].config
-        described = _differing(_params(config), alike[_key(config, params=False)])
-        made.append(Method(name(config, usual, described), tuple(same)))
-    return sorted(made, key=lambda method: method.name)
 
 
 def main_timeline(runs: Sequence[Run]) -> str:
@@ -110,10 +52,27 @@ def main_timeline(runs: Sequence[Run]) -> str:
     return max(count, key=lambda name: (count[name], name))
 
 
+def recurrent(method: Method) -> bool:
+    """Return whether a method is the paper's encoder and decoder, with the plan."""
+    return method.settings["actions"] == "planned" and method.family.startswith("recurrent")
+
+
 def papers(methods: Sequence[Method]) -> Method | None:
     """Return the method nearest to what the paper found best: the recurrent model of 20 principal components."""
-    found = [one for one in methods if one.recurrent and one.actions == "planned" and one.codec["of"] == "levels"]
+    found = [one for one in methods if recurrent(one) and codec(one)["of"] == "levels"]
     return min(found, key=_distance, default=None)
+
+
+def codec(method: Method) -> Tree:
+    """Return kind, width and name of a method's representation."""
+    found: Tree = method.runs[0].details.config["codec"]
+    return found
+
+
+def key_without(method: Method, what: str) -> str:
+    """Return what methods share that differ in one setting alone."""
+    described = {**method.settings, "architecture": method.family}
+    return json.dumps({name: value for name, value in described.items() if name != what}, sort_keys=True, default=str)
 
 
 def paper_row(codec: Tree) -> str | None:
@@ -132,22 +91,11 @@ def paper_row(codec: Tree) -> str | None:
     return "PCA" if codec["kind"] == "pca" else f"AE-C{codec['frames']}"
 
 
-def reference(methods: Sequence[Method]) -> Method:
-    """Return the method whose runs report on the baselines: with most baselines, then most runs, better with a plan."""
-
-    def place(one: Method) -> tuple[int, int, int, str]:
-        baselines = {
-            name for run in one.runs for name in run.errors.predictors if not name.startswith(("model", "codec"))
-        }
-        return -len(baselines), -len(one.runs), ACTIONS.index(one.actions), one.name
-
-    return min(methods, key=place)
-
-
 def _distance(method: Method) -> tuple[int, int, int, str]:
     """Return how far a recurrent method is from the paper's, for sorting."""
-    kind = method.codec["kind"]
-    off = abs(int(method.codec["latents"]) - _PAPER_WIDTH.get(kind, int(method.codec["latents"])))
+    found = codec(method)
+    kind = found["kind"]
+    off = abs(int(found["latents"]) - _PAPER_WIDTH.get(kind, int(found["latents"])))
     return _PREFERRED.index(kind), off, -len(method.runs), method.name
 
 
@@ -167,34 +115,17 @@ def _params(config: Tree) -> dict[str, Any]:
     return {name: value for name, value in found.items() if name not in _NO_METHOD}
 
 
-def _key(config: Tree, *, params: bool, without: str = "") -> str:
-    """Return what names a method, seed and split left out."""
-    described = {
-        "architecture": config["architecture"],
-        "codec": config["codec"]["name"],
-        "actions": actions(config),
-        "timeline": timeline(config),
-        "params": _params(config) if params else {},
-    }
-    return json.dumps({name: value for name, value in described.items() if name != without}, sort_keys=True)
-
-
-def _differing(params: Tree, alike: Sequence[Tree]) -> dict[str, Any]:
-    """Return those params that are not the same in all of ``alike``."""
-    return {name: value for name, value in sorted(params.items()) if any(one.get(name) != value for one in alike)}
-
-
 def settings(config: Tree) -> dict[str, Any]:
     """Return all that makes a method, without seed and split."""
     codec = config["codec"]["name"]
     return {**_params(config), "codec": codec, "actions": actions(config), "timeline": timeline(config)}
 
 
-def name(config: Tree, usual: str, params: Tree) -> str:
-    """Return what a method is called, with a timeline that is not the ``usual`` one and some ``params``."""
+def name(config: Tree, usual: str) -> str:
+    """Return what a method is called, with a timeline that is not the ``usual`` one."""
     parts = [str(config["architecture"]).replace("_", " "), str(config["codec"]["name"])]
     if actions(config) != "planned":
         parts.append("no actions" if actions(config) == "none" else f"{actions(config)} actions")
     if timeline(config) != usual:
         parts.append(timeline(config))
-    return " · ".join([*parts, *(f"{name} {value}" for name, value in params.items())])
+    return " · ".join(parts)

@@ -47,8 +47,8 @@ def kind(predictor: str) -> Kind:
 
 
 def called(predictor: str) -> str:
-    """Return what tables call a predictor."""
-    return predictor.removeprefix("model_").replace("_", " ")
+    """Return what tables call a predictor: its name in ``metrics.json``."""
+    return predictor.removeprefix("model_")
 
 
 def through(predictor: str, codec: str) -> str:
@@ -86,7 +86,8 @@ def sums(
 def _run(run: Run, steps: Sequence[int], usual: str) -> Compared:
     config = run.config
     measure = headline.measure(steps, units.of_model(config))
-    other = "" if methods.timeline(config) == usual else f"{methods.timeline(config)} timeline"
+    elsewhere = methods.timeline(config) != usual
+    other = f"{methods.timeline(config)} timeline" if elsewhere else ""
     questions = {}
     for known in (True, False) if run.errors.named else (None,):
         by_predictor = {
@@ -96,12 +97,12 @@ def _run(run: Run, steps: Sequence[int], usual: str) -> Compared:
         }
         if by_predictor:
             part = ", ".join(filter(None, (headline.PARTS[known], other)))
-            questions[Question(part)] = Errors(measure, by_predictor)
+            questions[Question(part, place=2 * elsewhere + (known is False))] = Errors(measure, by_predictor)
     params = config["params"]
     return Compared(
         run.dataset,
         headline.TASK,
-        methods.name(config, usual, {}),
+        methods.name(config, usual),
         methods.settings(config),
         questions,
         family=str(config["architecture"]).replace("_", " "),

@@ -7,27 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from tacpipe.arrays import Ints
-from tacpipe.report import markup
-from tacpipe.report.markup import listed
-from tacpipe.report.material import comparison, figures, tables
+from tacpipe.report import charts
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold, listed
+from tacpipe.report.material import comparison, tables
 from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import MODEL, NOTHING
 
 MOST_PAIRS = 3  # pairs of materials in words
-NOTE = "Blue: named right; orange: wrong, with how often. The stronger, the larger the fraction of a material's slides."
+NOTE = "Unseen slides. Blue: named right; orange: wrong. The stronger, the larger the fraction of a material's slides."
 
 
-def section(methods: Sequence[Method]) -> str:
-    """Return the confusions of the best method and of the joint one, a figure a sensor."""
+def folds(methods: Sequence[Method]) -> list[Fold]:
+    """Return the confusions of the best method and of the joint one, a chart a sensor."""
     drawn = []
     for sensor in tables.sensors_of(methods):
         best = tables.leader(methods, sensor)
         joint = comparison.main(methods)
         chosen = [best, *([joint] if joint is not best and joint and joint.of(sensor) else [])]
-        drawn += [_figure(one, sensor) for one in chosen if one]
-    if not drawn:
-        return ""
-    return f'<h3>Which materials are confused</h3><div class="pair">{"".join(drawn)}</div>{markup.note(NOTE)}'
+        drawn += [_chart(one, sensor) for one in chosen if one]
+    return fold("Which materials are confused", Charts(drawn), Note(NOTE)) if drawn else []
 
 
 def counted(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
@@ -57,13 +55,12 @@ def worst(counts: Ints, materials: Sequence[int | str]) -> str:
     return f"Most often it takes {listed(described)}." if described else "It takes none for another."
 
 
-def _figure(method: Method, sensor: str) -> str:
+def _chart(method: Method, sensor: str) -> Chart:
     counts, materials = counted(method, sensor)
     runs = len(method.of(sensor))
     label = method.of(sensor)[0].predictions.naming.key
-    svg = figures.confusion(counts, materials, f"Materials and what they were taken for, {shown(sensor)}", label)
-    caption = (
-        f"{shown(sensor)}, {method.name}: {counts.trace()} of {counts.sum()} right on unseen slides"
-        f"{f', {runs} runs pooled' if runs > 1 else ''}. {worst(counts, materials)}"
-    )
-    return markup.figure(svg, caption)
+    names = [str(one) for one in materials]
+    spec = {**charts.matrix(counts, names, label, "named"), "usermeta": {"most": 150 + 30 * len(names)}}
+    pooled = f", {runs} runs pooled" if runs > 1 else ""
+    caption = f"{counts.trace()} of {counts.sum()} right{pooled}. {worst(counts, materials)}"
+    return Chart(f"{shown(sensor)}: {method.name}", spec, caption)

@@ -7,31 +7,29 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.report import markup
-from tacpipe.report.material import comparison, figures
-from tacpipe.report.material.figures import Cloud
+from tacpipe.report import charts
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
+from tacpipe.report.material import comparison
 from tacpipe.report.material.methods import Method, Run, ordered, shown
 from tacpipe.report.material.predictions import Predictions
 
 NOTE = (
     "Latents of unseen slides on their first two principal components, both sensors together: a colour is a material, whose "
-    "number stands at the mean of the first sensor's slides. A line leads from there to the mean of the other sensor's "
+    "name is at the mean of the first sensor's slides. A line leads from there to the mean of the other sensor's "
     "slides of the material that it was paired with, so short lines are what alignment makes. Where permuted pairs have "
     "lines as short, that sensors lie together is not evidence that they measure the same."
 )
 
 
-def section(methods: Sequence[Method]) -> str:
-    """Return a figure each of a joint run, of the control and of two independent ones; empty without joint latents."""
+def folds(methods: Sequence[Method]) -> list[Fold]:
+    """Return a chart each of a joint run, of the control and of two independent ones; nothing without joint latents."""
     main = comparison.main(methods)
     if main is None:
-        return ""
+        return []
     alone = comparison.nearest(main, [one for one in methods if one.plain and one.kind == "RAEC independent"])
     permuted = comparison.nearest(main, [one for one in methods if comparison.control(one)])
-    drawn = [_figure(one) for one in (main, permuted, alone) if one]
-    if not any(drawn):
-        return ""
-    return f'<h3>Latents</h3><div class="pair">{"".join(drawn)}</div>{markup.note(NOTE)}'
+    drawn = [found for one in (main, permuted, alone) if one and (found := _chart(one))]
+    return fold("Latents", Charts(drawn), Note(NOTE)) if drawn else []
 
 
 def projected(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
@@ -62,24 +60,43 @@ def together(one: Predictions, other: Predictions, partners: Mapping[int, int]) 
     return int(sum(found)), len(found)
 
 
-def _figure(method: Method) -> str:
+def _chart(method: Method) -> Chart | None:
     """Return the latents of one run of a method, or of one a sensor where each has its own model."""
     rows = _rows(method.runs)
     if rows is None:
-        return ""
+        return None
     sensors, parts = rows
     points = projected([_latents(part) for part in parts])
-    clouds = [
-        Cloud(shown(sensor), at, part.materials, part.naming.names)
-        for sensor, at, part in zip(sensors, points, parts, strict=True)
-    ]
     partners = {int(one): int(other) for one, other in method.runs[0].config.get("partners", {}).items()}
     same, of = together(parts[0], parts[1], partners)
-    svg = figures.latents(clouds, partners, "Latents of both sensors")
-    what = "the material that it was paired with" if partners else "the same material"
-    return markup.figure(
-        svg, f"{method.name}: for {same} of {of} materials, the other sensor's nearest mean is {what}."
+    dots = [
+        {"name": str(name), "x": float(x), "y": float(y), "shape": shown(sensor), "tip": str(recording)}
+        for sensor, part, at in zip(sensors, parts, points, strict=True)
+        for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, at, strict=True)
+    ]
+    spec = charts.scatter(
+        dots, "first principal component", "second", shapes=[shown(sensor) for sensor in sensors], legend=False
     )
+    spec["layer"].append(charts.joined(_lines(points, parts, partners)))
+    what = "the material that it was paired with" if partners else "the same material"
+    caption = f"For {same} of {of} materials, the other sensor's nearest mean is {what}."
+    return Chart(f"{method.name}: latents of both sensors", spec, caption)
+
+
+def _lines(
+    points: Sequence[AnyFloats], parts: Sequence[Predictions], partners: Mapping[int, int]
+) -> list[tuple[str, AnyFloats, AnyFloats]]:
+    """Return the name of each material, the mean of the first sensor's slides and of its partner's by the other."""
+    means = [
+        {int(one): at[part.materials == one].mean(axis=0) for one in np.unique(part.materials)}
+        for at, part in zip(points, parts, strict=True)
+    ]
+    names = dict(zip(parts[0].materials.tolist(), parts[0].named(parts[0].materials).tolist(), strict=True))
+    return [
+        (str(names[one]), middle, means[1][partners.get(one, one)])
+        for one, middle in means[0].items()
+        if partners.get(one, one) in means[1]
+    ]
 
 
 def _rows(runs: Sequence[Run]) -> tuple[tuple[str, str], list[Predictions]] | None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.report import markup, provenance
-from tacpipe.report.markup import listed
-from tacpipe.report.material import figures, wording
+from tacpipe.report import charts, provenance
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, listed
+from tacpipe.report.charts import Line
+from tacpipe.report.material import wording
 from tacpipe.report.material.methods import PAPERS_SETS, ordered, shown
 
 if TYPE_CHECKING:
@@ -24,20 +25,20 @@ def reads(dataset: Dataset) -> bool:
     return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.recordings.values())
 
 
-def section(datasets: Sequence[Dataset]) -> str:
-    """Return what slides were like; empty without any."""
+def folds(datasets: Sequence[Dataset]) -> list[Fold]:
+    """Return what slides were like; nothing without any."""
     shards = [shard for one in datasets for shard in one.recordings.values() if reads(one)]
     if not shards:
-        return ""
+        return []
     published = all(provenance.published(one, PAPERS_SETS) for one in datasets)
     sensors = ordered({str(shard.attributes.get("sensor", "")) for shard in shards})
     parts = [_counts([shard for shard in shards if shard.attributes.get("sensor", "") == one], one) for one in sensors]
-    drawn = []
+    drawn: list[Chart] = []
     for sensor in sensors:
         held = [one for one in shards if one.attributes.get("sensor", "") == sensor and PROFILE in one.streams]
         if held:
-            drawn.append(_figures(typical(held), sensor, published))
-    return f"<h3>The slides</h3>{markup.note(' '.join(parts))}{''.join(drawn)}"
+            drawn += _charts(typical(held), sensor, published)
+    return [Fold("The slides", [Note(" ".join(parts)), *([Charts(drawn)] if drawn else [])])]
 
 
 def typical(shards: Sequence[Recording]) -> Recording:
@@ -62,24 +63,29 @@ def _counts(shards: Sequence[Recording], sensor: str) -> str:
     return text + (f" ({listed(described)})." if described else ".")
 
 
-def _figures(shard: Recording, sensor: str, published: bool) -> str:
+def _charts(shard: Recording, sensor: str, published: bool) -> list[Chart]:
     """Return force and speed of one slide."""
     table = shard.table(PROFILE)
     time_ns = table["t_ns"].to_numpy()
     time_s = (time_ns - time_ns[0]) / 1e9
-    during = table["phase"].to_numpy() == 0
+    during = time_s[table["phase"].to_numpy() == 0]
+    shade = (float(during[0]), float(during[-1])) if len(during) else None
+    wanted = (
+        ("Figure 5", f"force on {shown(sensor)}", "force (N)", {"force_n": "force"}, 1.0),
+        (
+            "Figure 6",
+            f"speed on {shown(sensor)}",
+            "speed (mm/s)",
+            {"speed_raw_m_s": "as measured", "speed_m_s": "median of 3"},
+            1000.0,
+        ),
+    )
     drawn = []
-    force = {"force": table["force_n"].to_numpy()} if "force_n" in table.column_names else {}
-    if force and np.isfinite(force["force"]).any():
-        svg = figures.profile(time_s, force, during, "force (N)", f"Force over a slide, {shown(sensor)}")
-        text = f"force on {shown(sensor)} in {shard.name}, the slide of median force."
-        caption = wording.form("Figure 5", text, published)
-        drawn.append(markup.figure(svg, f"{caption} Shaded: the slide."))
-    names = {"speed_raw_m_s": "as measured", "speed_m_s": "median of 3"}
-    speed = {label: 1000 * table[name].to_numpy() for name, label in names.items() if name in table.column_names}
-    speed = {label: values for label, values in speed.items() if np.isfinite(values).any()}
-    if speed:
-        svg = figures.profile(time_s, speed, during, "speed (mm/s)", f"Speed over a slide, {shown(sensor)}")
-        text = f"speed in the same slide, {listed(list(speed))}."
-        drawn.append(markup.figure(svg, wording.form("Figure 6", text, published)))
-    return f'<div class="pair">{"".join(drawn)}</div>'
+    for number, what, quantity, columns, scale in wanted:
+        lines = {label: scale * table[name].to_numpy() for name, label in columns.items() if name in table.column_names}
+        several = [Line(label, time_s, values) for label, values in lines.items() if np.isfinite(values).any()]
+        if several:
+            spec = charts.lines(several, "time (s)", quantity, shade=shade, points=False, height=190)
+            caption = f"{shard.name}, the slide of median force. Shaded: the slide."
+            drawn.append(Chart(wording.form(number, what, published), spec, caption))
+    return drawn

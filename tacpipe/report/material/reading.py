@@ -61,7 +61,9 @@ def _run(run: Run, method: Method) -> Compared:
         if classes:
             sums[headline.CHANCE] = dict.fromkeys(sums[MODEL], np.array([1 / classes, 1.0]))
         part = ", ".join(filter(None, (shown(sensor), other)))
-        questions[Question(part)] = Errors(headline.MEASURE, {name: one for name, one in sums.items() if one})
+        questions[Question(part, place=int(settings["elsewhere"]))] = Errors(
+            headline.MEASURE, {name: one for name, one in sums.items() if one}
+        )
     return Compared(
         run.dataset,
         headline.TASK,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tacpipe.report import markup
-from tacpipe.report.markup import NONE
+from tacpipe.report import blocks
+from tacpipe.report.blocks import NONE, Cell, Table
 from tacpipe.report.material import printed, wording
 from tacpipe.report.material.accuracy import accuracy
 from tacpipe.report.material.methods import Method, kept, shown
@@ -16,22 +16,22 @@ BATCH = 32  # slides, of the paper's batches
 JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 
 
-def tables(methods: Sequence[Method]) -> str:
-    """Return a table a reduced sensor, in the paper's form; empty where no sensor was reduced or other data are shown.
+def tables(methods: Sequence[Method]) -> list[Table]:
+    """Return a table a reduced sensor, in the paper's form; none where no sensor was reduced or other data are shown.
 
     A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
     """
     chosen = [one for one in methods if one.differs_only("subsample_sensor", "few")]
     if not all(one.published for one in chosen):
-        return ""
+        return []
     described = {
         str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("subsample_sensor", "few_of")
     }
-    return "".join(_table(chosen, sensor) for sensor in NUMBERS if sensor in described)
+    return [_table(chosen, sensor) for sensor in NUMBERS if sensor in described]
 
 
-def _table(methods: Sequence[Method], reduced: str) -> str:
+def _table(methods: Sequence[Method], reduced: str) -> Table:
     columns = [(JOINT, "biotac"), (JOINT, "roboskin"), (ALONE, reduced)]
     whole = max(run.trained.get(reduced, 0) for one in methods for run in one.runs)
     rows = []
@@ -43,7 +43,7 @@ def _table(methods: Sequence[Method], reduced: str) -> str:
             if (one.settings["subsample_sensor"], one.settings["subsample_percent"]) == (reduced, ratio)
         ]
         fewer = [one for one in methods if one.settings["few"] and _as_many(one, slides, reduced)]
-        row = [f"{ratio} %", str(slides)]
+        row: list[str | Cell] = [f"{ratio} %", str(slides)]
         for (kind, sensor), paper in zip(columns, printed.REDUCED[reduced][ratio], strict=True):
             found = [one for one in same if one.kind == kind] or [
                 one for one in fewer if one.kind == kind and (kind != JOINT or one.settings["few_of"] == reduced)
@@ -56,10 +56,10 @@ def _table(methods: Sequence[Method], reduced: str) -> str:
     title = (
         f"Table {NUMBERS[reduced]} in the paper's form: accuracy (%) where {shown(reduced)} has fewer training slides"
     )
-    return markup.table(title, [*heads, f"{OURS}, {shown(reduced)}"], rows)
+    return blocks.table(title, [*heads, f"{OURS}, {shown(reduced)}"], rows)
 
 
-def _cell(methods: Sequence[Method], sensor: str) -> str:
+def _cell(methods: Sequence[Method], sensor: str) -> str | Cell:
     """Return the accuracy of that of some methods that has most runs."""
     held = [one for one in methods if one.of(sensor)]
     chosen = max(held, key=lambda one: len(one.of(sensor)), default=None)

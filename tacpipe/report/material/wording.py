@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tacpipe.report.markup import NONE, Markup
+from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.material.accuracy import Accuracy
 from tacpipe.report.material.methods import Method
 
@@ -60,27 +60,26 @@ def p_value(p: float) -> str:
     return NONE if math.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
 
 
-def fraction(found: Accuracy | None) -> str:
+def fraction(found: Accuracy | None) -> Cell:
     """Return an accuracy and its standard deviation over runs, above what it rests on and its interval."""
-    return counted(found.correct, found.evaluated, found.low, found.high, found.sd) if found else NONE
+    return counted(found.correct, found.evaluated, found.low, found.high, found.sd) if found else Cell(NONE)
 
 
-def counted(correct: int, evaluated: int, low: float, high: float, sd: float) -> Markup:
+def counted(correct: int, evaluated: int, low: float, high: float, sd: float) -> Cell:
     """Return a share in percent, with its standard deviation where there is one, above what it rests on.
 
     >>> counted(190, 200, 0.91, 0.97, float("nan"))
-    '95.0<br><small>190/200 · 91.0 to 97.0</small>'
+    Cell(text='95.0', below='190/200 · 91.0 to 97.0', value=0.95)
     """
     spread = "" if math.isnan(sd) else f" ± {percent(sd)}"
-    return Markup(
-        f"{percent(correct / evaluated)}{spread}<br><small>{correct}/{evaluated} · {percent(low)} to {percent(high)}</small>"
-    )
+    below = f"{correct}/{evaluated} · {percent(low)} to {percent(high)}"
+    return Cell(f"{percent(correct / evaluated)}{spread}", below, correct / evaluated)
 
 
-def points_within(mean: float, low: float, high: float) -> Markup:
+def points_within(mean: float, low: float, high: float) -> Cell:
     """Return a difference in points above its interval.
 
     >>> points_within(0.01, -0.02, 0.04)
-    '+1.0<br><small>−2.0 to +4.0</small>'
+    Cell(text='+1.0', below='−2.0 to +4.0', value=0.01)
     """
-    return Markup(f"{points(mean)}<br><small>{points(low)} to {points(high)}</small>")
+    return Cell(points(mean), f"{points(low)} to {points(high)}", mean)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.metrics.proportions import wilson
-from tacpipe.report import markup
-from tacpipe.report.markup import NONE
+from tacpipe.report import blocks
+from tacpipe.report.blocks import NONE, Cell, Fold, Note
 from tacpipe.report.material import wording
 from tacpipe.report.material.methods import Method, Tree, shown
 
@@ -34,9 +34,9 @@ class Untold:
     materials: int  # that a run held out
 
 
-def table(methods: Sequence[Method]) -> str:
-    """Return how often held-out materials are named right across sensors; empty where none were held out."""
-    rows = []
+def folds(methods: Sequence[Method]) -> list[Fold]:
+    """Return how often held-out materials are named right across sensors; nothing where none were held out."""
+    rows: list[list[str | Cell]] = []
     for one in untold(methods):
         rows.append([f"{one.name}, out of all", shown(one.sensor), *_cells(one.trees, one.sensor, one.materials)])
         among = [tree[AMONG] for tree in one.trees if AMONG in tree]
@@ -44,11 +44,10 @@ def table(methods: Sequence[Method]) -> str:
             cells = _cells(among, one.sensor, one.materials)
             rows.append([f"{one.name}, out of those held out", shown(one.sensor), *cells])
     if not rows:
-        return ""
+        return []
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
-    caution = wording.caution(methods)
-    described = markup.table("Zero shot: accuracy on held-out materials", heads, rows)
-    return f"<h3>Materials that one sensor never saw</h3>{described}{markup.note(NOTE + caution)}"
+    described = blocks.table("Zero shot: accuracy on held-out materials", heads, rows)
+    return blocks.fold("Materials that one sensor never saw", described, Note(NOTE), *map(Note, sentences(methods)))
 
 
 def sentences(methods: Sequence[Method]) -> list[str]:
@@ -110,7 +109,7 @@ def _held_out(method: Method, sensor: str) -> int:
     )
 
 
-def _cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str]:
+def _cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str | Cell]:
     """Return what runs state of the held-out materials of one sensor."""
     correct, evaluated, low, high = _counts(trees, sensor, materials)
     if not evaluated:

@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 
 from tacpipe.channels import biotac_sp
-from tacpipe.report import epochs, markup
+from tacpipe.report import learning
+from tacpipe.report.blocks import Chart
 from tacpipe.report.touch import forms, wording
 from tacpipe.report.touch.methods import PAPERS, Group, Method, Run
 
@@ -16,21 +17,21 @@ UNWATCHED = (
 )
 
 
-def section(group: Group) -> str:
-    """Return validation losses of one method an architecture, a figure a target; empty without epochs."""
+def charts_of(group: Group) -> list[Chart]:
+    """Return validation losses of one method an architecture, a chart a target; none without epochs."""
     drawn = []
     for target in (*biotac_sp.TARGETS, ALL):
         curves = {one.name: found for one in group.main if (found := _curves(one, target, "val_loss"))}
         if curves:
             name = wording.TARGETS.get(target, "one network for all targets")
-            svg = epochs.by_epoch(curves, "validation loss", f"Validation loss by epoch, {name}", log=True)
-            caption = f"Validation loss by epoch, {name}, each method's own. Thick: mean over runs; thin: single runs."
-            drawn.append(markup.figure(svg, f"{caption}{_unwatched(group.main)}"))
-    return f'<h4>Training</h4><div class="pair">{"".join(drawn)}</div>' if drawn else ""
+            spec = learning.by_epoch(curves, "validation loss", log=True)
+            caption = "Each method's own loss. Thick: mean over runs; thin: single runs."
+            drawn.append(Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched(group.main)}"))
+    return drawn
 
 
-def figure_8(methods: Sequence[Method]) -> str:
-    """Return Figure 8 in the paper's form: both losses of its network, of most epochs; empty where it was not run."""
+def figure_8(methods: Sequence[Method]) -> list[Chart]:
+    """Return Figure 8 in the paper's form: both losses of its network, of most epochs; none where it was not run."""
     found = [
         (method, target)
         for method in methods
@@ -38,20 +39,17 @@ def figure_8(methods: Sequence[Method]) -> str:
         if method.architecture == PAPERS and _curves(method, target, "train_loss")
     ]
     if not found:
-        return ""
+        return []
     method, target = max(found, key=lambda one: (len(_curves(one[0], one[1], "train_loss")[0]), len(one[0].runs)))
     named = {"training": "train_loss", "validation": "val_loss"}
     curves = {name: described for name, loss in named.items() if (described := _curves(method, target, loss))}
     quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
-    svg = epochs.by_epoch(curves, quantity, "Training and validation loss by epoch", log=True)
-    simulated = " Simulated." if method.simulated else ""
-    text = f"training and validation loss by epoch, {method.name}, {wording.TARGETS.get(target, 'all targets')}."
+    text = f"training and validation loss by epoch, {method.name}, {wording.TARGETS.get(target, 'all targets')}"
     printed = " The paper's figure has 1,000 epochs." if method.published else ""
-    caption = (
-        f"{wording.form('Figure 8', text, method.published)} {wording.basis([method])}{printed}"
-        f"{_unwatched([method])}{simulated}"
-    )
-    return markup.figure(svg, caption)
+    caption = f"{wording.basis([method])}{printed}{_unwatched([method])}{' Simulated.' if method.simulated else ''}"
+    return [
+        Chart(wording.form("Figure 8", text, method.published), learning.by_epoch(curves, quantity, log=True), caption)
+    ]
 
 
 def losses(run: Run, target: str, name: str) -> list[float]:

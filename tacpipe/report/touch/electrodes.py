@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.metrics import regression
-from tacpipe.report import markup
-from tacpipe.report.touch import fingertip, scores, wording
-from tacpipe.report.touch.fingertip import Fingertip
+from tacpipe.report import charts
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
+from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import Method, Run
 from tacpipe.report.touch.predictions import Predictions
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
@@ -23,6 +24,7 @@ EXPLAINED = (
     "perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact lies on a few electrodes: a mean over 24 "
     "hides them."
 )
+LOW = "Counts. Blue: lower than the constant, which is the mean of training grasps, so pressed more; orange: higher."
 
 
 @dataclass(frozen=True)
@@ -35,18 +37,14 @@ class Chosen:
     error: float  # RMSE over the electrodes of both fingers, fraction of the range
 
 
-def section(method: Method) -> str:
-    """Return the electrodes' R² and some grasps; empty where the method predicts no electrodes."""
+def folds(method: Method) -> list[Fold]:
+    """Return the electrodes' R² and some grasps; nothing where the method predicts no electrodes."""
     fingers = [target for target in FINGERS if target in method.targets]
     if not fingers:
-        return ""
+        return []
     drawn = [part for known in (True, False) if (part := _explained(method, fingers, known))]
     pairs = [_pair(method.runs[0].predictions, one, fingers) for one in chosen(method.runs)]
-    low = "Blue: lower than the constant, which is the mean of training grasps, so pressed more; orange: higher."
-    return (
-        f'<h3>Electrodes</h3><div class="pair">{"".join(drawn)}</div>{markup.note(EXPLAINED)}'
-        f"{''.join(pairs)}{markup.note(f'Counts. {low}') if pairs else ''}"
-    )
+    return fold("Electrodes", Charts(drawn), Note(EXPLAINED), *pairs, Note(LOW) if pairs else None, about=method.name)
 
 
 def chosen(runs: Sequence[Run]) -> list[Chosen]:
@@ -68,23 +66,23 @@ def chosen(runs: Sequence[Run]) -> list[Chosen]:
     return [Chosen(place, row, str(rows.recordings[row]), float(error[row])) for place, row in found]
 
 
-def _explained(method: Method, fingers: Sequence[str], known: bool) -> str:
-    """Return the R² of each electrode on known or on novel objects; empty where there are none."""
-    tips = []
+def _explained(method: Method, fingers: Sequence[str], known: bool) -> Chart | None:
+    """Return the R² of each electrode on known or on novel objects; None where there are none."""
+    rows: list[dict[str, object]] = []
     for target in fingers:
         found = scores.by_electrode(method.runs, target, known)
         if found is not None:
             strength = np.nan_to_num(np.clip(found, -1, 1))
-            tips.append(Fingertip(wording.FINGERS[target], strength, [wording.signed_short(value) for value in found]))
-    if not tips:
-        return ""
-    title = f"R² of each electrode on {wording.OBJECTS[known]}"
-    return markup.figure(fingertip.draw(tips, title), f"{title}, {method.name}.")
+            rows += _tip(wording.FINGERS[target], strength, [wording.signed_short(value) for value in found], "R²")
+    if not rows:
+        return None
+    return Chart(f"R² of each electrode, {wording.OBJECTS[known]}", _plane(rows))
 
 
-def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> str:
+def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
     """Return true next to predicted electrodes of one grasp."""
-    tips, errors = [], []
+    tips: list[dict[str, object]] = []
+    errors = []
     for target in fingers:
         finger = wording.FINGERS[target]
         true, predicted = (touch[target][one.row] for touch in (rows.true, rows.predicted[MODEL]))
@@ -92,12 +90,26 @@ def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> str:
         usual = rows.true[target].mean(axis=0) if constant is None else constant[one.row]
         widest = float(np.abs(true - usual).max()) or 1.0
         for title, values in (("true", true), ("predicted", predicted)):
-            texts = [f"{value:.0f}" for value in values]
-            tips.append(Fingertip(f"{finger}, {title}", (usual - values) / widest, texts))
+            tips += _tip(
+                f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts"
+            )
         errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
     known = wording.OBJECTS[bool(rows.known[one.row])].removesuffix("s")
-    caption = (
-        f"{one.place.capitalize()} by error: {one.recording}, {rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of "
-        f"the range; {', '.join(errors)}."
-    )
-    return markup.figure(fingertip.draw(tips, f"True next to predicted electrodes of {one.recording}"), caption)
+    caption = f"{rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of the range; {', '.join(errors)}."
+    return Chart(f"True next to predicted: {one.place} by error, {one.recording}", _plane(tips), caption, wide=True)
+
+
+def _tip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[dict[str, object]]:
+    """Return the electrodes of one fingertip, its skin rolled out flat, the tip up, coloured from -1 to 1."""
+    places = 1000 * biotac_sp.unrolled_m()[:, ::-1]  # (electrode, across and along), mm
+    return [
+        {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(part, -1, 1)), 2), "text": text,
+         "Electrode": number, quantity: text}
+        for number, ((x, y), part, text) in enumerate(zip(places, strength, texts, strict=True), 1)
+    ]  # fmt: skip
+
+
+def _plane(rows: Sequence[dict[str, object]]) -> charts.Spec:
+    spec = charts.plane(rows, list(dict.fromkeys(str(row["panel"]) for row in rows)), size=520, columns=4)
+    spec["usermeta"] |= {"panel": 200, "least": 170}
+    return spec

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from tacpipe.report import markup
-from tacpipe.report.markup import NONE
-from tacpipe.report.touch import figures, printed, scores, tables, wording
+from tacpipe.report import blocks, charts
+from tacpipe.report.blocks import NONE, Block, Cell, Chart, Note
+from tacpipe.report.charts import Dot
+from tacpipe.report.touch import printed, scores, tables, wording
 from tacpipe.report.touch.methods import PAPERS, Method
 from tacpipe.report.touch.scores import Score
 
@@ -91,11 +93,11 @@ ESTIMATED = (
 )
 
 
-def section(methods: Sequence[Method]) -> str:
-    """Return the tables of which at least two rows were run; empty where there is none."""
-    described = "".join(_table(form, methods) for form in FORMS)
+def parts(methods: Sequence[Method]) -> list[Block]:
+    """Return the tables of which at least two rows were run; none where there is none."""
+    described = [one for form in FORMS for one in _table(form, methods)]
     published = all(one.published for one in methods)
-    return f"{described}{markup.note(printed.SCALES if published else '')}" if described else ""
+    return [*described, *([Note(printed.SCALES)] if published and described else [])]
 
 
 def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
@@ -115,17 +117,17 @@ def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
     return max(alike.values(), key=place, default={})
 
 
-def _table(form: Form, methods: Sequence[Method]) -> str:
+def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
     found = family(methods, form)
     if len(found) < 2:
-        return ""
+        return []
     published = all(one.published for one in found.values())
     described = {
         value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names
     }
     least = min((one.each.mean, name) for value, name in form.names.items() if (one := described[value]))[1]
     shown = {value: name for value, name in form.names.items() if published or described[value]}
-    rows = [
+    rows: list[list[str | Cell]] = [
         [name, *tables.cells(described[value]), *(_printed(form, value) if published else [])]
         for value, name in shown.items()
     ]
@@ -143,17 +145,25 @@ def _table(form: Form, methods: Sequence[Method]) -> str:
         ORDER if form.drawn and published else "",
     ]
     notes += [ESTIMATED] if any(one.settings.get("wrist") == "estimated" for one in found.values()) else []
-    drawn = _figure(form, described, dict(baselines)) if form.drawn else ""
-    table = markup.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)
-    return f"{table}{drawn}{markup.note(' '.join(one for one in notes if one))}"
+    drawn = [_chart(form, described, dict(baselines))] if form.drawn else []
+    table = blocks.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)
+    return [table, *drawn, Note(" ".join(one for one in notes if one))]
 
 
-def _printed(form: Form, value: object) -> list[str]:
-    return [markup.with_sd(*form.printed[value], digits=5)] if form.printed else []
+def _printed(form: Form, value: object) -> list[str | Cell]:
+    return [blocks.with_sd(*form.printed[value], digits=5)] if form.printed else []
 
 
-def _figure(form: Form, described: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> str:
-    errors = {form.names[value]: one.each for value, one in described.items() if one}
-    levels = {name: one.each.mean for name, one in baselines.items() if one}
-    svg = figures.settings(errors, levels, "Error by what the network is given")
-    return markup.figure(svg, "Mean and standard deviation over runs; lines are baselines on the same grasps.")
+def _chart(form: Form, described: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> Chart:
+    dots = [
+        Dot(name, one.each.mean, one.each.mean - sd, one.each.mean + sd, kind)
+        for found, kind in (
+            ({form.names[value]: one for value, one in described.items()}, "model"),
+            (baselines, "baseline"),
+        )
+        for name, one in found.items()
+        if one
+        for sd in [0.0 if math.isnan(one.each.sd) else one.each.sd]
+    ]
+    caption = "Mean and standard deviation over runs; grey: baselines on the same grasps."
+    return Chart("Error by what the network is given", charts.ranking(dots, "RMSE (fraction of the range)"), caption)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tacpipe.report import markup
-from tacpipe.report.markup import NONE, Markup
+from tacpipe.report import blocks
+from tacpipe.report.blocks import NONE, Block, Cell, Note
 from tacpipe.report.touch import printed, scores, tables, wording
 from tacpipe.report.touch.methods import DEFAULT, PAPERS, Method
 from tacpipe.report.touch.scores import Score
@@ -14,13 +14,13 @@ TITLE = "Figures 10 and 11", "known objects (test) next to novel ones"
 PARTS = ("RMSE over runs", "R²", "skill")
 
 
-def section(methods: Sequence[Method]) -> str:
+def parts(methods: Sequence[Method]) -> list[Block]:
     """Return the table of the paper's network and that of the default method, where they predicted two targets or more."""
     described = []
     for architecture in (PAPERS, DEFAULT):
         pairs = _pairs([one for one in methods if one.architecture == architecture])
         described.append(max(pairs, key=_weight, default=None))
-    return "".join(_table(*pair) for pair in described if pair)
+    return [one for pair in described if pair for one in _table(*pair)]
 
 
 def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
@@ -43,9 +43,9 @@ def _targets(method: Method, known: bool) -> list[str]:
     return [target for target in method.targets if scores.score(method.runs, target, known)]
 
 
-def _table(known: Method, novel: Method) -> str:
+def _table(known: Method, novel: Method) -> list[Block]:
     published = known.published and novel.published
-    rows: list[list[str]] = []
+    rows: list[list[str | Cell]] = []
     pairs: list[tuple[Score | None, Score | None]] = []
     kinds: dict[int, str] = {}
     for target, name in wording.TARGETS.items():
@@ -68,27 +68,28 @@ def _table(known: Method, novel: Method) -> str:
     evaluated = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
     note = f"{wording.basis(chosen)} {evaluated} {printed.FOUND_ON if published else ''} {wording.caution(chosen)}"
     title = f"{wording.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known.name}"
-    return f"{markup.table(title, heads, rows, kinds)}{markup.note(note)}"
+    return [blocks.table(title, heads, rows, kinds), Note(note)]
 
 
-def _cells(test: Score | None, novel: Score | None) -> list[str]:
+def _cells(test: Score | None, novel: Score | None) -> list[str | Cell]:
     change = NONE
     if test and novel and test.each.mean > 0:
         change = f"{round(100 * (novel.each.mean / test.each.mean - 1)):+d}".replace("-", "−")
     return [*_part(test), *_part(novel), change]
 
 
-def _part(found: Score | None) -> list[str]:
+def _part(found: Score | None) -> list[str | Cell]:
     """Return what `PARTS` name."""
     error, counts, *rest = tables.cells(found)[: len(PARTS) + 1]
-    return [_above_counts(error, counts) if found else NONE, *rest]
+    return [_above_counts(error, str(counts)) if found else NONE, *rest]
 
 
-def _printed(target: str) -> list[str]:
+def _printed(target: str) -> list[str | Cell]:
     one = printed.FINAL[target]
     pairs = ((one.test, one.test_counts), (one.novel, one.novel_counts))
     return [*(_above_counts(f"{percentage:.5f}", str(counts)) for percentage, counts in pairs), f"+{one.change}"]
 
 
-def _above_counts(error: str, counts: str) -> Markup:
-    return Markup(f"{error}<br><small>{counts} counts</small>")
+def _above_counts(error: str | Cell, counts: str) -> Cell:
+    text, value = (error, None) if isinstance(error, str) else (error.text, error.value)
+    return Cell(text, f"{counts} counts", value)

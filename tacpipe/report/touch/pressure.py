@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tacpipe.report import markup
-from tacpipe.report.touch import figures, wording
-from tacpipe.report.touch.figures import Scattered
+from tacpipe.report import charts
+from tacpipe.report.blocks import Chart, Charts, Fold, fold
+from tacpipe.report.touch import wording
 from tacpipe.report.touch.methods import Method
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
@@ -14,26 +14,37 @@ PRESSURES = ("pdc_th", "pdc_mf")
 SHOWN = 800  # grasps of a figure
 
 
-def section(method: Method) -> str:
-    """Return a figure a finger, of the first run; empty where the method predicts no pressure."""
-    drawn = [_figure(method, target) for target in PRESSURES if target in method.runs[0].predictions.targets]
-    return f'<div class="pair">{"".join(drawn)}</div>' if drawn else ""
+def folds(method: Method) -> list[Fold]:
+    """Return a chart a finger, of the first run; nothing where the method predicts no pressure."""
+    rows = method.runs[0].predictions
+    drawn = [_chart(method, target) for target in PRESSURES if target in rows.targets and len(rows.recordings)]
+    return fold("The pressure, predicted and true", Charts(drawn), about=method.name) if drawn else []
 
 
-def _figure(method: Method, target: str) -> str:
+def _chart(method: Method, target: str) -> Chart:
     rows = method.runs[0].predictions
     total = len(rows.recordings)
-    if not total:
-        return ""
     rows = rows.rows(np.unique(np.linspace(0, total - 1, SHOWN).astype(int)))
-    parts = sorted({(not known, str(name)) for known, name in zip(rows.known, rows.objects, strict=True)})
-    objects = []
-    for novel, name in parts:
-        held = rows.rows((rows.objects == name) & (rows.known != novel))
-        objects.append(Scattered(name, novel, held.true[target][:, 0], held.predicted[MODEL][target][:, 0]))
+    values = zip(
+        rows.recordings,
+        rows.objects,
+        rows.known,
+        rows.true[target][:, 0],
+        rows.predicted[MODEL][target][:, 0],
+        strict=True,
+    )
+    dots = [
+        {
+            "name": str(name) if known else f"{name} (novel)",
+            "tip": str(recording),
+            "x": float(true),
+            "y": float(predicted),
+        }
+        for recording, name, known, true, predicted in values
+    ]
     constant = rows.predicted.get(CONSTANT, {}).get(target)
-    level = float("nan") if constant is None else float(constant[0, 0])
+    level = None if constant is None else ("constant", float(constant[0, 0]))
     name = wording.TARGETS[target]
-    svg = figures.scatter(objects, level, "(counts)", f"Predicted over true {name}")
+    spec = charts.scatter(dots, "true (counts)", "predicted (counts)", diagonal=True, level=level)
     some = f"{len(rows.recordings):,} of {total:,}" if len(rows.recordings) < total else f"{total:,}"
-    return markup.figure(svg, f"{name}, {method.name}: {some} unseen grasps of its first run. Line: predicted as true.")
+    return Chart(name, spec, f"{some} unseen grasps of the first run. Line: predicted as true; dashed: the constant.")

@@ -20,13 +20,15 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Floats
     from tacpipe.datasets.dataset import Dataset
 
+USUAL = ("split", "simulated")  # parts of questions
+
 
 def read(results: Sequence[Dataset]) -> list[Compared]:
     """Return the runs of results that hold predictions of grasps which the model has not seen."""
     every = [Run.read(one) for one in results if PREDICTIONS in one.recordings]
     named = methods.grouped([one for one in every if len(one.predictions.recordings)])
-    several = len({(one.split, one.simulated) for one in named}) > 1
-    found = {id(run.dataset): _run(run, method, several) for method in named for run in method.runs}
+    splits = [(one.split, one.simulated) for one in methods.groups(named)]
+    found = {id(run.dataset): _run(run, method, splits) for method in named for run in method.runs}
     return [found[id(one)] for one in results if id(one) in found]
 
 
@@ -39,10 +41,11 @@ def called(predictor: str) -> str:
     return headline.BASELINES.get(predictor, predictor.replace("_", " "))
 
 
-def _run(run: Run, method: Method, several: bool) -> Compared:
+def _run(run: Run, method: Method, splits: Sequence[tuple[str, bool]]) -> Compared:
     questions = {}
     for known in (True, False):
         rows = run.predictions.of(known)
+        place = 2 * splits.index((method.split, method.simulated)) + (not known)
         if not len(rows.recordings):
             continue
         objects = dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
@@ -55,9 +58,11 @@ def _run(run: Run, method: Method, several: bool) -> Compared:
             }
             measure = headline.measure(high - low, "grasps" if known else "objects")
             part = headline.PARTS[known]
-            if several:
+            if len(splits) > 1:
                 part += f", {wording.place(method.split, method.simulated)}"
-            questions[Question(part, headline.TARGETS[target])] = Errors(measure, sums, None if known else objects)
+            questions[Question(part, headline.TARGETS[target], place)] = Errors(
+                measure, sums, None if known else objects
+            )
     return Compared(
         run.dataset,
         headline.TASK,

@@ -13,10 +13,8 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.spread import Spread, spread
 from tacpipe.metrics import regression
-from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.regression import Interval
 from tacpipe.report.touch.methods import Method, Run
-from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 
@@ -85,24 +83,6 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
     )
 
 
-def headline(method: Method, target: str, known: bool | None) -> Headline | None:
-    """Return how a method compares with its baselines on a target; None where it states nothing of it."""
-    errors: dict[str, dict[tuple[object, str], tuple[float, int]]] = {}
-    objects: dict[str, str] = {}
-    for run in method.runs:
-        for predictor in run.predictions.predicted:
-            for rows in _rows([run], target, known, predictor):
-                squared = regression.squared_sums(rows.true, rows.predicted)
-                objects |= dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
-                for name, one in zip(rows.recordings.tolist(), squared.tolist(), strict=True):
-                    key = run.params.get("seed"), name
-                    total, values = errors.setdefault(predictor, {}).get(key, (0.0, 0))
-                    errors[predictor][key] = total + one, values + rows.true.shape[1]
-    model = errors.pop(MODEL, {})
-    low, high = biotac_sp.RANGES[target]
-    return headlines.headline(method.name, target, high - low, model, errors, known, objects, len(method.runs))
-
-
 def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:
     """Return the method whose runs report on a baseline: that with most runs which hold it; None where none does."""
     held = [one for one in methods if any(target in run.predictions.predicted.get(predictor, ()) for run in one.runs)]
@@ -112,12 +92,6 @@ def reference(methods: Sequence[Method], target: str, predictor: str) -> Method 
 def baselines(methods: Sequence[Method]) -> list[str]:
     """Return the predictors that are not a model's own, in the order of their names."""
     return sorted({name for one in methods for run in one.runs for name in run.predictions.predicted if name != MODEL})
-
-
-def best(methods: Sequence[Method], target: str, known: bool | None) -> Method | None:
-    """Return the method of least RMSE on a target; of two that err alike the first."""
-    found = [(described.rmse, one) for one in methods if (described := score(one.runs, target, known))]
-    return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> AnyFloats | None:

@@ -6,8 +6,8 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from tacpipe.report import markup
-from tacpipe.report.markup import NONE
+from tacpipe.report import blocks
+from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.touch import printed
 from tacpipe.report.touch.methods import PAPERS, Method, Run
 from tacpipe.report.touch.scores import Score
@@ -61,19 +61,9 @@ def baseline(predictor: str) -> str:
     return BASELINES.get(predictor, predictor.replace("_", " "))
 
 
-def skill(found: Score) -> str:
+def skill(found: Score) -> Cell:
     """Return a skill over the constant above its interval."""
-    described = markup.sure(*found.skill)
-    return NONE if math.isnan(found.skill.mean) else described
-
-
-def skill_within(found: Score) -> str:
-    """Return a skill and its interval in a sentence."""
-    mean, low, high = found.skill
-    if math.isnan(mean):
-        return "no constant to compare with"
-    described = markup.decimals(mean)
-    return described if math.isnan(low) else f"{described} ({markup.decimals(low)} to {markup.decimals(high)})"
+    return blocks.interval(*found.skill)
 
 
 def percentage(value: float) -> str:

@@ -179,7 +179,7 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str) ->
 
 
 def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
-    """Return past touch (window, context, channel), motion (window, row, 12) and touch to come, for the baselines."""
+    """Return past touch (window, context, channel), motion (window, row, 12) and future touch, for the baselines."""
     starts = part.some(LINEAR)
     at = starts.cpu().numpy()[:, None]
     past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)

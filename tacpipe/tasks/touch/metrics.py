@@ -18,7 +18,7 @@ Tree = dict[str, Any]
 def tree(readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]) -> Tree:
     """Return the measures of one predictor's readings, by measure and target.
 
-    ``rmse`` and ``mae`` are in shares of each target's range (`biotac_sp.RANGES`), over all grasps and electrodes at once;
+    ``rmse`` and ``mae`` are in fractions of each target's range (`biotac_sp.RANGES`), over grasps and electrodes at once;
     ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
     ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over resampled ``clusters``.
     """

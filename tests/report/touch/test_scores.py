@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tacpipe.channels import biotac_sp
@@ -83,7 +82,7 @@ def test_without_a_constant_there_is_no_skill() -> None:
     assert found.rmse == pytest.approx(0.05, abs=1e-6)
 
 
-def test_the_best_method_errs_least_and_baselines_come_from_most_runs() -> None:
+def test_baselines_come_from_most_runs() -> None:
     methods = grouped(
         runs(
             result(off=0.05),
@@ -91,18 +90,6 @@ def test_the_best_method_errs_least_and_baselines_come_from_most_runs() -> None:
             result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=1),
         )
     )
-    best = scores.best(methods, "pdc_th", True)
     source = scores.reference(methods, "pdc_th", "object_mean")
-    assert best is not None and best.name == "trees on geometry and colour"
     assert source is not None and len(source.runs) == 2
-    assert scores.best(methods, "pdc_th", False) is None
     assert scores.baselines(methods) == ["constant", "object_mean"]
-
-
-def test_each_electrode_has_its_own_share_of_explained_variance() -> None:
-    given = runs(result(off=0.05))
-    found = scores.by_electrode(given, "e_th", True)
-    assert found is not None and found.shape == (24,)
-    spread = biotac_sp.normalised("e_th", given[0].predictions.true["e_th"]).std(axis=0)
-    np.testing.assert_allclose(found, 1 - 0.05**2 / spread**2, rtol=1e-3)
-    assert scores.by_electrode(given, "e_th", False) is None

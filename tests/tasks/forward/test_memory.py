@@ -12,7 +12,8 @@ from tacpipe.tasks.forward import evaluation, predictors, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.metrics import Trial
-from tests.stages.learning_fakes import FakeShard, motion
+from tests.fake_recordings import FakeShard
+from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import trained
 
 ROWS = 4000

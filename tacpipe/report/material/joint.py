@@ -1,4 +1,4 @@
-"""What came out, in plain words and no more surely than the slides allow."""
+"""What joint learning changes, in plain words and no more surely than the slides allow."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tacpipe.metrics.headline import Headline, clause
-from tacpipe.report import markup
-from tacpipe.report.material import comparison, curves, tables, wording, zero_shot
-from tacpipe.report.material.accuracy import Accuracy, accuracy, named_right
+from tacpipe.report.blocks import number
+from tacpipe.report.material import comparison, curves, wording
+from tacpipe.report.material.accuracy import Accuracy, accuracy
 from tacpipe.report.material.comparison import Difference
 from tacpipe.report.material.methods import Method, shown
 from tacpipe.report.material.predictions import SWAPPED
-from tacpipe.tasks.material import headline as headlines_of
 
 ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
 APART = 0.2  # of accuracy: where exchanging classifiers costs more, there is no alignment to explain
@@ -24,30 +22,13 @@ NO_CONTROL = (
 )
 
 
-def headlines(methods: Sequence[Method]) -> list[Headline]:
-    """Return how the best method of each sensor compares with its baselines."""
-    plain = [one for one in methods if one.plain]
-    found = (_headline(plain, sensor) for sensor in tables.sensors_of(plain))
-    return [one for one in found if one is not None]
-
-
-def sentences(methods: Sequence[Method]) -> list[tuple[str, str]]:
-    """Return the best method of each sensor with its verdict, what joint learning does, and what controls state.
-
-    Only the first are about baselines, so the others have no verdict.
-    """
-    plain = [one for one in methods if one.plain]
-    found = [_best(plain, sensor) for sensor in tables.sensors_of(plain)]
-    described = []
-    main = comparison.main(plain)
-    if main:
-        described += _joint(main, [one for one in plain if one.kind == "RAEC independent"])
-        described.append(control(main, [one for one in methods if comparison.control(one)]))
-    described += zero_shot.sentences(methods)
-    return [
-        *(one for one in found if one[0]),
-        *((" ".join(described), "") for described in [list(filter(None, described))] if described),
-    ]
+def effects(methods: Sequence[Method]) -> list[str]:
+    """Return what joint learning does, and what controls state of it."""
+    main = comparison.main([one for one in methods if one.plain])
+    if main is None:
+        return []
+    alone = [one for one in methods if one.plain and one.kind == "RAEC independent"]
+    return [*_joint(main, alone), control(main, [one for one in methods if comparison.control(one)])]
 
 
 def control(joint: Method, controls: Sequence[Method]) -> str:
@@ -75,7 +56,7 @@ def control(joint: Method, controls: Sequence[Method]) -> str:
     aligns = apart[1] <= ALIKE * apart[0]
     works = all(costs[1][sensor] - costs[0][sensor] <= LOSS for sensor in costs[0])
     numbers = (
-        f"latent difference {markup.number(apart[1])} against {markup.number(apart[0])}; classifiers exchanged: "
+        f"latent difference {number(apart[1]).text} against {number(apart[0]).text}; classifiers exchanged: "
         + ", ".join(
             f"{shown(sensor)} {wording.percent(swaps[1][sensor].fraction)} % against {wording.percent(one.fraction)} %"
             for sensor, one in swaps[0].items()
@@ -89,38 +70,6 @@ def control(joint: Method, controls: Sequence[Method]) -> str:
     half = "align as well but do not swap as well" if aligns else "swap as well but do not align as well"
     verdict = half if aligns or works else "neither align nor swap as well"
     return f"Pairs of permuted materials {verdict} as real ones ({numbers})."
-
-
-def _best(methods: Sequence[Method], sensor: str) -> tuple[str, str]:
-    """Return which method names most slides of a sensor right, how that compares with the best baseline, and the verdict."""
-    method = tables.leader(methods, sensor)
-    if method is None:
-        return "", ""
-    found, compared = accuracy(method.of(sensor), sensor), _headline(methods, sensor)
-    assert found is not None and compared is not None  # the leader was evaluated
-    several = len([one for one in methods if one.of(sensor)]) > 1
-    best = "is the best method and " if several else ""
-    described = (
-        f"{shown(sensor)}: {method.name} {best}names {_fraction(found)} of unseen slides right; it {clause(compared)}."
-    )
-    return described, compared.verdict
-
-
-def _headline(methods: Sequence[Method], sensor: str) -> Headline | None:
-    """Return how the best method on a sensor compares with its baselines."""
-    method = tables.leader(methods, sensor)
-    if method is None:
-        return None
-    runs = method.of(sensor)
-    right: dict[str, dict[tuple[object, str], tuple[int, int]]] = {}
-    for run in runs:
-        for predictor in run.predictions.predicted:
-            for name, one in named_right(run, sensor, predictor).items():
-                key = run.params.get("seed"), name
-                times, asked = right.setdefault(predictor, {}).get(key, (0, 0))
-                right[predictor][key] = times + one, asked + 1
-    classes = len(runs[0].config.get("classes", ()))
-    return headlines_of.headline(method.name, shown(sensor), right, classes, runs=len(runs))
 
 
 def _joint(joint: Method, others: Sequence[Method]) -> list[str]:
@@ -148,14 +97,6 @@ def _difference(found: Difference) -> str:
     return (
         f"{wording.points(found.mean)} points (95 % interval {wording.points(found.low)} to {wording.points(found.high)}) "
         f"on the same {found.slides} slides, {', '.join(tests)}".replace("= <", "<")
-    )
-
-
-def _fraction(found: Accuracy) -> str:
-    runs = f" in {found.runs} runs" if found.runs > 1 else ""
-    return (
-        f"{wording.percent(found.fraction)} % ({found.correct} of {found.evaluated}{runs}; 95 % interval "
-        f"{wording.percent(found.low)} to {wording.percent(found.high)} %)"
     )
 
 

@@ -1,0 +1,31 @@
+"""What changes over the epochs of training, as lines of a chart: a thin one a run, a thick one their mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.report import charts
+from tacpipe.report.charts import Line
+
+if TYPE_CHECKING:
+    from tacpipe.report.charts import Spec
+
+
+def by_epoch(
+    runs: Mapping[str, Sequence[Sequence[float]]], quantity: str, order: Sequence[str] = (), *, log: bool = False
+) -> Spec:
+    """Return a thin line a run, one value an epoch, and the mean over the runs of each name.
+
+    The mean ends where the first of its runs does. NaN breaks a line.
+    """
+    several = []
+    for name, curves in runs.items():
+        if len(curves) > 1:
+            several += [Line(name, range(1, len(curve) + 1), curve, thin=True) for curve in curves]
+        length = min(map(len, curves))
+        mean = np.mean([curve[:length] for curve in curves], axis=0)
+        several.append(Line(name, range(1, length + 1), mean))
+    return charts.lines(several, "epoch", quantity, order=order, log=log, points=False)

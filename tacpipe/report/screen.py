@@ -1,0 +1,237 @@
+"""The first screen of a section: one sentence, one chart, one table of at most seven rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from tacpipe.comparison.engine import Comparison, Row
+from tacpipe.metrics import headline
+from tacpipe.report import charts
+from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, interval, listed, number
+from tacpipe.report.blocks import table as table_of
+from tacpipe.report.charts import Dot
+from tacpipe.report.context import Context
+
+MOST = 7  # rows of the table
+SHOWN = 4  # methods of a chart, and as many baselines
+CLAUSES = {
+    headline.BETTER: "better than",
+    headline.WORSE: "worse than",
+    headline.UNCLEAR: "not measurably different from",
+}
+
+
+def sentence(context: Context) -> tuple[str, str]:
+    """Return which method is best, by how much over the best baseline and on how much, and the verdict on that."""
+    clauses: list[str] = []
+    verdicts: list[str] = []
+    last, held = "", ("", "")
+    for part, compared in context.parts.items():
+        method = context.winner(part)
+        rows = [(one, row) for one in compared if (row := context.row(one, method)) is not None]
+        if not rows or method is None:
+            continue
+        # parts of other splits or timelines come behind a fold
+        name = "it" if method.name == last else method.name
+        last = method.name
+        verdicts += [verdict(one, row) for one, row in rows]
+        alike = (verdicts[-1], rows[0][1].baseline)
+        if name == "it" and len(rows) == 1 and alike == held and verdicts[-1]:
+            clauses.append(f"on {part} too: {_amount(*rows[0])}")
+        else:
+            clauses.append(_clause(part, name, rows))
+        held = alike
+    if not clauses:
+        return "", ""
+    text = "; ".join(clauses[:2])
+    return f"{text[:1].upper()}{text[1:]}.", verdicts[0] if len(set(verdicts)) == 1 else headline.UNCLEAR
+
+
+def verdict(comparison: Comparison, row: Row) -> str:
+    """Return whether a method is better or worse than its best baseline, as `Headline.verdict` states it."""
+    if not row.baseline or row.n < headline.FEWEST or math.isnan(row.gain.low):
+        return headline.NO_VERDICT
+    return headline.BETTER if row.gain.low > 0 else headline.WORSE if row.gain.high < 0 else headline.UNCLEAR
+
+
+def first_chart(context: Context) -> Chart | None:
+    """Return the best methods and baselines with their intervals, a panel a question."""
+    dots: list[Dot] = []
+    levels: dict[str, float] = {}
+    chosen = _questions(context)
+    many = len(chosen) > 2
+    for one in chosen:
+        panel = (one.question.target if many else one.question.where) if len(chosen) > 1 else ""
+        methods = one.models[: 1 if many else SHOWN]
+        if many and (winner := context.row(one, context.winner(one.question.part))):
+            methods = [winner]
+        best = one.best_baseline
+        baselines = [row for row in one.of("baseline") if row is not best][: 0 if many else 2]
+        shown = [*methods, *([best] if best else []), *baselines]
+        sign = -1 if one.measure.rises else 1
+        for row in sorted(shown, key=lambda row: (math.isnan(row.score.mean), sign * row.score.mean)):
+            score = row.score
+            dots += [Dot(row.name, score.mean, score.low, score.high, row.kind, panel)]
+        if best:
+            levels[panel] = best.score.mean
+    if not any(one.kind == "model" for one in dots):
+        return None
+    measure = chosen[0].measure
+    better = "right" if measure.rises else "left"
+    caption = (
+        f"Blue: methods; grey: baselines; dashed: the best baseline. Better is to the {better}. Bars: 95 % intervals."
+    )
+    where = f", {chosen[0].question.part}" if many and chosen[0].question.part else ""
+    spec = charts.ranking(dots, measure.scored, level=levels, row=20 if many else 24)
+    return Chart(_capital(f"{measure.scored}{where}"), spec, caption)
+
+
+def first_table(context: Context) -> Table | None:
+    """Return the best methods and the best baseline, a row each; of several targets, the best method's row a target."""
+    parts = dict(list(context.parts.items())[:2])
+    if not any(one.models for compared in parts.values() for one in compared):
+        return None
+    targets = list(dict.fromkeys(one.question.target for compared in parts.values() for one in compared))
+    if len(targets) > 1:
+        return _by_target(context, parts, targets)
+    firsts = [compared[0] for compared in parts.values()]
+    names = list(dict.fromkeys(row.name for one in firsts for row in _leaders(one)))[: MOST - 2]
+    baselines = list(dict.fromkeys(row.name for one in firsts for row in [one.best_baseline] if row))
+    baselines = baselines[: MOST - len(names)]
+    single = len(firsts) == 1
+    heads, kinds = [""], dict[int, str]()
+    rows: list[Sequence[str | Cell]] = []
+    for one in firsts:
+        heads += _heads(one, single)
+    for name in [*names, *baselines]:
+        cells: list[str | Cell] = [name]
+        for one in firsts:
+            row = next((row for row in one.rows if row.name == name), None)
+            cells += _cells(one, row, single)
+        if name in baselines:
+            kinds[len(rows)] = "quiet"
+        rows.append(cells)
+    if names:
+        kinds[0] = "best"
+    left = len({row.name for one in firsts for row in one.models}) - len(names)
+    title = "Best methods and the best baseline" + (f"; {counted(left, 'more methods')} below" if left > 0 else "")
+    return table_of(title, heads, rows, kinds)
+
+
+def _by_target(context: Context, parts: dict[str, list[Comparison]], targets: Sequence[str]) -> Table:
+    heads = [""]
+    for part, compared in parts.items():
+        method = context.winner(part)
+        name = method.name if method else ""
+        heads += [f"{part}: {name}", "best baseline", compared[0].measure.name]
+    rows: list[Sequence[str | Cell]] = []
+    for target in targets[:MOST]:
+        cells: list[str | Cell] = [target]
+        for part, compared in parts.items():
+            one = next((one for one in compared if one.question.target == target), None)
+            row = context.row(one, context.winner(part)) if one else None
+            if one is None or row is None:
+                cells += [NONE] * 3
+                continue
+            best = next((base for base in one.of("baseline") if base.name == row.baseline), None)
+            cells += [
+                number(row.values[0]),
+                Cell(number(best.values[0]).text, best.name) if best else NONE,
+                gain(one, row),
+            ]
+        rows.append(cells)
+    measure = next(iter(parts.values()))[0].measure
+    return table_of(f"{measure.columns[0]} by target, and {measure.name} over the best baseline", heads, rows)
+
+
+def gain(comparison: Comparison, row: Row) -> Cell:
+    """Return the gain of a row with its interval."""
+    digits = 1 if comparison.measure.name == "points" else 3
+    return interval(row.gain.mean, row.gain.low, row.gain.high, digits)
+
+
+def _questions(context: Context) -> list[Comparison]:
+    """Return the comparisons of the chart: of the first two parts, or where there are several targets those of one."""
+    parts = list(context.parts.values())
+    several = any(len(one) > 1 for one in parts)
+    return parts[0] if parts and several else [compared[0] for compared in parts[:2]]
+
+
+def _leaders(comparison: Comparison) -> list[Row]:
+    """Return the best method of each family, then others, the best first."""
+    firsts: dict[str, Row] = {}
+    for row in comparison.models:
+        firsts.setdefault(row.family, row)
+    heads = list(firsts.values())[: MOST - 2]
+    held = {row.name for row in heads} | {row.name for row in comparison.models[: MOST - 2 - len(heads)]}
+    more = [row for row in comparison.models if row.name not in held][: max(MOST - 2 - len(held), 0)]
+    return [row for row in comparison.models if row.name in held or row in more]
+
+
+def _heads(one: Comparison, single: bool) -> list[str]:
+    measure = one.measure
+    columns = list(measure.columns[-2:]) if single else [measure.columns[-1]]
+    where = "" if single or not one.question.part else f"{one.question.part}: "
+    return [
+        *(f"{where}{name}" for name in columns),
+        f"{where}{measure.name} over baseline",
+        *(["n"] if single else []),
+    ]
+
+
+def _cells(one: Comparison, row: Row | None, single: bool) -> list[str | Cell]:
+    if row is None:
+        return [NONE] * len(_heads(one, single))
+    values = row.values[-2:] if single else row.values[-1:]
+    count = [Cell(f"{row.n:,}", value=row.n)] if single else []
+    compared = gain(one, row) if row.baseline else Cell("")
+    return [*(number(value) for value in values), compared, *count]
+
+
+def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, Row]]) -> str:
+    where = f"on {part}, " if part else ""
+    if len(rows) == 1:
+        one, row = rows[0]
+        return f"{where}{name} {_verb(one, row)}"
+    found: dict[str, list[str]] = {}
+    for one, row in rows:
+        found.setdefault(verdict(one, row), []).append(one.question.target)
+    counts = []
+    for each in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
+        if each in found:
+            all_of = len(found[each]) == len(rows)
+            which = f"all {len(rows)} targets" if all_of else f"{listed(found[each])}"
+            counts.append(f"{CLAUSES[each]} the best baseline on {which}")
+    if not counts:
+        return (
+            f"{where}{name} was evaluated on {counted(rows[0][1].n, rows[0][0].measure.cluster)}, too few for a verdict"
+        )
+    return f"{where}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
+
+
+def _verb(one: Comparison, row: Row) -> str:
+    size = counted(row.n, one.measure.cluster)
+    if not row.baseline:
+        return f"was evaluated without a baseline, on {size}"
+    said = verdict(one, row)
+    if said == headline.NO_VERDICT:
+        few = f"{size} {'is' if row.n == 1 else 'are'} too few for a verdict"
+        return f"has {_gained(one, row)} over the best baseline, {row.baseline}; {few}"
+    return f"is {CLAUSES[said]} the best baseline, {row.baseline}: {_amount(one, row, '95 % interval ')}"
+
+
+def _amount(one: Comparison, row: Row, called: str = "") -> str:
+    """Return a gain with its interval and what it rests on."""
+    ends = [headline.signed(end, one.measure.name) for end in (row.gain.low, row.gain.high)]
+    interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
+    return f"{_gained(one, row)} ({interval}{counted(row.n, one.measure.cluster)})"
+
+
+def _gained(one: Comparison, row: Row) -> str:
+    gained = headline.signed(row.gain.mean, one.measure.name)
+    return f"{gained} points" if one.measure.name == "points" else f"{one.measure.name} {gained}"
+
+
+def _capital(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"

@@ -1,0 +1,262 @@
+"""The section of a task: its first screen, all methods, what the task's own specification adds, recordings and runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats
+from tacpipe.comparison import engine
+from tacpipe.comparison.engine import Comparison, Row
+from tacpipe.comparison.runs import MODEL, Run, grouped
+from tacpipe.comparison.specification import Task
+from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.report import blocks, charts, plain, provenance, screen
+from tacpipe.report.blocks import NONE, Cell, Chart, Fold, Group, Note, Section, Table, counted, fold, number, p_value
+from tacpipe.report.blocks import Row as Line
+from tacpipe.report.context import Context, median_run
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+RECORDINGS = 60  # rows of a table of recordings
+DOTS = 400  # recordings of a chart
+KINDS = {
+    "baseline": "Baselines",
+    "variant": "The models' own forecasts in another form",
+    "oracle": "Oracles, which know what they predict",
+    "control": "Controls",
+}
+PICKED = "The best of several methods was picked on these very recordings, which flatters it a little."
+SIMULATED = "These recordings were simulated: nothing here is evidence about a real sensor."
+
+
+def section(task: Task, results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> Section:
+    """Return what results of one task state, with datasets that are not results next to them."""
+    runs = task.read(results)
+    methods = grouped(runs, task.usual)
+    compared = {id(one.dataset) for one in runs}
+    bare = [one for one in results if id(one) not in compared]
+    context = Context(task, methods, engine.comparisons(task, methods), others, bare, traces, runs)
+    own = getattr(task.module, "folds", None)
+    described = getattr(task.module, "sentence", screen.sentence)
+    sentence, verdict = described(context)
+    unread = [each for number, one in enumerate(bare, 1) for each in plain.folds(one, number, len(bare))]
+    folds = [
+        *everything(context),
+        *([] if own is None else own(context)),
+        *recordings(context),
+        *every_run(context),
+        *unread,
+        *basis(context),
+        *source(context),
+    ]
+    simulated = context.simulated or any(provenance.simulated(one) for one in bare)
+    if not runs and bare:
+        sentence = plain.sentence(bare)
+    return Section(
+        task.name or "results",
+        f"{task.title[:1].upper()}{task.title[1:]}" or "Results",
+        sentence,
+        verdict,
+        screen.first_chart(context),
+        screen.first_table(context),
+        folds,
+        simulated,
+        _counts(context, results),
+    )
+
+
+def everything(context: Context) -> list[Fold]:
+    """Return all methods by family, then baselines, oracles and controls, a table a question."""
+    tables = [_table(context, one) for one in context.comparisons]
+    if not tables:
+        return []
+    measure = context.comparisons[0].measure
+    note = blocks.notes(
+        headline_caption(measure),
+        "p: that method and best baseline are alike (paired permutation test over the same clusters, seeds as they are), "
+        "not corrected for the number of methods.",
+        "Baselines are those of the runs of one method, because a split has the same for all."
+        if len(context.methods) > 1
+        else "",
+        "A number after a name shows how many more methods of its family there are.",
+    )
+    return fold("All methods and baselines", *tables, note, about=counted(len(context.methods), "methods"))
+
+
+def headline_caption(measure: Measure) -> str:
+    """Return what the columns of a measure mean."""
+    skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
+    points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
+    return (
+        f"Units: {measure.unit}. {points if measure.name == 'points' else skill} Intervals are 95 %, from drawing "
+        f"{measure.cluster} anew (and seeds where there are several), method and baseline on the same ones, 2,000 resamples."
+    )
+
+
+def _table(context: Context, one: Comparison) -> Table:
+    more = getattr(context.task.module, "columns", None)
+    extra = [] if more is None else more(context, one)  # heads and a function of a row
+    families: dict[str, list[Row]] = {}
+    for row in one.models:
+        families.setdefault(row.family, []).append(row)
+    groups = [
+        Group([_line(one, row, extra, "best" if row is one.best else "") for row in rows], folded=len(rows) > 1)
+        for rows in families.values()
+    ]
+    for kind, title in KINDS.items():
+        rows = one.of(kind)  # type: ignore[arg-type]
+        if rows:
+            groups.append(Group([_line(one, row, extra, "quiet") for row in rows], title))
+    score = [] if _same(one) else [one.measure.scored]
+    heads = ["", *one.measure.columns, *score, "interval", "sd over runs", f"{one.measure.name} over the best baseline"]
+    heads += ["best baseline", "p", *(head for head, _ in extra), one.measure.cluster, "recordings", "runs"]
+    return Table(one.question.where if len(context.comparisons) > 1 else "", heads, groups)
+
+
+def _same(one: Comparison) -> bool:
+    """Return whether the score is among the columns already."""
+    return all(row.score.mean == row.values[-1] or np.isnan(row.score.mean) for row in one.rows) or all(
+        row.score.mean == row.values[0] for row in one.rows
+    )
+
+
+def _line(one: Comparison, row: Row, extra: Sequence[tuple[str, Callable[[Row], Cell]]], kind: str) -> Line:
+    score = row.score
+    ends = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
+    cells: list[str | Cell] = [row.name, *(number(value) for value in row.values)]
+    cells += [] if _same(one) else [number(score.mean)]
+    cells += [ends, number(row.spread, 3), screen.gain(one, row), row.baseline or NONE, p_value(row.p)]
+    cells += [make(row) for _, make in extra]
+    cells += [Cell(f"{count:,}", value=count) for count in (row.n, row.recordings, row.runs)]
+    return Line(cells, kind)
+
+
+def recordings(context: Context) -> list[Fold]:
+    """Return how the best method does on each recording of each part, the worst first, and the command to see one."""
+    found: list[blocks.Block] = []
+    for one in context.comparisons:
+        row = context.row(one, context.winner(one.question.part))
+        found += _by_recording(one, row) if row else []
+    if not found:
+        return []
+    command = Note(
+        "To see a recording with what was predicted: `tacpipe view DATASET RECORDING --predictions RESULT`, where DATASET "
+        "was given to `tacpipe evaluate` and RESULT is its output. A click on a name copies its command."
+    )
+    return fold("Recordings", command, *found, about="where the best method fails, and the command to look at it")
+
+
+def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
+    measure, question = one.measure, one.question
+    best = next((base for base in one.of("baseline") if base.name == row.baseline), None)
+    mine = _pooled(row.method.sums(question))
+    others = _pooled(best.method.sums(question, best.predictor)) if best else {}
+    names = sorted(mine)
+    errors, based = (
+        np.array([float(measure.error(held[name][None])[0]) if name in held else np.nan for name in names])
+        for held in (mine, others)
+    )
+    gains = np.asarray(measure.gain(errors, based), np.float64)
+    order = sorted(range(len(names)), key=lambda at: (np.isnan(errors[at]), -errors[at], names[at]))  # the worst first
+    wrong = [at for at in order if errors[at] != 0]
+    digits = 1 if measure.name == "points" else 3
+    rows: list[Sequence[str | Cell]] = []
+    for at in wrong[:RECORDINGS]:
+        name = names[at]
+        values = [number(value) for value in measure.values(mine[name])]
+        base = number(measure.values(others[name])[0]) if name in others else Cell(NONE)
+        gain = Cell(blocks.signed(float(gains[at]), digits), value=None if np.isnan(gains[at]) else float(gains[at]))
+        rows.append([Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, base, gain])
+    found: list[blocks.Block] = []
+    known = gains[~np.isnan(gains)]
+    title = f"{question.where}: {row.name}"
+    if len(known) > 3 and measure.cluster == "recordings":
+        ranked = [at for at in np.argsort(-gains, kind="stable") if not np.isnan(gains[at])]
+        kept = [ranked[at] for at in np.unique(np.linspace(0, len(ranked) - 1, min(len(ranked), DOTS)).astype(int))]
+        dots = [
+            {"x": float(at), "y": float(gains[name]), "name": row.name, "tip": names[name]}
+            for at, name in enumerate(kept, 1)
+        ]
+        quantity = f"{measure.name} over {row.baseline}"
+        spec = charts.scatter(dots, "recordings, the best first", quantity, level=("", 0.0), legend=False, height=170)
+        found.append(Chart(f"{title}, better than {row.baseline} on {int((known > 0).sum())} of {len(known)}", spec))
+    about = f"the {RECORDINGS} worst of {len(names):,}" if len(wrong) > RECORDINGS else "the worst first"
+    right = f"; {len(names) - len(wrong):,} of {len(names):,} are without error" if len(wrong) < len(names) else ""
+    other = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
+    heads = ["recording", *measure.columns, other, measure.name]
+    return [*found, blocks.table(f"{title}, {about}{right}", heads, rows)]
+
+
+def _pooled(sums: Sums) -> dict[str, AnyFloats]:
+    """Return sums by recording, those of several seeds added up."""
+    found: dict[str, AnyFloats] = {}
+    for (_, name), values in sums.items():
+        found[name] = found[name] + values if name in found else values
+    return found
+
+
+def every_run(context: Context) -> list[Fold]:
+    """Return one row a run."""
+    about: Callable[[Run], Mapping[str, str | Cell]] = getattr(context.task.module, "about_run", lambda _: {})
+    rows: list[Sequence[str | Cell]] = []
+    for method in context.methods:
+        for run in sorted(method.runs, key=lambda run: (str(run.fold), str(run.seed))):
+            cells: list[str | Cell] = [
+                method.name,
+                *(NONE if one is None else str(one) for one in (run.fold, run.seed)),
+            ]
+            for one in context.comparisons:
+                sums = run.questions[one.question].sums.get(MODEL, {}) if one.question in run.questions else {}
+                cells += [
+                    number(one.measure.score_of(sums.values())) if sums else NONE,
+                    f"{len(sums):,}" if sums else NONE,
+                ]
+            rows.append([*cells, *about(run).values()])
+    if not rows:
+        return []
+    heads: list[str] = ["", "fold", "seed"]
+    for one in context.comparisons:
+        heads += [f"{one.question.where}: {one.measure.scored}", "recordings"]
+    heads += list(about(context.runs[0]))
+    return fold("Every run", blocks.table("", heads, rows), about=counted(len(rows), "runs"))
+
+
+def basis(context: Context) -> list[Fold]:
+    """Return what the numbers rest on and cannot show."""
+    own = getattr(context.task.module, "caveats", None)
+    texts = [] if own is None else list(own(context))
+    texts += [PICKED] if len(context.methods) > 1 else []
+    texts += [SIMULATED] if context.simulated else []
+    texts += ["No recording above is one that its model was trained on."] if context.runs else []
+    return [Fold("What these numbers rest on", [Note(one) for one in texts if one])] if texts else []
+
+
+def source(context: Context) -> list[Fold]:
+    """Return where the best method's median run comes from."""
+    if not context.comparisons:
+        return [Fold("Where it comes from", provenance.parts(one.manifest)) for one in context.bare[:1]]
+    first = context.comparisons[0]
+    method = context.winner(first.question.part) or context.methods[0]
+    run = median_run(method, first)
+    params = ", ".join(f"{name} = {json.dumps(value, default=str)}" for name, value in sorted(run.settings.items()))
+    note = Note(f"A run of {method.name}{f', seed {run.seed}' if run.seed is not None else ''}, with {params}.")
+    return [Fold("Where it comes from", [note, *provenance.parts(run.dataset.manifest)])]
+
+
+def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
+    found = []
+    if context.methods:
+        found.append(counted(len(context.methods), "methods"))
+    if len(results) > 1:
+        found.append(counted(len(results), "results"))
+    held = {name for run in context.runs for errors in run.questions.values() for name in errors.sums.get(MODEL, {})}
+    if held:
+        names = {one.measure.cluster for one in context.comparisons}
+        word = next(iter(names)) if len(names) == 1 else context.comparisons[0].measure.cluster
+        found.append(counted(len(held), word))
+    return found

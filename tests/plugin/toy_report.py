@@ -1,0 +1,51 @@
+"""How results of a third party's task, the weights of things, are compared and reported."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.metrics.pairing import Measure
+
+if TYPE_CHECKING:
+    from tacpipe.arrays import AnyFloats
+    from tacpipe.datasets.dataset import Dataset
+
+TITLE = "weights of things"
+
+
+def error(sums: AnyFloats) -> AnyFloats:
+    """Return the mean absolute error (draw,) of sums (draw, 2): errors in grams, and how many there are."""
+    found: AnyFloats = sums[:, 0] / sums[:, 1]
+    return found
+
+
+WEIGHT = Measure(
+    columns=("MAE (g)",),
+    unit="grams",
+    ranked_by="the mean absolute error",
+    name="skill",
+    cluster="things",
+    error=error,
+    gain=lambda one, other: 1 - one / other,
+    values=lambda sums: (float(sums[0] / sums[1]),),
+    scored="MAE (g)",
+)
+
+
+def read(results: Sequence[Dataset]) -> list[Run]:
+    """Return a run a result: what the model and each baseline err on each thing."""
+    runs = []
+    for result in results:
+        config, errors = (json.loads(result.files[name]) for name in ("config.json", "errors.json"))
+        sums = {
+            predictor: {thing: np.array([grams, 1.0]) for thing, grams in by_thing.items()}
+            for predictor, by_thing in errors.items()
+        }
+        about = {"method": config["architecture"], "settings": config["params"], "seed": config.get("seed")}
+        runs.append(Run(result, "weighing", **about, questions={Question("light things"): Errors(WEIGHT, sums)}))
+    return runs

@@ -1,0 +1,14 @@
+"""Curves over the epochs of training."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tacpipe.report import learning
+
+
+def test_runs_are_thin_lines_and_their_mean_a_thick_one_as_long_as_the_shortest() -> None:
+    rows = learning.by_epoch({"a": [[1.0, 0.5], [1.0, 0.4, 0.3]], "b": [[1.0]]}, "loss", log=True)["data"]["values"]
+    thick = [(row["name"], row["x"], row["y"]) for row in rows if not row["thin"]]
+    assert thick == [("a", 1.0, 1.0), ("a", 2.0, np.mean([0.5, 0.4])), ("b", 1.0, 1.0)]
+    assert sum(row["thin"] for row in rows) == 5
