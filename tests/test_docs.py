@@ -37,6 +37,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
             "tutorials/own-data",
             "howto/hdf5",
             "howto/view",
+            "howto/report",
             "howto/export",
             "howto/format",
             "tutorials/ci-and-dvc",
@@ -386,7 +387,7 @@ def test_what_runs_where_is_as_contributing_states() -> None:
     first = text.split("\n\n")[1]
 
     for words in shlex.split(targets):
-        target, _, options = words.replace("$third", "2").partition(" ")
+        target, _, options = re.sub(r"\$\(\(commits % \d+ \+ 1\)\)", "2", words).partition(" ")
         assert f"{target}:" in make and f"make {target}" in first
         assert f"`make {target}{options and ' ' + options}`" in text
     for marker in ("long", "rig", "faults"):

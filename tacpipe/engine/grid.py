@@ -15,7 +15,7 @@ from tacpipe.engine.request import Request
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress
 
-PLACE = "{fold}"  # stands for the number of the fold in paths
+PLACE = "{fold}"  # is replaced by the number of the fold in paths
 _PATHS = ("model", "source", "split", "codec", "extend", "init")
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
 

@@ -46,7 +46,7 @@ class Request:
     extend: Path | None = None
     init: Path | None = None
     jobs: int = 0
-    executor: str = ""  # NAME or NAME://ADDRESS; empty: as the environment says, or this computer
+    executor: str = ""  # NAME or NAME://ADDRESS; empty: that of the environment, or this computer
     skip_bad: bool = False
     check: bool = False
     compare: bool = False

@@ -253,12 +253,12 @@ def _check(name: str, wanted: Mapping[str, Any], task: Task) -> None:
 
 
 def _at_work(run: str) -> bool:
-    """Return whether the command that began a run goes on, as far as its lease shows."""
+    """Return whether the command that began a run is still at work, as far as its lease shows."""
     return os.path.exists(run)  # noqa: PTH110
 
 
 def _lease(task: Task) -> str:
-    """Return a lease of this worker's own, which announces the objects it makes for as long as the task's run goes on.
+    """Return a lease of this worker's own, which announces the objects it makes for as long as the task's run is at work.
 
     Two computers do not write to one lease: on a network file system one would overwrite what the other announces.
     """
