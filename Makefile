@@ -93,7 +93,7 @@ test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight othe
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 35 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one
 	@$(exhaustive)
 	@$(EXHAUSTIVE) tests/promises
 	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
