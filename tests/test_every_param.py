@@ -399,7 +399,10 @@ def test_the_command_line_names_no_stage() -> None:
         ("compress autoencoder nowhere --split s --hidden 64,x", "each item a whole number of 1 or more"),
         ("compress autoencoder nowhere --split s --hidden 8 --search 3", "search is 3, which tries its own"),
         ("evaluate nowhere nowhere --split s --role best", "--role is 'best'; it must be one of train, val, test."),
-        ("evaluate nowhere nowhere --split s --fold -1", "--fold is -1; it must be a whole number of 0 or more."),
+        (
+            "evaluate nowhere nowhere --split s --fold -1",
+            "--fold is '-1'; it must be a fold as 2, or several as 0-4 or 0,2,5.",
+        ),
         ("predict nowhere nowhere --steps 1,0", "--steps is '1,0'; it must be a comma-separated list, each item a"),
         ("simulate touch --families box,pyramid", "--families is 'box,pyramid'; it must be a comma-separated list"),
         ("simulate touch --raw --spheres", "raw and spheres are both set"),

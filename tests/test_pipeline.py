@@ -373,3 +373,11 @@ def test_a_pool_of_processes_gives_the_same_as_one(lab: Lab) -> None:
         path.unlink()
     assert counts(lab.run("scale data/r -o data/b --jobs 1 --json").out) == (20, 0)
     assert Path("data/b/manifest.json").read_bytes() == pooled
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are counted as Linux lists them")
+def test_recordings_computed_in_one_process_leave_no_file_open(lab: Lab) -> None:
+    lab.run("simulate toy -o data/rec --trials 20 --jobs 1")
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    lab.run("scale data/rec -o data/out --jobs 1")
+    assert len(list(Path("/proc/self/fd").iterdir())) <= before

@@ -84,6 +84,8 @@ def compute(task: Task) -> Done:
             (store.root / "checkpoints" / key).rmdir()
         at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
         return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
+    finally:
+        store.close()
 
 
 class _Scratch:

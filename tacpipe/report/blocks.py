@@ -168,7 +168,7 @@ def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
     """Return a signed number above its interval, where that is more than a point.
 
     >>> interval(0.5, 0.25, 0.75)
-    Cell(text='+0.500', below='+0.250 to +0.750', value=0.5)
+    Cell(text='+0.500', below='+0.250 to +0.750', value=0.5, copy='')
     """
     if math.isnan(mean):
         return Cell(NONE)

@@ -110,6 +110,11 @@ class Store:
                 if path.name.startswith(f"{Path(self.run).stem}."):
                     path.unlink(missing_ok=True)
 
+    def close(self) -> None:
+        """Keep no file open: whoever opens a store for each of many tasks would run out of them."""
+        if self._run is not None:
+            self._run.close()
+
     @property
     def run(self) -> str:
         """The lease of the run at work, for the processes that work for it; empty where nobody stated so."""

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import Lab, Ran, tacpipe
+
 GIVE_UP_S = 300.0  # only what hangs takes so long
 
 
@@ -64,7 +66,27 @@ class Cluster:
         raise AssertionError((self.folder / f"{name}.log").read_text())
 
 
-@pytest.fixture(scope="session")
+class Apart(Lab):
+    """A project whose commands that use Dask run in processes of their own: its threads and files would stay in this one."""
+
+    def __init__(self, lab: Lab) -> None:
+        super().__init__(lab.folder, self._call)
+        self.inside = lab.call  # in this process, where something is replaced
+
+    def _call(self, command: str) -> Ran:
+        if "dask" not in command:
+            return self.inside(command)
+        done = tacpipe(self.folder, command)
+        return Ran(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture
+def lab(lab: Lab) -> Apart:
+    """An empty project with the plug-in."""
+    return Apart(lab)
+
+
+@pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory, plugin: Path) -> Iterator[str]:
     """The executor of two workers that find the plug-in of ``lab``."""
     pytest.importorskip("distributed", reason="the extra dask is not installed")

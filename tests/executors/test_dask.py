@@ -11,6 +11,7 @@ import pytest
 from tacpipe.engine.execution import Task
 from tacpipe.engine.executors import agreement, dask
 from tests.conftest import Lab
+from tests.executors.conftest import Apart
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 
@@ -32,11 +33,11 @@ def test_a_scheduler_that_must_not_or_cannot_be_reached_is_refused(lab: Lab, add
     assert named in ran.err
 
 
-def test_a_scheduler_that_does_not_answer_is_named(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_does_not_answer_is_named(lab: Apart, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="the extra dask is not installed")
     monkeypatch.setattr(dask, "_CONNECT_S", 0.2)
     lab.run("simulate toy -o data/rec --jobs 1")
-    ran = lab.call("scale data/rec -o data/out --executor dask://127.0.0.1:1")
+    ran = lab.inside("scale data/rec -o data/out --executor dask://127.0.0.1:1")
     assert ran.code == 1
     assert "127.0.0.1:1" in ran.err
     assert "Traceback" not in ran.err
@@ -56,23 +57,25 @@ def test_a_record_names_the_worker(lab: Lab, scheduler: str) -> None:
 
 @pytest.mark.long
 def test_a_worker_with_other_versions_is_refused_in_one_sentence(
-    lab: Lab, scheduler: str, monkeypatch: pytest.MonkeyPatch
+    lab: Apart, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
     here = agreement.here
     monkeypatch.setattr(agreement, "here", lambda stage: {**here(stage), "numpy": "0.1"})
-    ran = lab.call(f"scale data/rec -o data/out --executor {scheduler}")
+    ran = lab.inside(f"scale data/rec -o data/out --executor {scheduler}")
     assert ran.code == 2
     assert "(here 0.1)" in ran.err
     assert "Traceback" not in ran.err
 
 
 @pytest.mark.long
-def test_a_worker_that_sees_another_store_is_refused(lab: Lab, scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_sees_another_store_is_refused(
+    lab: Apart, scheduler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
     absolute = dask._absolute
     monkeypatch.setattr(dask, "_absolute", lambda task: replace(absolute(task), run=f"{task.run}-of-another"))
-    ran = lab.call(f"scale data/rec -o data/out --executor {scheduler}")
+    ran = lab.inside(f"scale data/rec -o data/out --executor {scheduler}")
     assert ran.code == 1
     assert str(lab.folder) in ran.err
 

@@ -73,7 +73,7 @@ BREAKS = {
     "a file is written in its place": (
         "def write(path, content, draft, *, mode=0o666, exclusive=False):\n"
         "    Path(path).parent.mkdir(parents=True, exist_ok=True)\n"
-        "    return bool(Path(path).write_bytes(content))\n"
+        "    return bool(Path(path).write_bytes(content if isinstance(content, bytes) else b''.join(content)))\n"
         "store.write_whole = directory.write_whole = write\n"
     ),
     "nothing is synced": (

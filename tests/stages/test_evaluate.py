@@ -37,7 +37,7 @@ def test_a_model_with_a_codec_is_evaluated_in_counts_beside_the_codecs_own_loss(
     assert metrics["codec"]["mse_latent"]["mean"] == 0
     assert metrics["codec"]["mse_counts"]["both"]["mean"] > 0
     assert set(result.files) == {
-        *("metrics.json", "horizons.csv", "trials.csv", "errors.parquet", "headline.json"),
+        *("metrics.json", "summary.json", "horizons.csv", "trials.csv", "errors.parquet", "headline.json"),
         *("config.json", "history.jsonl", "codec.json"),
     }
     assert set(result.recordings) == {"trial-20", "trial-21"}

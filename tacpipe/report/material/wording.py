@@ -69,7 +69,7 @@ def counted(correct: int, evaluated: int, low: float, high: float, sd: float) ->
     """Return a share in percent, with its standard deviation where there is one, above what it rests on.
 
     >>> counted(190, 200, 0.91, 0.97, float("nan"))
-    Cell(text='95.0', below='190/200 · 91.0 to 97.0', value=0.95)
+    Cell(text='95.0', below='190/200 · 91.0 to 97.0', value=0.95, copy='')
     """
     spread = "" if math.isnan(sd) else f" ± {percent(sd)}"
     below = f"{correct}/{evaluated} · {percent(low)} to {percent(high)}"
@@ -80,6 +80,6 @@ def points_within(mean: float, low: float, high: float) -> Cell:
     """Return a difference in points above its interval.
 
     >>> points_within(0.01, -0.02, 0.04)
-    Cell(text='+1.0', below='−2.0 to +4.0', value=0.01)
+    Cell(text='+1.0', below='−2.0 to +4.0', value=0.01, copy='')
     """
     return Cell(points(mean), f"{points(low)} to {points(high)}", mean)

@@ -89,7 +89,7 @@ def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[
 
 
 class _Predictions(Mapping[str, Prediction]):
-    """The predictions of each predictor for some windows, made again each time that they are asked for."""
+    """The predictions of each predictor for some windows, computed each time that they are asked for."""
 
     def __init__(self, forecaster: Forecaster, track: Track, some: Forecast) -> None:
         self._forecaster, self._track, self._some = forecaster, track, some
