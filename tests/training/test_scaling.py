@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -60,4 +61,4 @@ def test_an_affine_scaling_restores_by_hand() -> None:
     fitted = scaling.Affine(np.array([2500.0, 100.0]), np.array([900.0, 3500.0]))
     assert fitted.restore(shares).tolist() == [[2500.0, 3600.0], [2950.0, -3400.0]]
     heavy = scaling.Affine(np.zeros(1), np.array([2.0]), logarithm=True)
-    np.testing.assert_allclose(heavy.restore(np.array([[0.0], [0.5]], np.float32)), [[0.0], [np.e - 1]], rtol=1e-7)
+    np.testing.assert_allclose(heavy.restore(np.array([[0.0], [0.5]], np.float32)), [[0.0], [math.e - 1]], rtol=1e-7)
