@@ -531,6 +531,8 @@ def test_a_command_names_what_it_left_out_and_keeps_it_in_the_attributes(lab: La
     ],
 )
 def test_a_bag_of_others_is_read(path: str, rows: dict[str, int], skipped: int) -> None:
+    if not (sample_data() / "foreign" / path).exists():
+        pytest.skip("the published bags are not here")
     contents = read(sample_data() / "foreign" / path)
     found = {one.name: one.table.num_rows for one in contents.streams}
     assert {name: found.get(name) for name in rows} == rows
