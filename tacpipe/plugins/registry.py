@@ -122,10 +122,7 @@ def tasks() -> list[str]:
 
 def load_task(name: str) -> Any:
     """Return the module of the task of this name."""
-    target = entry_points()[TASKS].get(str(name))
-    if target is None:
-        raise UsageError(f"There is no task {plain(str(name))}; there are {', '.join(tasks())}.")
-    return _import(name, target)
+    return _named(TASKS, "task", name)
 
 
 def load_report(task: str) -> Any:
@@ -155,10 +152,7 @@ def load_sensor(name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    target = sensors().get(name)
-    if target is None:
-        raise UsageError(f"There is no sensor {plain(name)}; there are {', '.join(sensors())}.")
-    return _import(name, target)
+    return _named(SENSORS, "sensor", name)
 
 
 def load_executor(name: str) -> Any:
@@ -166,11 +160,7 @@ def load_executor(name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    target = entry_points()[EXECUTORS].get(name)
-    if target is None:
-        names = ", ".join(sorted(entry_points()[EXECUTORS]))
-        raise UsageError(f"There is no executor {plain(name)}; there are {names}.")
-    return _import(name, target)
+    return _named(EXECUTORS, "executor", name)
 
 
 def trackers() -> dict[str, str]:
@@ -183,9 +173,15 @@ def load_tracker(name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    target = trackers().get(name)
+    return _named(TRACKERS, "tracker", name)
+
+
+def _named(group: str, what: str, name: Any) -> Any:
+    """Return what an entry point of a group names; ``name`` may be anything that a file holds."""
+    found = entry_points()[group]
+    target = found.get(str(name))
     if target is None:
-        raise UsageError(f"There is no tracker {plain(name)}; there are {', '.join(trackers())}.")
+        raise UsageError(f"There is no {what} {plain(str(name))}; there are {', '.join(sorted(found))}.")
     return _import(name, target)
 
 
@@ -220,9 +216,7 @@ def _package(target: str) -> str | None:
     found = (point.dist for group in GROUPS for point in every(group=group) if point.value == target)
     try:
         return next((one.name for one in found if one is not None), None)
-    except (
-        FileNotFoundError
-    ):  # `importlib_metadata`, which takes over where it was imported, wants metadata to be there
+    except FileNotFoundError:  # once `importlib_metadata` was imported it answers, and raises where metadata is missing
         return None
 
 
