@@ -112,8 +112,6 @@ class ByRecording:
                 if done.record is None:
                     bad[done.recording] = done
                     continue
-                if executor.elsewhere:  # whose announcements end with the worker
-                    self.store.announce(records.named(done.record["result"]))
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
                 self.outcome.add_record(name, done.recording, done.record)

@@ -294,15 +294,9 @@ class _Run:
             rerun=self.request.rerun,
             run=self.store.run,
         )
-        executor = self.chosen.opened()
-        if executor.elsewhere:
-            (done,) = executor.run(execution.compute, [task], [])
-        else:
-            done = execution.compute(task)
+        (done,) = self.chosen.opened().run(execution.compute, [task], [])
         if done.record is None:
             raise by_recording.error(done.exit_code, done.error)
-        if executor.elsewhere:
-            self.store.announce(records.named(done.record["result"]))
         self.outcome.add_record(name, "", done.record)
         made: Mapping[str, Any] = done.record["result"]
         if self.request.compare and known and record is not None:

@@ -28,6 +28,7 @@ from tacpipe.engine.processor import usable_cores
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress, termination
 from tacpipe.plugins import extras
+from tacpipe.store import records
 from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
@@ -71,8 +72,6 @@ def encrypted(address: str, jobs: int) -> Iterator[Dask]:
 class Dask:
     """The workers that a client of Dask reaches."""
 
-    elsewhere = True
-
     def __init__(self, client: Client) -> None:
         self.client = client
         self._scheduler = str(client.scheduler_info(n_workers=0)["address"])
@@ -91,9 +90,14 @@ class Dask:
         futures = [self.client.submit(_work, wanted, compute, chunk, pure=False) for chunk in given]
         what = f"{len(tasks)} tasks were given to {workers} workers"
         with termination.reporting(f"tacpipe: interrupted; {what}: those that wait are cancelled, those at work end."):
+            store = Store(tasks[0].store, tasks[0].run)
             try:
-                yield from self._results(futures, tasks[0].name)
+                for done in self._results(futures, tasks[0].name):
+                    if done.record is not None:  # a worker announces it too, until that worker ends
+                        store.announce(records.named(done.record["result"]))
+                    yield done
             finally:
+                store.close()
                 with contextlib.suppress(Exception):  # the scheduler forgets them in any case when the client goes
                     self.client.cancel(futures)  # type: ignore[no-untyped-call]
 

@@ -21,13 +21,12 @@ class Executor(Protocol):
     how many processes were asked for, 0 for as many as are sensible.
     """
 
-    elsewhere: bool  # tasks over whole datasets go there too; they are computed in the command's own process otherwise
-
     def run(self, compute: Callable[[Any], Any], tasks: Sequence[Any], preload: Sequence[str]) -> Iterator[Any]:
         """Yield ``compute(task)`` of every task (`tacpipe.engine.execution.Task`), in any order.
 
         ``preload`` are modules that a worker will need. Raises `TacpipeError` where tasks cannot be computed there; what
-        was finished is in the store by then. Where the iterator is closed, nothing that waits is begun.
+        was finished is in the store by then. Where the iterator is closed, nothing that waits is begun. What a result
+        names is announced in the lease of the tasks' run before the result is yielded.
         """
         ...  # a protocol has no body
 

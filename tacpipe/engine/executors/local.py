@@ -25,8 +25,6 @@ _POOL_FROM = 8  # starting workers costs more than a few shards
 class Local:
     """Processes of this computer."""
 
-    elsewhere = False
-
     def __init__(self, jobs: int, pool_from: int = _POOL_FROM) -> None:
         """Take the number of processes, 0 for one a usable core, and how many tasks are worth starting them."""
         self.jobs, self._pool_from = jobs or usable_cores(), pool_from
