@@ -13,7 +13,7 @@ import typer
 
 from tacpipe.engine import by_recording, grid, pipeline
 from tacpipe.engine.outcome import Outcome
-from tacpipe.engine.request import OPTIONS, Request
+from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
@@ -65,7 +65,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
-    paths: dict[str, Any] = {key: given.get(key) for key in ("model", "source", "split", "codec", "extend", "init")}
+    paths: dict[str, Any] = {key: given.get(key) for key in PATHS}
     request = Request(
         name,
         params,

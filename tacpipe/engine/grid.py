@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress
 
 PLACE = "{fold}"  # is replaced by the number of the fold in paths
-_PATHS = ("model", "source", "split", "codec", "extend", "init")
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
 
 
@@ -53,16 +52,9 @@ def _of(request: Request, number: int) -> Request:
     def path(given: Path) -> Path:
         return Path(str(given).replace(PLACE, str(number)))
 
-    named: Mapping[str, Any] = {name: path(given) for name in _PATHS if (given := getattr(request, name)) is not None}
+    named: Mapping[str, Any] = {name: path(given) for name, given in request.named.items()}
     datasets = [path(given) for given in request.datasets]
     return replace(request, fold=number, output=path(request.output), datasets=datasets, **named)
-
-
-@dataclass(frozen=True)
-class _Ran:
-    position: int
-    outcome: Outcome | None
-    error: TacpipeError | None = None
 
 
 def run(given: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome | TacpipeError]]:
@@ -73,17 +65,15 @@ def run(given: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome 
     tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(given)]
     pool = Local(jobs, pool_from=2)
     with progress.bar(f"{given[0].name}, folds", len(given)) as advance:
-        for ran in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
-            advance(note=str(given[ran.position].output))
-            became = ran.error or ran.outcome
-            assert became is not None
-            yield given[ran.position], became
+        for position, became in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
+            advance(note=str(given[position].output))
+            yield given[position], became
 
 
-def _run(task: tuple[int, Request]) -> _Ran:
+def _run(task: tuple[int, Request]) -> tuple[int, Outcome | TacpipeError]:
     position, request = task
     with progress.shown(False):
         try:
-            return _Ran(position, pipeline.run(request))
+            return position, pipeline.run(request)
         except TacpipeError as error:
-            return _Ran(position, None, error)
+            return position, error

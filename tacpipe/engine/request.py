@@ -29,6 +29,10 @@ OPTIONS = {
 }
 
 
+DATASETS = ("model", "split", "codec", "extend", "init")  # given by name
+PATHS = (*DATASETS, "source")
+
+
 @dataclass(frozen=True)
 class Request:
     """What a command was asked to do."""
@@ -57,8 +61,12 @@ class Request:
     @property
     def reads(self) -> list[Path]:
         """All that was given to read: datasets, model, split and the like, the folder of a published source."""
-        named = (self.model, self.split, self.codec, self.extend, self.init, self.source)
-        return [*self.datasets, *(path for path in named if path is not None)]
+        return [*self.datasets, *self.named.values()]
+
+    @property
+    def named(self) -> dict[str, Path]:
+        """What was given to read by its argument's name: all but datasets."""
+        return {name: path for name in PATHS if (path := getattr(self, name)) is not None}
 
     @property
     def single_file(self) -> bool:
@@ -74,9 +82,7 @@ class Inputs:
         self.stage = registry.load(request.name)
         self.datasets = [manifest.find(path) for path in request.datasets]
         self.named: dict[str, Found] = {
-            name: manifest.find(path)
-            for name in ("model", "split", "codec", "extend", "init")
-            if (path := getattr(request, name)) is not None
+            name: manifest.find(path) for name, path in request.named.items() if name in DATASETS
         }
         self.notes: list[str] = []  # what the user should know though nothing failed
         self.sources = _discover(self.stage, request)
