@@ -1,4 +1,4 @@
-"""What the page states of forecasts beyond the comparison: by time ahead, channel, plan and timeline, and single runs."""
+"""What the page states of forecasts beyond the comparison: by time ahead, channel, plan and timeline."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.metrics import pairing
 from tacpipe.metrics.forecast import Interval
 from tacpipe.report import blocks, charts, contents
-from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, counted, fold, number, table
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
 from tacpipe.report.forward import methods as by_method
-from tacpipe.report.forward import reading, representations, traces
+from tacpipe.report.forward import reading, representations, single_run, traces
 from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.tasks.forward import headline, units
 
@@ -34,21 +34,6 @@ LINES = 4  # methods in a figure of skill, the paper's not counted
 FLOOR = -1.0  # skill at which figures end
 TRACE_STEPS = (1, 5, 10)
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
-OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
-EXPLAINED = {
-    "model": "the trained model",
-    "persistence": "nothing changes: the last frame is held",
-    "codec_persistence": "the last frame is held after going through the codec",
-    "codec": "the true future through the codec, which is what compression alone costs",
-    "model_anchored": "the model's forecast, moved so that it continues from the last frame",
-    "codec_anchored": "the true future through the codec, moved so that it continues from the last frame",
-    "context_mean": "the mean of the frames the model reads",
-    "train_mean": "the mean of the training recordings",
-    "damped_trend": "the last frames' trend continues and fades",
-    "last_value_linear": "a linear map of the frames the model reads, the last frame taken off them",
-    "ridge": "ridge regression of the changes to come on those of the frames the model reads",
-    "ridge_actions": "the same with the planned motion",
-}
 
 
 def folds(context: Context) -> list[Fold]:
@@ -130,7 +115,7 @@ def caveats(context: Context) -> list[str]:
         "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it perfectly."
         if any(by_method.actions(run.config) == "planned" for run in runs)
         else "",
-        "; ".join(f"{name}: {EXPLAINED[name]}" for name in _predictors(context)) + ".",
+        "; ".join(f"{name}: {single_run.EXPLAINED[name]}" for name in _predictors(context)) + ".",
     ]  # fmt: skip
 
 
@@ -394,141 +379,12 @@ def _training(context: Context) -> list[Fold]:
 
 def _single(context: Context) -> list[Fold]:
     """Return the errors of representative runs in full, by predictor and step."""
-    found = []
-    for method, run in _representatives(context):
-        metrics, unit = run.details.metrics, units.of_model(run.details.config)
-        names = _ordered(metrics)
-        if not names:
-            continue
-        held = [Note(text) for text in (_floor(metrics, unit), _seen(metrics)) if text]
-        found += fold(
-            f"In full: {method.name}",
-            *held,
-            *_rmse(run, names, unit),
-            *_error_tables(metrics, names, unit),
-            about="one run, each predictor and step",
-        )
-    return found
-
-
-def _rmse(run: Run, names: Sequence[str], unit: str) -> list[Chart]:
-    metrics, rate_hz = run.details.metrics, float(run.details.config.get("rate_hz") or 0)
-    steps = sorted(int(name[1:]) for name in _both(metrics[names[0]]["mse_counts"]) if name != "mean")
-    x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
-    several = [
-        Line(
-            name,
-            x,
-            [float(np.sqrt(_both(metrics[name]["mse_counts"])[f"t{step}"])) for step in steps],
-            dashed=name != MODEL,
-        )
-        for name in names
-        if name not in OFF_SCALE
-    ]
-    ahead = f"time ahead ({'ms' if rate_hz else 'steps'})"
-    return [
-        Chart(
-            "Error of each predictor by time ahead",
-            charts.lines(several, ahead, f"root mean squared error ({unit})"),
-            "All channels, unseen recordings.",
-        )
-    ]
-
-
-def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]:
-    groups = metrics[names[0]]["mae_counts"]
-    shown = [f"t{step}" for step in headline.STEPS if f"t{step}" in _both(groups)] + ["mean"]
-    heads = ["", *(name.replace("t", "t+") if name != "mean" else name for name in shown)]
-
-    def cells(errors: Tree) -> list[Cell]:
-        return [number(errors[step]) for step in shown]
-
-    errors = {"mae_counts": f"Mean absolute error ({unit})", "mse_counts": f"Mean squared error ({unit}²)"}
-    found = [
-        table(title, heads, [[name, *cells(_both(metrics[name][measure]))] for name in names])
-        for measure, title in errors.items()
-    ]
-    rows: list[Sequence[str | Cell]] = [
-        [name, *cells(metrics[name]["mse_feature"])] for name in names if "mse_feature" in metrics[name]
-    ]
-    found += [table("Mean squared error (latents scaled to ±1)", heads, rows)] if rows else []
-    rows = [[measure, *(_stated(skill.get(step, {})) for step in shown)] for measure, skill in metrics["skill"].items()]
-    found.append(table("Skill over persistence, with 95 % interval", heads, rows))
-    rows = [
-        [f"{name}, {group}", *cells(metrics[name]["mae_counts"][group])]
-        for group in groups
-        if group not in ("both", "all")
-        for name in names[:2]
-    ]
-    found.append(table(f"Mean absolute error by sensor and axis ({unit})", heads, rows))
-    rows = []
-    for name in ("known", "unseen"):
-        part = metrics.get(name, {})
-        if "skill" in part:
-            objects = f"{name} objects ({counted(part['counts']['recordings'], 'recordings')})"
-            rows += [
-                [f"{objects}, {one} ({unit})", *cells(_both(part[one]["mae_counts"]))] for one in _ordered(part)[:2]
-            ]
-            rows.append([f"{objects}, skill", *(_stated(part["skill"]["mse_counts"].get(step, {})) for step in shown)])
-    return (
-        [*found, table("Known objects and unseen ones: mean absolute error, and skill", heads, rows)] if rows else found
-    )
-
-
-def _floor(metrics: Tree, unit: str) -> str:
-    """Return a warning where the codec alone loses more than persistence errs, empty otherwise."""
-    if "codec" not in metrics:
-        return ""
-    floor, baseline = (_both(metrics[name]["mse_counts"]) for name in ("codec", "persistence"))
-    steps = sorted(int(name[1:]) for name in floor if name != "mean")
-    lost = [step for step in steps if floor[f"t{step}"] >= baseline[f"t{step}"]]
-    if not lost:
-        return ""
-    which = "at every step" if lost == steps else f"up to t+{max(lost)}"
-    return (
-        f"The codec alone loses more than persistence errs {which} (squared error of the true future through the codec: "
-        f"{number(floor['mean']).text} {unit}² on average), so a model of its latents can hardly win there in {unit}."
-    )
-
-
-def _seen(metrics: Tree) -> str:
-    """Return the errors on recordings that the model was trained on, which prove nothing."""
-    described = metrics.get("seen", {}).get("skill", {}).get("mse_counts", {}).get("mean", {})
-    if "mean" not in described:
-        return ""
-    count = counted(metrics["seen"]["counts"]["recordings"], "recordings")
-    mean = blocks.signed(described["mean"])
-    return f"Left out: {count} that the model was trained or stopped on; its mean skill on these is {mean}."
-
-
-def _stated(one: Tree) -> Cell:
-    return (
-        blocks.interval(one["mean"], one.get("low", np.nan), one.get("high", np.nan))
-        if "mean" in one
-        else Cell("not defined")
-    )
-
-
-def _both(scores: Tree) -> Tree:
-    """Return the errors over all channels; results of before this was called ``both`` call it ``all``."""
-    found: Tree = scores["both"] if "both" in scores else scores["all"]
-    return found
-
-
-def _ordered(metrics: Tree) -> list[str]:
-    """Return the names of model and baselines, model first, then persistence."""
-    found = [
-        name
-        for name, scores in metrics.items()
-        if name != "skill" and isinstance(scores, Mapping) and "mse_counts" in scores
-    ]
-    order = list(EXPLAINED)
-    return sorted(found, key=lambda name: (order.index(name) if name in order else len(order), name))
+    return [one for method, run in _representatives(context) for one in single_run.folds(method.name, run)]
 
 
 def _predictors(context: Context) -> list[str]:
     held = {name for run in context.runs for name in run.details.errors.predictors}
-    return [name for name in EXPLAINED if name in held]
+    return [name for name in single_run.EXPLAINED if name in held]
 
 
 def _steps(context: Context) -> tuple[int, ...]:
