@@ -30,7 +30,7 @@ SETS = {  # of a task: the folders that its set has in DATA
 }
 
 
-HEADS = {  # of a table: what tells its rows apart beside the method, and the value
+HEADS = {  # of a table: what distinguishes its rows beside the method, and the value
     "forward": ("objects", "skill"),
     "material": ("sensor", "accuracy_percent"),
     "touch": ("target", "rmse"),

@@ -197,8 +197,9 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
 
     It is verified first. Raises `MissingError` if it is not in the store, or was damaged there.
     """
-    for _ in store.blocks(name) if not copy else ():
-        pass
+    if not copy:
+        for _ in store.blocks(name):  # reads all of it, which verifies it
+            pass
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex[:12]}{_DRAFT}")
     source = store.object_path(name)

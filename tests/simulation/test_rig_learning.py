@@ -1,6 +1,6 @@
 """What can be learned of the simulated rig: how much the plan tells, what bounds a forecast, and what nobody can foresee.
 
-Forecasters are trained and evaluated on trials in which nothing slips. Ground truth serves to judge, never to train.
+Forecasters are trained and evaluated on trials in which nothing slips. Ground truth is for evaluation, never for training.
 """
 
 from __future__ import annotations
