@@ -112,7 +112,7 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
         cores=cores,
         memory=configured("memory", MEMORY),
         processes=1,
-        nanny=False,
+        nanny=True,  # a worker alone may hang as it closes
         # one task at a time, on all cores of the job; it is Slurm that limits memory
         worker_extra_args=[*configured("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
         job_script_prologue=[*configured("job-script-prologue", []), f"export OMP_NUM_THREADS={cores}"],
