@@ -57,6 +57,19 @@ class TestJobs:
         assert 1 <= len(workers) <= 2
         wait_until_no_job_is_left()
 
+    def test_a_job_computes_with_as_many_threads_as_it_has_cores(
+        self, lab: Lab, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        lab.run("simulate toy -o data/rec --jobs 1")
+        monkeypatch.setenv("DASK_JOBQUEUE__SLURM__CORES", "2")
+        lab.run("scale data/rec -o data/out --executor slurm --jobs 1")
+        threads = {
+            record["provenance"]["processor"]["threads"]
+            for _, record in lab.store.records()
+            if record["identity"].get("stage") == "scale"
+        }
+        assert threads == {2}
+
     def test_an_unknown_partition_is_named(self, lab: Lab) -> None:
         lab.run("simulate toy -o data/rec --jobs 1")
         ran = lab.call("scale data/rec -o data/out --executor slurm://none-such --jobs 1")

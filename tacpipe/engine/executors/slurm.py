@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 JOBS = 4  # that are submitted unless --jobs gives another number
 CORES, MEMORY = 1, "4 GiB"  # that a job requests where Dask's configuration states nothing
 SECTION = "jobqueue.slurm"
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # each 1 in Dask's workers unless it is set
 _POLL_S = 0.5
 _SHOWN_S = 5.0  # a wait that is longer is stated
 
@@ -115,7 +116,7 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
         nanny=True,  # a worker alone may hang as it closes
         # one task at a time, on all cores of the job; it is Slurm that limits memory
         worker_extra_args=[*configured("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
-        job_script_prologue=[*configured("job-script-prologue", []), f"export OMP_NUM_THREADS={cores}"],
+        job_script_prologue=[*configured("job-script-prologue", []), *(f"export {name}={cores}" for name in _THREADS)],
         job_name="tacpipe",
         log_directory=str(folder),
         protocol="tls://",
