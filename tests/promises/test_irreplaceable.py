@@ -81,12 +81,13 @@ def files(store: Path) -> Iterator[Path]:
 
 def lost(lab: Lab, held: list[Manifest], spoiled: Path) -> list[str]:
     """Return what of the recordings and their labels is not in the store; what was spoiled itself is not looked for."""
-    objects = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
+    found = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
+    objects = {name: content for name, content in found.items() if bytes_digest(content) == name}
     there = [parse(content, name) for name, content in objects.items() if content.startswith(b"{\n") and _is(content)]
     missing = []
     for manifest in held:
         for path, name in manifest.objects():
-            if name != spoiled.name and bytes_digest(objects.get(name, b"")) != name:
+            if name != spoiled.name and name not in objects:
                 missing.append(path)
         known = any(one.labels == manifest.labels and one.recordings == manifest.recordings for one in there)
         if not known and spoiled.name != bytes_digest(manifest.content):
