@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.datasets.manifest import Manifest, parse
+from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import bytes_digest
 from tests.conftest import Lab
 from tests.promises import damages, specimen
@@ -163,6 +164,39 @@ def test_records_roots_or_manifests_alone_keep_every_recording(
     specimen.age(lab.store.root)
     lab.run(f"{COLLECT} --recordings")  # asked for by name, all of it goes
     assert list(specimen.beneath(lab.store.root / "objects")) == [] or left == "roots"
+
+
+@pytest.mark.parametrize(
+    ("only", "gone", "before", "after"),
+    [
+        ("records", "objects", b'"irreplaceable"', b'"irreplaceablf"'),
+        ("objects", "records", b'"recordings"', b'"recordingz"'),
+    ],
+)
+def test_a_damaged_record_or_manifest_holds_from_quarantine_what_nothing_else_names(
+    lab: Lab, only: str, gone: str, before: bytes, after: bytes
+) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/rec")
+    manifest = lab.manifest("data/rec")
+    shards = [name for _, name in manifest.objects()]
+    for folder in ("data", ".tacpipe/roots"):
+        shutil.rmtree(folder)
+    damaged = [path for path in specimen.beneath(lab.store.root / only) if before in path.read_bytes()]
+    for path in specimen.beneath(lab.store.root / gone):
+        if path.name not in shards:
+            path.unlink()
+    for path in damaged:
+        damages.overwrite(path, path.read_bytes().replace(before, after))
+    assert lab.call("store verify").code == DAMAGED
+    assert len(list((lab.store.root / "quarantine").iterdir())) == len(damaged) > 0
+    for _ in range(3):
+        specimen.age(lab.store.root)
+        lab.run(COLLECT)
+        assert [name for name in shards if not lab.store.has(name)] == []
+    for _ in range(2):  # asked for by name: the first removes what was damaged, the second what it named
+        lab.run(f"{COLLECT} --recordings")
+    assert [name for name in shards if lab.store.has(name)] == []
 
 
 def test_a_manifest_whose_recordings_are_all_in_a_later_one_is_collected(lab: Lab) -> None:
