@@ -307,7 +307,12 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
     ("module", "function", "value", "named"),
     [
         (processor, "threads", 977, r"threads: \d+, now 977"),
-        (processor, "_processor", {"model": "Zen 9", "instructions": ["sve"]}, r"instructions: .*, now sve; model: .*9"),
+        (
+            processor,
+            "_processor",
+            {"model": "Zen 9", "instructions": ["sve"]},
+            r"instructions: .*, now sve; model: .*9",
+        ),
         (provenance, "_here", {"libraries": {"numpy": "0.1"}}, r"numpy: [\d.]+, now 0\.1;"),
     ],
     ids=["threads", "processor", "libraries"],
