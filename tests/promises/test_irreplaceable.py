@@ -19,11 +19,7 @@ from tests.test_replacing import source
 
 COLLECT = "store gc --grace-days 0"
 QUICK = ("it is gone", "a bit is flipped")
-
-
-def seldom(*values: str) -> list[object]:
-    """Return values of a test's parameter that are tried by `make test-faults` alone."""
-    return [pytest.param(value, marks=pytest.mark.faults) for value in values]
+BROAD = (*QUICK, "it is empty", "its second half is lost")  # of each kind: bytes, size, all of it
 
 
 @pytest.fixture(scope="module")
@@ -106,9 +102,19 @@ def fresh(made: Path, lab: Lab) -> None:
     specimen.clone(made, lab.folder)
 
 
+LOOKS = [
+    *((damage, "store verify") for damage in QUICK),
+    *(pytest.param(damage, "store verify", marks=pytest.mark.faults) for damage in damages.ALL if damage not in QUICK),
+    *(
+        pytest.param(damage, look, marks=pytest.mark.faults)
+        for damage in BROAD
+        for look in ("store repair", "store gc")
+    ),
+]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("look", ["store verify", *seldom("store repair", "store status")])
-@pytest.mark.parametrize("damage", [*QUICK, *seldom(*sorted({*damages.ALL} - {*QUICK}))])
+@pytest.mark.parametrize(("damage", "look"), LOOKS)
 def test_no_recording_is_collected_whichever_one_file_of_the_store_is_damaged_or_gone(
     project: Path, lab: Lab, held: list[Manifest], damage: str, look: str
 ) -> None:
