@@ -26,7 +26,7 @@ from tests.conftest import Lab
 from tests.promises import damages
 from tests.promises.counts import count
 from tests.promises.operations import Call, Shim
-from tests.promises.operations_cases import CASES, STAGES, TOYS
+from tests.promises.operations_cases import CASES, PART, STAGES, TOYS
 from tests.test_garbage import age
 
 MEMORY = Path("/dev/shm")  # where thousands of folders come and go in no time
@@ -34,7 +34,6 @@ PROJECT = Path(__file__).parents[2]
 QUICK = (TOYS[:5], TOYS[5:11], TOYS[11:])
 # Of commands that touch the store each call is tried. Stages make the same calls there, so of a stage each third is tried,
 # from the first, the second or the third: what all stages do is tried whole by three of them.
-PART = int(os.environ.get("TACPIPE_TEST_CALLS", "3"))
 EVERY = {case.name: "1" for case in TOYS} | {case.name: f"{1 + n % PART}/{PART}" for n, case in enumerate(STAGES)}
 
 
