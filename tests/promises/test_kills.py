@@ -118,7 +118,7 @@ def test_a_pool_of_workers_survives_kills_at_all_of_its_moments(scene: Scene) ->
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["SIGKILL", "Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGKILL", "Ctrl-C", "SIGTERM", "SIGHUP of all"])
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_call_in_c_that_takes_minutes_ends_with_the_command(scene: Scene, name: str, jobs: int) -> None:
     scene.run("simulate toy --trials 9 --rows 4 -o data/r")
