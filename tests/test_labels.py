@@ -77,3 +77,16 @@ def test_a_shard_that_is_gone_when_a_label_is_set_is_brought_back_by_link(many: 
     many.run("label data/r trial-003 --set material=foam")
     many.run("store link data/r")
     assert shard.read_bytes() == content
+
+
+@pytest.mark.parametrize(("trials", "named"), [(3, "it has trial-000, trial-001, trial-002."), (7, "and 2 more.")])
+def test_a_recording_that_is_not_there_is_refused_with_those_that_are(lab: Lab, trials: int, named: str) -> None:
+    lab.run(f"simulate toy --trials {trials} -o data/r --jobs 1")
+    failed = lab.call("label data/r nobody --set a=b")
+    assert failed.code == 2 and "nobody" in failed.err and failed.err.rstrip().endswith(named)
+
+
+def test_a_label_of_several_lines_is_refused_on_one(lab: Lab) -> None:
+    lab.run("simulate toy --trials 1 -o data/r --jobs 1")
+    failed = lab.call("label data/r trial-000 --set 'a\nb=c'")
+    assert failed.code == 2 and failed.err.count("\n") == 1 and "a\\nb=c" in failed.err

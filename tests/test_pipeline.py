@@ -2,6 +2,8 @@ import json
 import re
 import time
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -10,7 +12,7 @@ import tacpipe
 from tacpipe.datasets import directory
 from tacpipe.datasets.dataset import Recording
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.engine import processor
+from tacpipe.engine import processor, provenance
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.store.records import named
@@ -301,16 +303,30 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
     assert lab.manifest("data/s") == before
 
 
-def test_a_difference_to_what_another_processor_or_number_of_threads_computed_names_them(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("module", "function", "value", "named"),
+    [
+        (processor, "threads", 977, r"threads: \d+, now 977"),
+        (
+            processor,
+            "_processor",
+            {"model": "Zen 9", "instructions": ["sve"]},
+            r"instructions: .*, now sve; model: .*9",
+        ),
+        (provenance, "_here", {"libraries": {"numpy": "0.1"}}, r"numpy: [\d.]+, now 0\.1;"),
+    ],
+    ids=["threads", "processor", "libraries"],
+)
+def test_a_difference_to_what_another_processor_number_of_threads_or_library_computed_names_them(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, module: ModuleType, function: str, value: Any, named: str
 ) -> None:
     import toy_stages
 
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
-    monkeypatch.setattr(processor, "threads", lambda: 977)
+    monkeypatch.setattr(module, function, lambda: value)
     same = lab.call("scale data/r -o data/s --jobs 1 --recompute-and-compare")
-    assert same.code == 0 and "977" not in same.err
+    assert same.code == 0 and "now" not in same.err
     honest = toy_stages.scale.function
 
     def changed(params: toy_stages.Scale, recording: "Recording") -> pa.Table:
@@ -319,7 +335,7 @@ def test_a_difference_to_what_another_processor_or_number_of_threads_computed_na
     monkeypatch.setitem(toy_stages.scale.__dict__, "function", changed)
     failed = lab.call("scale data/r -o data/s --jobs 1 --recompute-and-compare")
     assert failed.code == 1
-    assert re.search(r"\(computed with other threads: \d+, now 977, which rounds differently\)$", failed.err.strip())
+    assert re.search(named, failed.err), failed.err
 
 
 @pytest.mark.parametrize("rows", range(3, 9))  # of keys that come before and after one another

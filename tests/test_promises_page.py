@@ -37,3 +37,7 @@ def test_every_promise_names_a_test() -> None:
     assert len(found) > 20
     without = [cells[0] for cells in found if len(cells) != 3 or not NAMED.search(cells[2])]
     assert without == ["Bad input is one sentence, with the documented exit code, and leaves everything as it was."]
+
+
+def test_every_promise_states_how_it_is_kept() -> None:
+    assert [cells[0] for cells in rows() if not cells[1]] == []

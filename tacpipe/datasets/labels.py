@@ -13,7 +13,10 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import Found, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import listed, plain
 from tacpipe.store.store import locate
+
+_NAMED = 5  # recordings that a refusal names
 
 
 def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
@@ -22,7 +25,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
     for text in sets:
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
-            raise UsageError(f"--set {text} should read name=value, as in --set material=foam.")
+            raise UsageError(f"--set {plain(text)} should read name=value, as in --set material=foam.")
         labels[name] = of_text(value) if value else ""
     if exclude is not None and include:
         raise UsageError("--exclude and --include contradict each other; give one.")
@@ -137,7 +140,7 @@ def _matching(found: Found, patterns: Sequence[str]) -> list[str]:
     for pattern in patterns:
         matching = {name for name in recordings if fnmatchcase(name, pattern)}
         if not matching:
-            some = ", ".join(sorted(recordings)[:5])
-            raise UsageError(f"{found.directory} has no recording {pattern}; it has {len(recordings)}: {some} …")
+            there = listed(sorted(recordings), _NAMED)
+            raise UsageError(f"{found.directory} has no recording {plain(pattern)}; it has {there}.")
         names |= matching
     return sorted(names)

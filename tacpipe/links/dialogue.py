@@ -49,16 +49,17 @@ def hold(link: Link, dialogue: Dialogue, stream: str) -> Arrived:
 def _reply(link: Link, ask: Ask, since: Arrived, stream: str) -> tuple[bytes, Arrived]:
     """Return the reply and what came before it, which is none; what is behind stays in ``since``."""
     until = time.monotonic() + ask.timeout_s
-    seen = 0
+    seen, over = 0, False
     while True:
         found = _found(ask, since, seen, packets=bool(getattr(link, "packets", False)))
         if found is not None:
             return found
+        if over:
+            raise NoReplyError(ask, since, stream)
         seen = len(since)
         left_s = until - time.monotonic()
-        if left_s <= 0:
-            raise NoReplyError(ask, since, stream)
-        since += link.read(left_s)
+        over = left_s <= 0  # a last look: a process that was held up finds the reply waiting
+        since += link.read(max(left_s, 0.0))
 
 
 def _found(ask: Ask, since: Arrived, seen: int, *, packets: bool) -> tuple[bytes, Arrived] | None:

@@ -6,21 +6,28 @@ import contextlib
 import os
 import pty
 import threading
+import time
 import tty
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from tacpipe.errors import DeviceError
+from tacpipe.links import dialogue as dialogue_of
 from tacpipe.links.dialogue import hold
 from tacpipe.links.link import Link
+from tacpipe.links.opened import Arrived
 from tacpipe.recording import rig
 from tacpipe.sensors.sensor import Ask, Dialogue
 from tests.links import peers
-from tests.links.peers import Quiet, made
+from tests.links.peers import SOON_S, Quiet, made
 from tests.sensors.made import pieces, samples
 
 Talk = Callable[[bytes, list[bytes]], None]
+LEAST_S = 1.0  # a reply that is awaited for so long is to come; what is to be silent is awaited for less
 
 
 @pytest.fixture
@@ -50,6 +57,25 @@ def device() -> Iterator[tuple[Link, Talk]]:
     os.close(master)
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Await a reply that is to come for as long as a busy computer may take; limits of their own are kept."""
+    reply = dialogue_of._reply
+
+    def longer(link: Link, ask: Ask, *more: Any) -> Any:
+        return reply(link, replace(ask, timeout_s=SOON_S) if ask.timeout_s >= LEAST_S else ask, *more)
+
+    monkeypatch.setattr(dialogue_of, "_reply", longer)
+
+
+def until_all_came(link: Link, kept: Arrived, count: int) -> Arrived:
+    """Return what was kept and what comes after it, until these are ``count`` bytes."""
+    found, until = list(kept), time.monotonic() + SOON_S
+    while sum(len(data) for _, data in found) < count and time.monotonic() < until:
+        found += link.read(0.1)
+    return found
+
+
 def ends_with_newline(data: bytes) -> int:
     return data.find(b"\n") + 1
 
@@ -68,7 +94,7 @@ def test_replies_reach_the_sensor_and_the_stream_behind_them_is_kept(device: tup
     kept = hold(link, dialogue(), "probe")
 
     assert heard == [b"1.2\n", b"serial 7\n"]
-    assert b"".join(data for _, data in kept) + b"".join(data for _, data in link.read(0.2)) == b"frameframe2"
+    assert b"".join(data for _, data in until_all_came(link, kept, 11)) == b"frameframe2"
     assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
 
 
@@ -91,15 +117,17 @@ def test_samples_before_and_after_a_reply_among_them_are_kept_with_their_arrival
     read = link.read
 
     def noted(timeout_s: float) -> list[tuple[int, bytes]]:
-        arrived.extend(read(timeout_s))
-        return arrived[-1:]
+        came = read(timeout_s)
+        arrived.extend(came)
+        return came
 
     link.read = noted  # type: ignore[method-assign]
     talk(b"tare", [b"sample1 sam", b"ple2 <do", b"ne>sample3 <ok>sample4 ", b"sample5 "])
-    kept = hold(link, dialogue(), "probe") + read(0.2)
+    wanted = b"sample1 sample2 sample3 sample4 sample5 "
+    kept = until_all_came(link, hold(link, dialogue(), "probe"), len(wanted))
 
     assert heard == [b"<done>", b"<ok>", b""]
-    assert b"".join(data for _, data in kept) == b"sample1 sample2 sample3 sample4 sample5 "
+    assert b"".join(data for _, data in kept) == wanted
     stamps = {t_ns for t_ns, _ in arrived}
     assert {t_ns for t_ns, _ in kept[:2]} <= stamps and kept[0][0] == arrived[0][0]
     assert [t_ns for t_ns, _ in kept] == sorted(t_ns for t_ns, _ in kept)
@@ -132,7 +160,8 @@ def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
                     talk(ask.send, [b"".join([*before, *(replies if ask.until is not None else []), *streamed()])])
                     reply = yield ask
 
-    kept = hold(link, dialogue(), "probe") + link.read(0.2)
+    kept = hold(link, dialogue(), "probe")
+    kept = until_all_came(link, kept, len(b"".join(written)))
 
     assert len(written) > 5
     assert b"".join(data for _, data in kept) == b"".join(written)
@@ -179,11 +208,39 @@ def test_what_came_instead_of_a_reply_is_told(device: tuple[Link, Talk]) -> None
     link, talk = device
 
     def dialogue() -> Dialogue:
-        yield Ask(b"?", ends_with_newline, timeout_s=0.3, what="the version")
+        yield Ask(b"?", lambda data: (0, 0) if len(data) == 3 else 0)  # it has come
+        yield Ask(b"", ends_with_newline, timeout_s=0.1, what="the version")
 
     talk(b"?", [b"\xaa\x55\x00"])
     with pytest.raises(DeviceError, match=r"3 bytes.*55 00"):
         hold(link, dialogue(), "pps")
+
+
+class Waiting:
+    """A link at whose other end a reply waits to be read."""
+
+    def __init__(self) -> None:
+        self.there: Arrived = [(1, b"1.2\n")]
+
+    def write(self, data: bytes) -> None:
+        pass
+
+    def read(self, timeout_s: float) -> Arrived:
+        came, self.there = self.there, []
+        return came
+
+
+def test_a_reply_that_waited_while_this_process_was_held_up_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard = []
+
+    def dialogue() -> Dialogue:
+        heard.append((yield Ask(b"version?", ends_with_newline, timeout_s=0.1)))
+
+    times_s = iter([0.0])
+    monkeypatch.setattr(dialogue_of, "time", SimpleNamespace(monotonic=lambda: next(times_s, 5.0)))
+    link: Any = Waiting()
+    assert hold(link, dialogue(), "probe") == []
+    assert heard == [b"1.2\n"]
 
 
 def test_a_reply_that_means_no_ends_the_dialogue(device: tuple[Link, Talk]) -> None:

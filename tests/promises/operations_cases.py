@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
@@ -253,4 +254,7 @@ STAGES = (
     *(_ingest(name) for name in CONTAINERS),
 )
 CASES = {case.name: case for case in (*TOYS, *STAGES)}
+PART = int(
+    os.environ.get("TACPIPE_TEST_CALLS", "3")
+)  # of a stage's calls one of so many is tried; 1: all of each stage
 assert len(CASES) == len(TOYS) + len(STAGES)

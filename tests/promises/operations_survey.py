@@ -30,21 +30,21 @@ class Left:
 class Survey:
     """Follows the calls of a run, and notes what a kill or a loss of power at each would leave."""
 
-    def __init__(self, disk: Disk, every: int) -> None:
-        self.disk, self._every, self._number = disk, every, 0
+    def __init__(self, disk: Disk, chosen: range) -> None:
+        self.disk, self._chosen, self._number = disk, chosen, 0  # numbers of calls
         self.left: list[Left] = []
         self.kills: dict[int, State] = {}  # what each kill leaves, by the number of its call
 
     def before(self, call: Call) -> None:
         self._number += 1
-        if call.changes and (self._number - 1) % self._every == 0:
+        if call.changes and self._number in self._chosen:
             self.kills[self._number] = self.disk.killed()
             self.left.append(Left(self.kills[self._number], f"a kill before {self._described(call)}", "killed"))
             self._lose(f"before {self._described(call)}", "dark")
 
     def after(self, call: Call) -> None:
         self.disk.made(call.name, call.path, call.source)
-        if call.name == "write" and (self._number - 1) % self._every == 0:
+        if call.name == "write" and self._number in self._chosen:
             torn = self.disk.torn(call.path)
             if torn is not None:
                 self.left.append(Left(torn, f"a kill amid {self._described(call)}", "killed"))

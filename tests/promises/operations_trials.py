@@ -1,6 +1,6 @@
 """One command tried with every fault at every call of the file system.
 
-    python -m tests.promises.operations_trials FOLDER CASE... [--every 7]
+    python -m tests.promises.operations_trials FOLDER CASE... [--every 2/7]
 
 prints a JSON line for each case: how many operations failed, and which promises did not hold. It is a process of its
 own because it changes what ``open`` and the like are.
@@ -66,16 +66,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("cases", nargs="+")
-    parser.add_argument("--every", type=int, default=1, help="try every so many-th call alone")
+    parser.add_argument("--every", default="1", help="K/N: try each Nth call from the Kth; N: from the first")
     given = parser.parse_args()
     os.environ.pop("TACPIPE_STORE", None)
     os.environ["TACPIPE_LOCK_TIMEOUT_S"] = "10"
     hashing.SETTLED_NS = 0  # calls must not depend on what time it is
     projects.new_id = lambda: "ab" * 16  # nor what is written on chance
     os.fsync = os.fdatasync = lambda handle: None  # type: ignore[assignment]  # nobody takes the power away here
+    first, _, every = given.every.rpartition("/")
+    chosen = range(int(first or 1), sys.maxsize, int(every))
     for name in given.cases:
         lab = given.folder.absolute() / name.replace(" ", "-")
-        print(json.dumps(asdict(Trials(CASES[name], lab).run(given.every))), flush=True)
+        print(json.dumps(asdict(Trials(CASES[name], lab).run(chosen))), flush=True)
 
 
 class Trials:
@@ -99,10 +101,10 @@ class Trials:
         replay.listening = False
         self.shown, self.kept = self._shown(self.place.look()), self._kept()
 
-    def run(self, every: int) -> Tried:
-        """Try every fault at every call (or every so many-th), and a loss of power at the end."""
+    def run(self, chosen: range) -> Tried:
+        """Try every fault at the calls of the ``chosen`` numbers, and a loss of power at the end."""
         self.place.restore()
-        survey = Survey(Disk.of(self.lab, self.place.before), every)
+        survey = Survey(Disk.of(self.lab, self.place.before), chosen)
         with Shim(self.lab, watch=survey) as shim:
             ran = call(self.case.command)
         assert ran.code == 0, f"{self.case.command}: {ran.err}"
@@ -113,7 +115,7 @@ class Trials:
         self._die(survey)
         for left in survey.left:
             self._evaluate(left, [])
-        for number in range(1, len(shim.calls) + 1, every):
+        for number in range(chosen.start, len(shim.calls) + 1, chosen.step):
             for fault in shim.calls[number - 1].errors:
                 self._fail(number, shim.calls[number - 1], fault)
         self.tried.states = len(self._proven)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.datasets.manifest import Manifest, parse
+from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import bytes_digest
 from tests.conftest import Lab
 from tests.promises import damages, specimen
@@ -18,11 +19,7 @@ from tests.test_replacing import source
 
 COLLECT = "store gc --grace-days 0"
 QUICK = ("it is gone", "a bit is flipped")
-
-
-def seldom(*values: str) -> list[object]:
-    """Return values of a test's parameter that are tried by `make test-faults` alone."""
-    return [pytest.param(value, marks=pytest.mark.faults) for value in values]
+BROAD = (*QUICK, "it is empty", "its second half is lost")  # of each kind: bytes, size, all of it
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +78,13 @@ def files(store: Path) -> Iterator[Path]:
 
 def lost(lab: Lab, held: list[Manifest], spoiled: Path) -> list[str]:
     """Return what of the recordings and their labels is not in the store; what was spoiled itself is not looked for."""
-    objects = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
+    found = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
+    objects = {name: content for name, content in found.items() if bytes_digest(content) == name}
     there = [parse(content, name) for name, content in objects.items() if content.startswith(b"{\n") and _is(content)]
     missing = []
     for manifest in held:
         for path, name in manifest.objects():
-            if name != spoiled.name and bytes_digest(objects.get(name, b"")) != name:
+            if name != spoiled.name and name not in objects:
                 missing.append(path)
         known = any(one.labels == manifest.labels and one.recordings == manifest.recordings for one in there)
         if not known and spoiled.name != bytes_digest(manifest.content):
@@ -104,9 +102,19 @@ def fresh(made: Path, lab: Lab) -> None:
     specimen.clone(made, lab.folder)
 
 
+LOOKS = [
+    *((damage, "store verify") for damage in QUICK),
+    *(pytest.param(damage, "store verify", marks=pytest.mark.faults) for damage in damages.ALL if damage not in QUICK),
+    *(
+        pytest.param(damage, look, marks=pytest.mark.faults)
+        for damage in BROAD
+        for look in ("store repair", "store gc")
+    ),
+]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("look", ["store verify", *seldom("store repair", "store status")])
-@pytest.mark.parametrize("damage", [*QUICK, *seldom(*sorted({*damages.ALL} - {*QUICK}))])
+@pytest.mark.parametrize(("damage", "look"), LOOKS)
 def test_no_recording_is_collected_whichever_one_file_of_the_store_is_damaged_or_gone(
     project: Path, lab: Lab, held: list[Manifest], damage: str, look: str
 ) -> None:
@@ -162,6 +170,39 @@ def test_records_roots_or_manifests_alone_keep_every_recording(
     specimen.age(lab.store.root)
     lab.run(f"{COLLECT} --recordings")  # asked for by name, all of it goes
     assert list(specimen.beneath(lab.store.root / "objects")) == [] or left == "roots"
+
+
+@pytest.mark.parametrize(
+    ("only", "gone", "before", "after"),
+    [
+        ("records", "objects", b'"irreplaceable"', b'"irreplaceablf"'),
+        ("objects", "records", b'"recordings"', b'"recordingz"'),
+    ],
+)
+def test_a_damaged_record_or_manifest_holds_from_quarantine_what_nothing_else_names(
+    lab: Lab, only: str, gone: str, before: bytes, after: bytes
+) -> None:
+    source("src", a="1 2", b="3 4")
+    lab.run("ingest numbers src -o data/rec")
+    manifest = lab.manifest("data/rec")
+    shards = [name for _, name in manifest.objects()]
+    for folder in ("data", ".tacpipe/roots"):
+        shutil.rmtree(folder)
+    damaged = [path for path in specimen.beneath(lab.store.root / only) if before in path.read_bytes()]
+    for path in specimen.beneath(lab.store.root / gone):
+        if path.name not in shards:
+            path.unlink()
+    for path in damaged:
+        damages.overwrite(path, path.read_bytes().replace(before, after))
+    assert lab.call("store verify").code == DAMAGED
+    assert len(list((lab.store.root / "quarantine").iterdir())) == len(damaged) > 0
+    for _ in range(3):
+        specimen.age(lab.store.root)
+        lab.run(COLLECT)
+        assert [name for name in shards if not lab.store.has(name)] == []
+    for _ in range(2):  # asked for by name: the first removes what was damaged, the second what it named
+        lab.run(f"{COLLECT} --recordings")
+    assert [name for name in shards if lab.store.has(name)] == []
 
 
 def test_a_manifest_whose_recordings_are_all_in_a_later_one_is_collected(lab: Lab) -> None:
