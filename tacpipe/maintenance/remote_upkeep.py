@@ -9,6 +9,7 @@ moved aside has names of its own, so several at once do no harm.
 from __future__ import annotations
 
 import contextlib
+import sys
 import uuid
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
@@ -112,9 +113,9 @@ def collect(
     if not store.check():
         return collected
     if not dry_run:
-        _forget_dead(store, grace_days)
-        for entry in list(store.asides()):  # of collections that were killed, or that run: both then look again
-            _put_back(store, entry)
+        now_s = _forget_dead(store, grace_days)
+        for entry in list(store.asides()):
+            _restore(store, entry, dead=now_s - entry.changed_s > max(grace_days, 1.0) * _DAY_S)
     there = {Path(entry.name).name: entry for entry in store.files.list("objects") if _is_object(entry.name)}
     needed = _needed(store)
     kept = set(needed.objects)
@@ -164,27 +165,45 @@ def _each(work: Callable[[Item], object], items: Iterable[Item]) -> None:
 
 
 def _put_back(store: RemoteStore, entry: Entry) -> None:
-    """Put an object that is aside back into its place, unless somebody has brought it anew."""
-    name = Path(entry.name).name.removeprefix(layout.ASIDE).partition("-")[0]
-    if not DIGEST.fullmatch(name):
-        return
-    if store.files.stat(layout.object_name(name)) is None:
-        store.files.move(entry.name, layout.object_name(name))
+    """Put an object that this collection moved aside back into its place, unless somebody has brought it anew."""
+    place = layout.object_name(_of_aside(entry))
+    if store.files.stat(place) is None:
+        store.files.move(entry.name, place)
     else:
         store.files.delete(entry.name)
 
 
-def _forget_dead(store: RemoteStore, grace_days: float) -> None:
-    """Remove announcements that are too old to be of a process that lives, by the clock of the place."""
+def _restore(store: RemoteStore, entry: Entry, *, dead: bool) -> None:
+    """Bring back what another collection moved aside, which was killed or is at work.
+
+    One at work deletes the object after it was copied, so its copy stays; one of a collection that is ``dead`` does not.
+    """
+    name = _of_aside(entry)
+    if not DIGEST.fullmatch(name):
+        return
+    with contextlib.suppress(FileNotFoundError):
+        if store.files.stat(layout.object_name(name)) is None:
+            store.files.create(layout.object_name(name), store.files.blocks(entry.name, sys.maxsize))
+        if dead:
+            store.files.delete(entry.name)
+
+
+def _of_aside(entry: Entry) -> str:
+    return Path(entry.name).name.removeprefix(layout.ASIDE).partition("-")[0]
+
+
+def _forget_dead(store: RemoteStore, grace_days: float) -> float:
+    """Remove announcements that are too old to be of a process that lives; return the time by the clock of the place."""
     name = f"leases/run-{uuid.uuid4().hex}.lock"
     store.files.create(name, b"{}")
     entry = store.files.stat(name)
     store.files.delete(name)
     if entry is None:
-        return
+        return 0.0
     for one in store.files.list("leases"):
         if entry.changed_s - one.changed_s > max(grace_days, 1.0) * _DAY_S:
             store.files.delete(one.name)
+    return entry.changed_s
 
 
 def _needed(store: RemoteStore) -> _Needed:

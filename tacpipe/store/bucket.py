@@ -22,7 +22,8 @@ from tacpipe.store.addresses import Address
 from tacpipe.store.backend import Entry
 
 Result = TypeVar("Result")
-TRIES = 5  # of one request, each with retries of its own
+TRIES = 5  # of one request
+RETRIES = 2  # of the client, within each of these
 PAUSE_S = 0.2  # after the first; four times longer after each
 PART_BYTES = 8 << 20  # an object up to this size is one request
 _AHEAD = 4  # parts of one object on their way at once
@@ -257,7 +258,7 @@ def _connected(address: Address) -> Any:
     given = addresses.settings(address)
     options: dict[str, Any] = {"timeout": "120s", "connect_timeout": "5s", "allow_http": given.plaintext}
     retries: dict[str, Any] = {
-        "max_retries": 2,
+        "max_retries": RETRIES,
         "retry_timeout": timedelta(seconds=60),
         "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=2), "base": 2},
     }

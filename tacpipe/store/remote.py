@@ -31,6 +31,7 @@ from tacpipe.store.store import AbsentError, MissingError, Object, most, record_
 AT_ONCE = 16  # requests on their way at once
 SNAPSHOTS = "snapshots"  # which records belong to which manifest, so that a pull need not read all
 _LISTED = 10  # objects of one shelf from which on the shelf is listed: S3 takes as much for a list as for 12 looks
+_NUMBER = "number"  # of the version that a root was read from; it is not kept
 _VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
 
 
@@ -283,7 +284,6 @@ class RemoteRoots:
 
     def __init__(self, files: Backend) -> None:
         self.files = files
-        self._newest: dict[str, int] = {}  # number of the newest version of each root, as it was read last
 
     def all(self) -> list[Root]:
         """Return all roots; what is damaged is named by `damaged`."""
@@ -306,11 +306,9 @@ class RemoteRoots:
         for one, root in self._read(wanted):
             if root is None:
                 raise DamagedError(
-                    f"{self.files.place}/roots/{one}/{self._newest[one]:08d}.json is damaged. Delete it: the version before "
-                    f"it counts then."
+                    f"The newest file in {self.files.place}/roots/{one} is damaged. Delete it: then the one before it counts."
                 )
             return root
-        self._newest[wanted] = 0
         return None
 
     def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> bool:
@@ -321,7 +319,9 @@ class RemoteRoots:
         if before is not None and before["manifest"] == manifest and before.get("project") == project:
             return True
         root = {"path": name, "kind": PUSHED, "project": dict(project)}
-        return self._succeed({**root, **succeeding(before, manifest, lasting=lasting)})
+        same = before is not None and _name(before) == _name(root)
+        number = before.get(_NUMBER, 0) if before is not None and same else 0
+        return self._succeed({**root, **succeeding(before, manifest, lasting=lasting), _NUMBER: number})
 
     def write(self, root: Root) -> None:
         """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` where another one came first."""
@@ -331,9 +331,11 @@ class RemoteRoots:
             )
 
     def remove(self, root: Root) -> None:
-        """Remove all versions of a root."""
-        for _, file in self._versions().get(_name(root), []):
-            self.files.delete(file)
+        """Remove a root, as `all` gave it, with all its earlier versions; one that was succeeded meanwhile stays."""
+        name = _name(root)
+        if dict(self._read(name)).get(name) == root:
+            for _, file in self._versions().get(name, []):
+                self.files.delete(file)
 
     def superseded(self) -> list[str]:
         """Return the names of versions that no push can take for the newest any more: all but the last two of each."""
@@ -341,24 +343,23 @@ class RemoteRoots:
 
     def _succeed(self, root: Root) -> bool:
         name = _name(root)
-        number = self._newest.get(name, 0) + 1
-        if not self.files.create(_version(name, number), encoded(root)):
+        number = root[_NUMBER] + 1
+        if not self.files.create(_version(name, number), encoded({key: root[key] for key in root if key != _NUMBER})):
             return False
         if number > 2:  # the version before stays, so that whoever read that one is refused this number
             self.files.delete(_version(name, number - 2))
-        self._newest[name] = number
         return True
 
     def _read(self, wanted: str = "") -> Iterator[tuple[str, Root | None]]:
         """Yield the name of each root, or of the one that is ``wanted``, and its newest version; None for a damaged one."""
         newest = {name: found[-1] for name, found in self._versions().items() if wanted in ("", name)}
-        self._newest.update({name: number for name, (number, _) in newest.items()})
-        roots = threads.each(self._at, (file for _, file in newest.values()), AT_ONCE)
-        return zip(newest, roots, strict=True)
+        return zip(newest, threads.each(self._at, newest.values(), AT_ONCE), strict=True)
 
-    def _at(self, file: str) -> Root | None:
+    def _at(self, version: tuple[int, str]) -> Root | None:
+        number, file = version
         with contextlib.suppress(FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
-            return decoded(json.loads(self.files.read(file, ROOT_BYTES)))
+            root = decoded(json.loads(self.files.read(file, ROOT_BYTES)))
+            return None if root is None else {**root, _NUMBER: number}
         return None
 
     def _versions(self) -> dict[str, list[tuple[int, str]]]:
