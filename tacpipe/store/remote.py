@@ -306,7 +306,7 @@ class RemoteRoots:
         for one, root in self._read(wanted):
             if root is None:
                 raise DamagedError(
-                    f"The newest file in {self.files.place}/roots/{one} is damaged. Delete it: then the one before it counts."
+                    f"The newest file in {self.files.place}/roots/{one} is damaged. Delete it, and the one before it counts."
                 )
             return root
         return None

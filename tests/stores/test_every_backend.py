@@ -25,7 +25,7 @@ def test_a_name_is_created_once_and_keeps_its_first_content(files: Backend) -> N
 
 
 def test_of_sixteen_that_create_a_name_at_once_one_wins_and_its_content_stays(files: Backend) -> None:
-    for turn in range(4):
+    for turn in range(2):
         name = f"objects/0{turn}/0{turn}" + "e" * 62
         won: list[bytes] = []
         begin = threading.Barrier(16)

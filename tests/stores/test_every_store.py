@@ -56,6 +56,7 @@ def test_an_empty_clone_pulls_what_was_pushed_byte_for_byte_and_computes_nothing
     assert tacpipe.open("data/s").to_numpy()["trial-001"].values[:, 0].tolist() == [0, 2, 4]
 
 
+@pytest.mark.long
 def test_records_come_along_so_that_a_clone_reuses_what_another_one_computed(
     lab: Lab, pushed: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -65,18 +66,21 @@ def test_records_come_along_so_that_a_clone_reuses_what_another_one_computed(
     assert counts(lab.run("scale data/r -o data/again --factor 1 --json").out) == (0, 4)
 
 
+@pytest.mark.long
 def test_a_second_push_and_a_second_pull_move_nothing(lab: Lab, pushed: Place) -> None:
     for verb in ("push", "push --verify", "pull"):
         done = json.loads(lab.run(f"store {verb} {pushed.address} data/s --json").out)
         assert (done["objects"], done["bytes"], done["there"] >= 5) == (0, 0, True), verb
 
 
+@pytest.mark.long
 def test_a_push_that_was_cut_off_sends_only_what_is_missing(lab: Lab, pushed: Place) -> None:
     pushed.files.delete(shard(lab))
     done = json.loads(lab.run(f"store push {pushed.address} data/s --json").out)
     assert (done["objects"], done["replaced"]) == (1, 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0, 100, 10**6])
 def test_an_object_of_another_size_is_replaced_by_the_next_push(lab: Lab, pushed: Place, size: int) -> None:
     content = pushed.files.read(shard(lab))
@@ -111,6 +115,7 @@ def test_an_object_with_other_bytes_is_never_pulled_is_named_and_is_replaced_by_
     count("damages of a store found", 3)
 
 
+@pytest.mark.long
 def test_a_vanished_object_is_named_and_ends_a_pull_with_the_code_of_damage(
     lab: Lab, pushed: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,6 +130,7 @@ def test_a_vanished_object_is_named_and_ends_a_pull_with_the_code_of_damage(
     count("damages of a store found", 2)
 
 
+@pytest.mark.long
 def test_a_manifest_that_vanished_is_named_and_comes_back_with_the_next_push(lab: Lab, pushed: Place) -> None:
     (one,) = listed(lab, pushed)
     pushed.files.delete(f"objects/{one['manifest'][:2]}/{one['manifest']}")
@@ -133,6 +139,7 @@ def test_a_manifest_that_vanished_is_named_and_comes_back_with_the_next_push(lab
     assert lab.call(f"store verify --remote {pushed.address}").code == 0
 
 
+@pytest.mark.long
 def test_a_store_of_another_format_and_what_is_not_a_store_are_refused(lab: Lab, place: Place) -> None:
     lab.run("simulate toy -o data/r --trials 1")
     assert lab.call(f"store pull {place.address} data/r").code == 2
@@ -158,6 +165,7 @@ def two_clones(lab: Lab, pushed: Place, monkeypatch: pytest.MonkeyPatch) -> tupl
     return folders[0], folders[1]
 
 
+@pytest.mark.long
 def test_a_push_onto_what_another_computer_pushed_since_is_refused_and_both_stay_as_snapshots(
     lab: Lab, pushed: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +212,7 @@ def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_ref
     count("pushes of one name at once")
 
 
+@pytest.mark.long
 def test_the_last_pushes_are_kept_and_forgotten_ones_are_collected(
     lab: Lab, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,6 +238,7 @@ def aged(place: Place) -> None:
             os.utime(path, (1_500_000_000, 1_500_000_000))
 
 
+@pytest.mark.long
 def test_a_collection_removes_what_nothing_names_and_keeps_all_that_is_needed(lab: Lab, pushed: Place) -> None:
     lab.run("scale data/r -o data/t --factor 5")
     lab.run(f"store push {pushed.address} data/t")
@@ -244,6 +254,7 @@ def test_a_collection_removes_what_nothing_names_and_keeps_all_that_is_needed(la
     assert json.loads(lab.run(f"store gc --remote {pushed.address} --json").out)["objects"] == 0
 
 
+@pytest.mark.long
 def test_recordings_that_nothing_names_are_kept_until_they_are_asked_for(lab: Lab, place: Place) -> None:
     Path("src").mkdir()
     Path("src/a.txt").write_text("1 2 3")
