@@ -312,10 +312,12 @@ def _copy(
     _expect_room(target, sum(sizes[name] for name in absent))
     absent += _damaged(target, [name for name in plan.objects if there.get(name) == sizes[name]], sizes, verify=verify)
     _send(source, target, plan, absent, beside)
+    target.settle(layout.object_name(name) for name in absent)
     fresh = [name for name in plan.manifests if there.get(name) != sizes[name]]
     fresh += _damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
     for name in fresh:
         target.take(name, [plan.manifests[name]])
+    target.settle(layout.object_name(name) for name in fresh)
     moved = {*absent, *fresh}
     done.objects += len(moved)
     done.bytes += sum(sizes[name] for name in moved)
@@ -371,14 +373,16 @@ def _copy_records(source: AnyStore, target: AnyStore, found: manifest_of.Found, 
 
     def commit(one: tuple[str, dict[str, Any]]) -> str:
         key, record = one
-        target.commit(record["identity"], record["result"], record["provenance"], durable=True)
+        target.commit(record["identity"], record["result"], record["provenance"])
         return key
 
     names = set(moved)
     several = (
         (key, one) for key, one in source.records_of(found.digest) if _named(one) & names and _named(one) <= names
     )
-    target.note_records(found.digest, list(threads.each(commit, several, target.at_once)))
+    keys = list(threads.each(commit, several, max(source.at_once, target.at_once)))
+    target.settle(layout.record_name(key) for key in keys)
+    target.note_records(found.digest, keys)
 
 
 def _manifest(source: AnyStore, target: AnyStore, name: str) -> bytes:

@@ -169,6 +169,9 @@ class RemoteStore:
         self.files.delete(path)
         self.files.create(path, blocks)
 
+    def settle(self, names: Iterable[str]) -> None:
+        """Do nothing: what was created here outlasts a loss of power."""
+
     def read(self, name: str, size: int | None = None) -> bytes:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
 
@@ -225,14 +228,7 @@ class RemoteStore:
 
     # ---- records
 
-    def commit(
-        self,
-        identity: Mapping[str, Any],
-        result: Mapping[str, Any],
-        provenance: Mapping[str, Any],
-        *,
-        durable: bool = True,
-    ) -> None:
+    def commit(self, identity: Mapping[str, Any], result: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
         """Record that ``identity`` gave ``result``, unless a record states what it gave: the first to finish wins."""
         _, content = record_content(identity, result, provenance)
         self.files.create(layout.record_name(digest(identity)), content)

@@ -195,14 +195,18 @@ class Store:
         return Object(name, draft.bytes)
 
     def take(self, name: str, blocks: Iterable[bytes]) -> None:
-        """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
+        """Store the object ``name`` from ``blocks`` that are verified, as `blocks` of another store yields them.
 
-        What was there is replaced.
+        What was there is replaced. After `settle` it outlasts a loss of power.
         """
         self.announce([name])
-        path = self.object_path(name)
-        self.write_file(path, blocks, mode=0o444)
-        self.sync(path)
+        self.write_file(self.object_path(name), blocks, mode=0o444)
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Have names within the store outlast a loss of power, as their contents do; each folder is synced once."""
+        with readable_errors(self.root):
+            for path in {os.path.dirname(self.files.path(name)) for name in names}:  # noqa: PTH120
+                sync_folders(path, self._root)
 
     def read(self, name: str, size: int | None = None) -> bytes:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.

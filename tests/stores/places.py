@@ -155,7 +155,7 @@ def _make_bucket(endpoint: str, process: subprocess.Popen[bytes]) -> None:
     from obstore.store import S3Store
 
     variables = {"access_key_id": KEY, "secret_access_key": SECRET, "region": "us-east-1", "endpoint": endpoint}
-    client = S3Store("lab", config=variables, client_options={"allow_http": True}, retry_config={"max_retries": 0})  # type: ignore[typeddict-item, arg-type]
+    client = S3Store("lab", config=variables, client_options={"allow_http": True}, retry_config={"max_retries": 0})  # type: ignore[arg-type]
     for _ in range(1200):
         assert process.poll() is None, "SeaweedFS ended"
         with contextlib.suppress(Exception):

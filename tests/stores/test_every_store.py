@@ -188,7 +188,8 @@ def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_ref
 ) -> None:
     lab.run(f"store push {pushed.address} data/r")
     first, second = two_clones(lab, pushed, monkeypatch)
-    honest, meanwhile = transfer._copy, []
+    honest = transfer._copy
+    meanwhile: list[int] = []
 
     def copy(*given: Any, **more: Any) -> None:
         honest(*given, **more)

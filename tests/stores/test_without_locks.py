@@ -201,6 +201,8 @@ def test_a_push_of_the_same_name_at_any_step_of_a_push_is_never_written_over_in_
     one = manifest(lab, "data/r")
     before = (lab.folder / "data/r/manifest.json").read_bytes()
 
+    others: list[str] = []
+
     def other() -> None:
         lab.run("label data/r trial-000 --set material=cork")
         push(monkeypatch, files, "data/r", replace=True)
@@ -208,7 +210,8 @@ def test_a_push_of_the_same_name_at_any_step_of_a_push_is_never_written_over_in_
 
     for step in steps_of(base.content(), lambda files: push(monkeypatch, files, "data/r", replace=True), every):
         (lab.folder / "data/r/manifest.json").write_bytes(before)
-        files, others = Stepping(base.content()), []
+        files = Stepping(base.content())
+        others.clear()
         files.begin(step, other)
         try:
             push(monkeypatch, files, "data/r")
