@@ -420,10 +420,10 @@ def test_a_push_that_another_one_writes_over_where_nothing_locks_says_so_and_its
     (before,) = remote.roots.all()
     other, honest = "ab" * 32, Roots.push
 
-    def push(roots: Roots, *given: Any, **more: Any) -> None:
+    def push(roots: Roots, *given: Any, **more: Any) -> bool:
         honest(roots, *given, **more)
         name, project, _, _ = given  # the other one looked before this one wrote
-        honest(roots, name, project, other, before, lasting=False)
+        return honest(roots, name, project, other, before, lasting=False)
 
     with monkeypatch.context() as meanwhile:
         meanwhile.setattr(Roots, "push", push)

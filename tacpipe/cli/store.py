@@ -16,12 +16,20 @@ from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import Store, locate
 
 if TYPE_CHECKING:
+    from tacpipe.maintenance.pushed import AnyStore
     from tacpipe.maintenance.repair import Soundness
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
-Remote = Annotated[Path, typer.Argument(help="The other store, a directory.")]
-OtherStore = Annotated[Path | None, typer.Option("--store", help="Store to read instead of the project's own.")]
+Remote = Annotated[
+    str, typer.Argument(metavar="STORE", help="The other store: a directory, or s3://BUCKET/FOLDER, gs://…, az://…")
+]
+OtherStore = Annotated[
+    str | None, typer.Option("--store", metavar="STORE", help="Store to read instead of the project's own.")
+]
+AtRemote = Annotated[
+    str | None, typer.Option("--remote", metavar="STORE", help="Other store to work on, a directory or an address.")
+]
 Replace = Annotated[bool, typer.Option("--replace", help="Replace what the directory holds.")]
 Ancestors = Annotated[bool, typer.Option("--ancestors", help="Include the shards of all ancestors.")]
 
@@ -81,17 +89,19 @@ def checkout(
     _print({**value, "labelled": len(made.labels)}, as_json=as_json, text=str(output))
 
 
-def verify(as_json: AsJson = False) -> None:
+def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
     """Check every stored object and record for damage.
 
-    Damaged ones are quarantined. Exits with 4 if one is damaged or missing,
-    with 1 if the system failed to read one.
+    Damaged ones are quarantined, but for those in a bucket. Exits with 4 if
+    one is damaged or missing, with 1 if the system failed to read one.
 
-    Example: tacpipe store verify
+    Example: tacpipe store verify --remote s3://lab/store
     """
+    from tacpipe.maintenance import remote_upkeep, transfer
     from tacpipe.maintenance import repair as upkeep
 
-    found = upkeep.verify(locate())
+    store = locate() if remote is None else transfer.remote_store(remote)
+    found = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
     _print(asdict(found), as_json=as_json, text=found.to_text())
     if found.damaged or found.missing or found.lost:
         raise typer.Exit(DAMAGED)
@@ -132,6 +142,7 @@ def gc(
     forget: Annotated[
         list[str] | None, typer.Option("--forget", help="Dataset, pushed or deleted, to keep no longer.")
     ] = None,
+    remote: AtRemote = None,
     as_json: AsJson = False,
 ) -> None:
     """Remove stored objects that nothing needs.
@@ -140,9 +151,12 @@ def gc(
 
     Example: tacpipe store gc --dry-run
     """
-    store = locate()
+    from tacpipe.maintenance import remote_upkeep, transfer
+
+    store = locate() if remote is None else transfer.remote_store(remote)
     _forget(store, forget or [], dry_run=dry_run)
-    found = garbage.collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
+    collect = garbage.collect if isinstance(store, Store) else remote_upkeep.collect
+    found = collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)  # type: ignore[arg-type]
     verb = "would remove" if dry_run else "removed"
     text = (
         f"{verb} {found.objects} objects ({found.bytes / 1e6:.1f} MB), {found.records} records, {found.drafts} drafts"
@@ -152,7 +166,7 @@ def gc(
     _print(asdict(found), as_json=as_json, text=text)
 
 
-def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
+def _forget(store: AnyStore, names: list[str], *, dry_run: bool) -> None:
     from tacpipe.maintenance import pushed
 
     for name in names:
@@ -162,7 +176,7 @@ def _forget(store: Store, names: list[str], *, dry_run: bool) -> None:
             store.roots.remove(root)
         if not pushed.forget(store, name, dry_run=dry_run) and not local:
             known = sorted(pushed.label(root, roots) for root in roots)
-            raise UsageError(f"{store.root} keeps no dataset {name}; it keeps {', '.join(known) or 'nothing'}.")
+            raise UsageError(f"{store.place} keeps no dataset {name}; it keeps {', '.join(known) or 'nothing'}.")
 
 
 def link(datasets: Paths) -> None:
@@ -199,7 +213,7 @@ def push(
 
     The snapshots belong to this project; earlier ones stay there.
 
-    Example: tacpipe store push /mnt/lab/store models/forward data/latents data/split
+    Example: tacpipe store push s3://lab/store models/forward data/latents data/split
     """
     from tacpipe.maintenance import transfer
 

@@ -18,10 +18,11 @@ from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.maintenance import pushed, transfer
+from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import projects
 from tacpipe.store.roots import PUSHED
-from tacpipe.store.store import MissingError, Store, locate
+from tacpipe.store.store import MissingError, locate
 
 SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
 IN_STORE, EARLIER = "pushed here", "pushed earlier"
@@ -44,7 +45,7 @@ class Known:
     project: str = ""  # of what was pushed: the name of the project, or digits of its id; then ":" and the path name it
 
 
-def known(store: Store) -> list[Known]:
+def known(store: AnyStore) -> list[Known]:
     """Return the manifests that roots of the store name or named before, newest first."""
     found: dict[tuple[str, str], Known] = {}
     roots = store.roots.all()
@@ -113,7 +114,7 @@ def _place(one: Known) -> str:
     return f"{one.project}:{one.path}" if one.state in (IN_STORE, EARLIER) else one.path
 
 
-def checkout(name: str, output: Path, *, replace: bool = False, source: Store | None = None) -> Manifest:
+def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore | None = None) -> Manifest:
     """Write the dataset ``name`` to ``output``, with its labels; from the store ``source`` if it is given.
 
     ``name`` is the digest of its manifest or of the dataset, or how it begins, or the path at which it was last written, or
@@ -145,7 +146,7 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: Store | 
     raise AssertionError
 
 
-def _is_manifest(store: Store, name: str) -> bool:
+def _is_manifest(store: AnyStore, name: str) -> bool:
     """Return whether ``name`` is the whole digest of a manifest in the store."""
     if not DIGEST.fullmatch(name) or not store.has(name):
         return False
@@ -158,7 +159,7 @@ def _is_manifest(store: Store, name: str) -> bool:
     return True
 
 
-def _named(store: Store, name: str) -> str:
+def _named(store: AnyStore, name: str) -> str:
     """Return the digest of the manifest that is meant: by its digest, or by the path at which it was last written."""
     root = store.roots.get(Path(name).absolute())
     if root is not None:
@@ -170,13 +171,13 @@ def _named(store: Store, name: str) -> str:
         except UsageError as error:
             raise UsageError(
                 f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which "
-                f"{store.root} has seen a dataset; `tacpipe store list` names both. {error}"
+                f"{store.place} has seen a dataset; `tacpipe store list` names both. {error}"
             ) from None
     matching = {one.manifest for one in known(store) if one.manifest.startswith(name) or one.dataset.startswith(name)}
     if len(matching) > 1:
-        raise UsageError(f"{len(matching)} manifests of {store.root} begin with {name}; give more of its hex digits.")
+        raise UsageError(f"{len(matching)} manifests of {store.place} begin with {name}; give more of its hex digits.")
     if not matching and _is_manifest(store, name):  # that no root names any more
         return name
     if not matching:
-        raise UsageError(f"{store.root} knows no manifest {name}; `tacpipe store list` names those that it knows.")
+        raise UsageError(f"{store.place} knows no manifest {name}; `tacpipe store list` names those that it knows.")
     return matching.pop()

@@ -16,15 +16,17 @@ from tacpipe.datasets import replacing
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.printable import listed
 from tacpipe.store.projects import Project
+from tacpipe.store.remote import RemoteStore
 from tacpipe.store.roots import PUSHED, Root, project_id
 from tacpipe.store.store import Store
 
+AnyStore = Store | RemoteStore
 SHORTEST = 6  # digits by which a project or a manifest may be named
 _SHOWN_DIGITS = 8  # of a project whose name another one has too
 _SHOWN = 20  # datasets listed before the rest is counted
 
 
-def roots(store: Store) -> list[Root]:
+def roots(store: AnyStore) -> list[Root]:
     """Return the roots of what was pushed to a store, by name."""
     found = [root for root in store.roots.all() if root["kind"] == PUSHED]
     return sorted(found, key=lambda root: (str(root["path"]), project_id(root)))
@@ -69,7 +71,7 @@ def _is_of(project: str, root: Root) -> bool:
     return by_id or root.get("project", {}).get("name") == project
 
 
-def project_in(store: Store, wanted: str) -> Project:
+def project_in(store: AnyStore, wanted: str) -> Project:
     """Return the project of a store that has this name, or an id that begins so. Raises `UsageError` if there is not one."""
     known = {project_id(root): root["project"]["name"] for root in roots(store) if project_id(root)}
     found = [
@@ -79,12 +81,12 @@ def project_in(store: Store, wanted: str) -> Project:
         names = listed((f"{name} ({one[:_SHOWN_DIGITS]})" for one, name in known.items()), _SHOWN)
         several = "several projects are" if found else "no project is"
         raise UsageError(
-            f"{several} called {wanted} in {store.root}; it has {names}. Give one's name, or digits of its id."
+            f"{several} called {wanted} in {store.place}; it has {names}. Give one's name, or digits of its id."
         )
     return Project(found[0], known[found[0]])
 
 
-def find(store: Store, wanted: str, name: str, own: Project | None) -> Root:
+def find(store: AnyStore, wanted: str, name: str, own: Project | None) -> Root:
     """Return the root that is ``wanted`` by the project ``own``: a ``PROJECT:PATH``, or a path, in the project ``name``.
 
     A name alone is that of ``own``. Where ``own`` never pushed anything it may be that of the only project that has it,
@@ -100,13 +102,13 @@ def find(store: Store, wanted: str, name: str, own: Project | None) -> Root:
     others = sorted(names[project_id(root), root["path"]] for root in same)
     if others:
         raise UsageError(
-            f"{store.root} has no dataset {wanted} of this project, but of others: {listed(others, _SHOWN)}. Give one of "
+            f"{store.place} has no dataset {wanted} of this project, but of others: {listed(others, _SHOWN)}. Give one of "
             f"these names."
         )
     known = [(root, names[project_id(root), root["path"]]) for root in every]
     shown = [root["path"] if _of_name(root["path"], every, own) == [root] else named for root, named in known]
     there = listed(sorted(shown), _SHOWN) if shown else "nothing that was pushed"
-    raise UsageError(f"{store.root} has no dataset {wanted}; it has {there}.")
+    raise UsageError(f"{store.place} has no dataset {wanted}; it has {there}.")
 
 
 def _of_name(name: str, every: Iterable[Root], own: Project | None) -> list[Root]:
@@ -117,20 +119,20 @@ def _of_name(name: str, every: Iterable[Root], own: Project | None) -> list[Root
     return [root for root in same if project_id(root) == own.id] or [root for root in same if not project_id(root)]
 
 
-def refuse_newer(there: Store, before: Root, seen: Collection[str], name: str) -> None:
+def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str) -> None:
     """Raise `UsageError` where the manifest of ``before`` is none of those that the pushing project has ``seen``."""
     manifest = str(before["manifest"])
     if manifest in seen:
         return
     written = time.strftime("%Y-%m-%d %H:%M", time.localtime(before.get("written_s", 0)))
     raise UsageError(
-        f"{there.root} holds another {name} than this project has had here: {manifest[:12]}, pushed on {written}. `tacpipe "
-        f"store checkout {manifest[:12]} --store {there.root} -o DIRECTORY` brings it; --replace pushes all the same, and "
+        f"{there.place} holds another {name} than this project has had here: {manifest[:12]}, pushed on {written}. `tacpipe "
+        f"store checkout {manifest[:12]} --store {there.place} -o DIRECTORY` brings it; --replace pushes all the same, and "
         f"keeps it as an earlier snapshot."
     )
 
 
-def lasting(store: Store, manifest: str) -> bool:
+def lasting(store: AnyStore, manifest: str) -> bool:
     """Return whether a pushed manifest holds recordings or labels set by hand, or cannot be read to know that."""
     try:
         found = manifest_of.parse(store.read(manifest), manifest, verified=True)
@@ -141,7 +143,7 @@ def lasting(store: Store, manifest: str) -> bool:
     return replacing.lasting(found)
 
 
-def forget(store: Store, wanted: str, *, dry_run: bool = False) -> bool:
+def forget(store: AnyStore, wanted: str, *, dry_run: bool = False) -> bool:
     """Keep no longer what ``wanted`` names: all snapshots of ``PROJECT:PATH``, or one by `SHORTEST` or more of its digits.
 
     Returns whether there was any. Raises `UsageError` where several are meant.
@@ -150,7 +152,7 @@ def forget(store: Store, wanted: str, *, dry_run: bool = False) -> bool:
     found = _of_project(wanted, every) or [root for root in every if root["path"] == wanted]
     if len(found) > 1:
         names = listed((label(root, every) for root in found), _SHOWN)
-        raise UsageError(f"{store.root} keeps several datasets {wanted}: {names}. Give one of these names.")
+        raise UsageError(f"{store.place} keeps several datasets {wanted}: {names}. Give one of these names.")
     if found:
         if not dry_run:
             store.roots.remove(found[0])
@@ -160,7 +162,7 @@ def forget(store: Store, wanted: str, *, dry_run: bool = False) -> bool:
     }
     if len(snapshots) > 1:
         raise UsageError(
-            f"{len(snapshots)} snapshots in {store.root} begin with {wanted}; give more of its hex digits."
+            f"{len(snapshots)} snapshots in {store.place} begin with {wanted}; give more of its hex digits."
         )
     for root in every if snapshots and not dry_run else ():
         _without(store, root, *snapshots)
@@ -172,7 +174,7 @@ def _manifests(root: Root) -> list[str]:
     return [str(one["manifest"]) for one in (root, *root.get("history", []))]
 
 
-def _without(store: Store, root: Root, manifest: str) -> None:
+def _without(store: AnyStore, root: Root, manifest: str) -> None:
     """Take a manifest out of a pushed root; of those that stay the newest is what a pull takes."""
     kept = [one for one in (root, *root.get("history", [])) if one["manifest"] != manifest]
     if kept and len(kept) <= len(root.get("history", [])):

@@ -263,6 +263,9 @@ def _wanted(store: Store, found: Soundness) -> dict[str, str]:
     wanted = {}
     for root in store.roots.all():
         here = _find(root)
+        if root["kind"] == PUSHED and not store.has(root["manifest"]):
+            wanted[root["manifest"]] = manifest_of.NAME
+            continue
         try:
             content = store.read(root["manifest"]) if here is None else here.content
             name = bytes_digest(content)

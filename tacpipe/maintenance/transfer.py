@@ -1,10 +1,9 @@
-"""Copies of datasets between stores: a directory now, so that CI evaluates what a rig recorded."""
+"""Copies of datasets to and from another store, a folder or a bucket, so that CI evaluates what a rig recorded."""
 
 from __future__ import annotations
 
 import contextlib
-import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,15 +13,20 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.engine import execution
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
-from tacpipe.io import places, regular
+from tacpipe.io import places, progress, regular, threads
 from tacpipe.io.files import may_not_write
 from tacpipe.io.hashing import digest
 from tacpipe.maintenance import garbage, pushed
+from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
-from tacpipe.store import projects, records
+from tacpipe.store import addresses, layout, projects, records
+from tacpipe.store.bucket import Bucket
 from tacpipe.store.projects import Project
+from tacpipe.store.remote import RemoteStore
 from tacpipe.store.roots import Root, project_id
 from tacpipe.store.store import MissingError, Store, locate
+
+_LOOKS = 100  # pushes of one name that may come first
 
 
 @dataclass
@@ -36,23 +40,39 @@ class Transferred:
     datasets: list[str] = field(default_factory=list)  # as they are named in the other store
 
 
-def remote_store(path: Path) -> Store:
-    """Return the store at ``path``, which is only read. Raises `UsageError` where none is."""
-    store = Store(places.local(path).absolute())
+def named_store(remote: Path | str) -> AnyStore:
+    """Return the store at a path or an address, whether or not there is one. Raises `UsageError` for another address."""
+    found = addresses.parsed(str(remote))
+    if isinstance(found, Path):
+        return Store(places.local(found).absolute())
+    return RemoteStore(Bucket(found))
+
+
+def remote_store(remote: Path | str) -> AnyStore:
+    """Return the store at a path or an address, which is only read. Raises `UsageError` where none is."""
+    store = named_store(remote)
+    if isinstance(store, RemoteStore):
+        if not store.check():
+            raise UsageError(
+                f"{remote} is not a store: it has no `format`. Give an address that `store push` wrote to."
+            )
+        return store
     try:
-        regular.content(store.root / "format", regular.BLOCK_BYTES, follow=False)
-    except (FileNotFoundError, NotADirectoryError):
+        store.files.read(layout.MARK, regular.BLOCK_BYTES)
+    except (FileNotFoundError, StorageError) as error:
+        if isinstance(error, StorageError) and not isinstance(error.__cause__, NotADirectoryError):
+            raise
         raise UsageError(
-            f"{path} is not a store: it has no file `format`. Give a directory that `store push` wrote."
+            f"{remote} is not a store: it has no file `format`. Give a directory that `store push` wrote."
         ) from None
     except regular.IrregularError as error:
-        raise UsageError(f"{path} is not a store: {error}") from None
+        raise UsageError(f"{remote} is not a store: {error}") from None
     store.prepare()  # refuses one of another format
     return store
 
 
 def push(
-    remote: Path,
+    remote: Path | str,
     paths: Sequence[Path],
     *,
     ancestors: bool = False,
@@ -69,7 +89,7 @@ def push(
     Raises `UsageError` where another dataset was pushed under the name meanwhile, unless ``replace``, and `DamagedError` for
     a shard that is damaged here and cannot be recomputed.
     """
-    there, done = Store(places.local(remote).absolute()), Transferred()
+    there, done = named_store(remote), Transferred()
     for path in paths:
         here = locate(path)
         found = manifest_of.find(path)
@@ -82,7 +102,7 @@ def push(
             if writable:
                 replacing.outgoing(here, found.directory.absolute())
             lock = digest(["pushed", owner.id, name])
-            with there.leases.hold(lock, f"the pushed dataset {name}"):
+            with there.exclusively(lock, f"the pushed dataset {name}"):
                 before = _before(there, here, found, owner, name, replace=replace)
                 _copy(
                     here,
@@ -93,11 +113,7 @@ def push(
                     ancestors=ancestors,
                     verify=verify,
                 )
-                lasting = before is not None and pushed.lasting(there, before["manifest"])
-                there.roots.push(name, {"id": owner.id, "name": owner.name}, found.digest, before, lasting=lasting)
-                _expect_kept(there, name, owner, found.digest)
-                if before is not None and not project_id(before):
-                    there.roots.remove(before)  # its manifests are in the history of the new one
+                _name(there, here, found, owner, name, before, replace=replace)
             if writable:
                 here.roots.note_pushed(found.directory.absolute(), found.digest)
         every = pushed.roots(there)
@@ -105,7 +121,7 @@ def push(
     return done
 
 
-def pull(remote: Path, paths: Sequence[Path], *, ancestors: bool = False, replace: bool = False) -> Transferred:
+def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, replace: bool = False) -> Transferred:
     """Copy datasets from the store at ``remote``: those whose manifest lies at the path, else what was pushed from there.
 
     ``PROJECT:PATH`` is what another project pushed, and is written to that path of this one.
@@ -129,7 +145,9 @@ def pull(remote: Path, paths: Sequence[Path], *, ancestors: bool = False, replac
     return done
 
 
-def bring(there: Store, here: Store, found: manifest_of.Found, done: Transferred, *, ancestors: bool = False) -> None:
+def bring(
+    there: AnyStore, here: Store, found: manifest_of.Found, done: Transferred, *, ancestors: bool = False
+) -> None:
     """Copy what a dataset of another store needs into this one, which is at work on it. Raises as `push` does."""
     _copy(there, here, found, done, beside=(), ancestors=ancestors, verify=False)
 
@@ -159,8 +177,32 @@ def _announced(store: Store, manifest: str) -> Iterator[bool]:
             ) from error
 
 
+def _name(
+    there: AnyStore,
+    here: Store,
+    found: manifest_of.Found,
+    owner: Project,
+    name: str,
+    before: Root | None,
+    *,
+    replace: bool,
+) -> None:
+    """Have ``name`` mean what was copied. Raises as `push` does where another push came first."""
+    project = {"id": owner.id, "name": owner.name}
+    for _ in range(_LOOKS):
+        lasting = before is not None and pushed.lasting(there, before["manifest"])
+        if there.roots.push(name, project, found.digest, before, lasting=lasting):
+            break
+        before = _before(there, here, found, owner, name, replace=replace)
+    else:
+        raise TacpipeError(f"{name} is pushed to {there.place} by others all the time. Run the same command again.")
+    _expect_kept(there, name, owner, found.digest)
+    if before is not None and not project_id(before):
+        there.roots.remove(before)  # its manifests are in the history of the new one
+
+
 def _before(
-    there: Store, here: Store, found: manifest_of.Found, owner: Project, name: str, *, replace: bool
+    there: AnyStore, here: Store, found: manifest_of.Found, owner: Project, name: str, *, replace: bool
 ) -> Root | None:
     """Return the root that a push succeeds, None if there is none. Raises `UsageError` as `push` does.
 
@@ -179,16 +221,16 @@ def _before(
     return before
 
 
-def _expect_kept(there: Store, name: str, owner: Project, manifest: str) -> None:
+def _expect_kept(there: AnyStore, name: str, owner: Project, manifest: str) -> None:
     """Raise `TacpipeError` where a push of the same name wrote its root over this one's at the same time.
 
-    The lease excludes that, but for file systems without locks.
+    The lease excludes that, but for file systems without locks; in a bucket it takes three pushes during one of them.
     """
     root = there.roots.pushed(name, owner.id) or {}
     if manifest not in (root.get("manifest"), *(one["manifest"] for one in root.get("history", ()))):
         raise TacpipeError(
-            f"Another push of {name} to {there.root} ended at the same time and wrote over this one: the file system has "
-            f"no locks. Run the same command again, and one push at a time."
+            f"Another push of {name} to {there.place} ended at the same time and wrote over this one: there are no locks. "
+            f"Run the same command again, and one push at a time."
         )
 
 
@@ -196,7 +238,7 @@ def _is(root: Root, owner: Project, name: str) -> bool:
     return project_id(root) == owner.id and root["path"] == name
 
 
-def _wanted(path: Path, there: Store) -> tuple[manifest_of.Found, str]:
+def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
     """Return the manifest at a path, else that which was pushed from there or by the project that is named, and its name."""
     directory = path.parent if path.name == manifest_of.NAME else path
     if (directory / manifest_of.NAME).exists():
@@ -208,24 +250,30 @@ def _wanted(path: Path, there: Store) -> tuple[manifest_of.Found, str]:
         if not manifest_of.safe_path(root["path"]):
             raise UsageError(
                 f"{plain(root['path'])} is not a path within a project. `tacpipe store checkout {root['manifest'][:12]} "
-                f"--store {there.root} -o DIRECTORY` writes it elsewhere."
+                f"--store {there.place} -o DIRECTORY` writes it elsewhere."
             )
         directory = folder / root["path"]
     content = there.read(root["manifest"], regular.JSON_BYTES)
     return manifest_of.Found(directory, content), pushed.label(root, pushed.roots(there))
 
 
-def _copy(
-    source: Store,
-    target: Store,
-    found: manifest_of.Found,
-    done: Transferred,
-    *,
-    beside: tuple[str, ...],
-    ancestors: bool,
-    verify: bool,
-) -> None:
-    moved: set[str] = set()
+@dataclass
+class _Plan:
+    """What is to be copied."""
+
+    manifests: dict[str, bytes] = field(default_factory=dict)  # content by digest
+    objects: dict[str, tuple[str, int]] = field(default_factory=dict)  # path within the dataset and bytes, by digest
+
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of all of it."""
+        return {name: size for name, (_, size) in self.objects.items()} | {
+            name: len(content) for name, content in self.manifests.items()
+        }
+
+
+def _planned(source: AnyStore, target: AnyStore, found: manifest_of.Found, *, ancestors: bool) -> _Plan:
+    """Return what a dataset needs: its manifest and objects, the manifests it descends from, perhaps their objects too."""
+    plan = _Plan()
     todo, seen = [found.digest], set()
     while todo:
         name = todo.pop()
@@ -236,60 +284,122 @@ def _copy(
             content = found.content if name == found.digest else _manifest(source, target, name)
         except MissingError:
             continue
-        moved.add(name)
-        _put(target, content, name, done, verify=verify)
+        plan.manifests[name] = content
         manifest = manifest_of.parse(content, name, verified=True)
         todo += garbage.ancestors(manifest)
         if ancestors or name == found.digest:
             sizes = dict(manifest.sizes())
-            target.announce(sizes)
-            _expect_room(target, sizes)
-            read = execution.reader(source, beside, sizes)
-            for path, wanted in manifest.objects():
-                moved.add(wanted)
-                if _is_whole(target, wanted, sizes[wanted], done, verify=verify):
-                    continue
-                try:
-                    target.take(wanted, _counted(source.blocks(wanted, sizes[wanted]), sizes[wanted], path))
-                except MissingError:  # a copy next to the manifest or the stage that made it may bring it back
-                    target.take(wanted, _counted([read(wanted, path)], sizes[wanted], path))
-                done.objects += 1
-                done.bytes += sizes[wanted]
-    for _, record in source.records():
-        if _named(record) & moved and _named(record) <= moved:
-            target.commit(record["identity"], record["result"], record["provenance"], durable=True)
+            plan.objects.update({one: (path, sizes[one]) for path, one in manifest.objects()})
+    return plan
 
 
-def _manifest(source: Store, target: Store, name: str) -> bytes:
+def _copy(
+    source: AnyStore,
+    target: AnyStore,
+    found: manifest_of.Found,
+    done: Transferred,
+    *,
+    beside: tuple[str, ...],
+    ancestors: bool,
+    verify: bool,
+) -> None:
+    """Copy objects, then manifests, then records: what names something comes after it."""
+    plan = _planned(source, target, found, ancestors=ancestors)
+    sizes = plan.sizes()
+    target.announce(sizes)  # before looking what is there
+    there = target.sizes(sizes)
+    absent = [name for name in plan.objects if there.get(name) != sizes[name]]
+    _expect_room(target, sum(sizes[name] for name in absent))
+    absent += _damaged(target, [name for name in plan.objects if there.get(name) == sizes[name]], sizes, verify=verify)
+    _send(source, target, plan, absent, beside)
+    target.settle(layout.object_name(name) for name in absent)
+    fresh = [name for name in plan.manifests if there.get(name) != sizes[name]]
+    fresh += _damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
+    for name in fresh:
+        target.take(name, [plan.manifests[name]])
+    target.settle(layout.object_name(name) for name in fresh)
+    moved = {*absent, *fresh}
+    done.objects += len(moved)
+    done.bytes += sum(sizes[name] for name in moved)
+    done.there += len(sizes) - len(moved)
+    done.replaced += sum(name in there for name in moved)
+    _copy_records(source, target, found, sizes)
+
+
+def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
+    """Return those objects whose bytes are not what their names state, none unless they are to be verified."""
+
+    def is_sound(name: str) -> bool:
+        try:
+            for _ in target.blocks(name, sizes[name]):
+                pass
+        except MissingError:
+            return False
+        return True
+
+    names = list(names) if verify else []
+    return [name for name, sound in zip(names, threads.each(is_sound, names, target.at_once), strict=True) if not sound]
+
+
+def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], beside: tuple[str, ...]) -> None:
+    """Copy objects, several at once where another computer is asked. Raises `DamagedError` for what is nowhere sound."""
+    sizes = plan.sizes()
+
+    def send(name: str) -> tuple[str, MissingError | None]:
+        path, size = plan.objects[name]
+        try:
+            target.take(name, _Counted(source, name, size, path))
+        except MissingError as error:
+            return name, error
+        return name, None
+
+    failed = []
+    total = sum(sizes[name] for name in names)
+    went = 0
+    with progress.bar("copying", len(names)) as advance:
+        for name, error in threads.each(send, names, max(source.at_once, target.at_once)):
+            failed += [] if error is None else [(name, error)]
+            went += sizes[name]
+            advance(note=f"{went / 1e6:,.1f} of {total / 1e6:,.1f} MB")
+    for name, error in failed:  # a copy next to the manifest or the stage that made it may bring it back
+        path, size = plan.objects[name]
+        if isinstance(source, RemoteStore):
+            raise DamagedError(f"{path}: {error}") from error
+        target.take(name, _counted([execution.reader(source, beside, sizes)(name, path)], size, path))
+
+
+def _copy_records(source: AnyStore, target: AnyStore, found: manifest_of.Found, moved: Collection[str]) -> None:
+    """Copy the records of what was copied, and note in ``target`` which those are."""
+
+    def commit(one: tuple[str, dict[str, Any]]) -> str:
+        key, record = one
+        target.commit(record["identity"], record["result"], record["provenance"])
+        return key
+
+    names = set(moved)
+    several = (
+        (key, one) for key, one in source.records_of(found.digest) if _named(one) & names and _named(one) <= names
+    )
+    keys = list(threads.each(commit, several, max(source.at_once, target.at_once)))
+    target.settle(layout.record_name(key) for key in keys)
+    target.note_records(found.digest, keys)
+
+
+def _manifest(source: AnyStore, target: AnyStore, name: str) -> bytes:
     try:
         return source.read(name, regular.JSON_BYTES)
     except MissingError:
         return target.read(name, regular.JSON_BYTES)
 
 
-def _put(target: Store, content: bytes, name: str, done: Transferred, *, verify: bool) -> None:
-    target.announce([name])
-    if _is_whole(target, name, len(content), done, verify=verify):
-        return
-    if target.put(content, durable=True).digest != name:
-        raise TacpipeError(f"Object {name[:12]} changed on its way to {target.root}. Run the same command again.")
-    done.objects += 1
-    done.bytes += len(content)
+class _Counted:
+    """The blocks of an object, as often as they are asked for; raises as `_counted` does."""
 
+    def __init__(self, source: AnyStore, name: str, size: int, path: str) -> None:
+        self._source, self._name, self._size, self._path = source, name, size, path
 
-def _is_whole(target: Store, name: str, size: int, done: Transferred, *, verify: bool) -> bool:
-    """Return whether an object is there already: with its size, and to ``verify`` with its bytes."""
-    whole = target.has(name, size)
-    damaged = not whole and target.has(name)
-    if whole and verify:
-        try:
-            for _ in target.blocks(name, size):
-                pass
-        except MissingError:
-            whole, damaged = False, True
-    done.there += whole
-    done.replaced += damaged
-    return whole
+    def __iter__(self) -> Iterator[bytes]:
+        return _counted(self._source.blocks(self._name, self._size), self._size, self._path)
 
 
 def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
@@ -305,13 +415,12 @@ def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
         )
 
 
-def _expect_room(target: Store, sizes: Mapping[str, int]) -> None:
+def _expect_room(target: AnyStore, needed: int) -> None:
     """Raise `StorageError` where the disk of a store has less room than what is to be copied there takes."""
-    needed = sum(size for name, size in sizes.items() if not target.has(name, size))
-    disk = shutil.disk_usage(target.root)
-    if disk.total and needed > disk.free:
+    room = target.room()
+    if room is not None and needed > room:
         raise StorageError(
-            f"{needed / 1e9:,.1f} GB are to be copied to {target.root}, and its disk has {disk.free / 1e9:,.1f} GB left; "
+            f"{needed / 1e9:,.1f} GB are to be copied to {target.place}, and its disk has {room / 1e9:,.1f} GB left; "
             f"nothing was copied. If that is what you expect, free some space; if it came from an untrusted store, do not."
         )
 

@@ -12,9 +12,10 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
+from tacpipe.io.hashing import DIGEST
 from tacpipe.printable import listed, plain
 
 FORMAT = "1"
@@ -43,6 +44,21 @@ _SHELVED = ("objects", "records")
 _HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # their entries are folders, those of others files
 _BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may hold something before there is a mark
 _BESIDE = frozenset({".gitignore", ".gitkeep", "lost+found"})  # no reason to refuse a folder that is to become a store
+
+
+def object_name(name: str) -> str:
+    """Return the path within a store of the object ``name``.
+
+    Raises `DamagedError` for a name that is not a digest: it would lead out of the store.
+    """
+    if not DIGEST.fullmatch(name):
+        raise DamagedError(f"{name[:80]!r} is not a digest (64 hex digits): what names it is damaged or was made up.")
+    return f"objects/{name[:2]}/{name}"
+
+
+def record_name(key: str) -> str:
+    """Return the path within a store of the record of ``key``."""
+    return f"records/{key[:2]}/{key}.json"
 
 
 def check(root: Path) -> bool:

@@ -64,7 +64,7 @@ class Leases:
         try:
             with contextlib.suppress(OSError):  # who waits likes to know for whom; no more rests on it
                 os.ftruncate(handle, 0)
-                os.pwrite(handle, _note(what=what), 0)
+                os.pwrite(handle, note(what=what), 0)
             yield
         finally:
             _release(path, handle)
@@ -78,7 +78,7 @@ class Leases:
             handle = _try_lock(path)
         try:
             with readable_errors(self.folder):
-                write_all(handle, _note(manifests=sorted(manifests)) + b"\n")
+                write_all(handle, note(manifests=sorted(manifests)) + b"\n")
             announcing = Announcing(path)
             yield announcing
             announcing.close()
@@ -130,7 +130,7 @@ class Leases:
             raise LockedError(f"{_holder(path)} is at work on `tacpipe store {what}` already. Wait for it.")
         try:
             with contextlib.suppress(OSError):
-                os.pwrite(handle, _note(what=what), 0)
+                os.pwrite(handle, note(what=what), 0)
             yield
         finally:
             _release(path, handle)
@@ -177,16 +177,21 @@ def _release(path: Path, handle: int) -> None:
 
 
 def _parsed(path: Path) -> Run:
-    first, _, rest = regular.content(path, LEASE_BYTES, follow=False).decode("latin-1").partition("\n")
+    return parsed(path, regular.content(path, LEASE_BYTES, follow=False))
+
+
+def parsed(path: Path, content: bytes) -> Run:
+    """Return the run that a lease describes: a line on who holds it, and a line for each digest that is used."""
+    first, _, rest = content.decode("latin-1").partition("\n")
     try:
-        note = json.loads(first)
+        stated = json.loads(first)
     except ValueError:
-        note = {}  # it is being written
-    return Run(path, note if isinstance(note, dict) else {}, set(rest.split()))
+        stated = {}  # it is being written
+    return Run(path, stated if isinstance(stated, dict) else {}, set(rest.split()))
 
 
-def _note(**more: Any) -> bytes:
-    """Return what a lease states of who holds it."""
+def note(**more: Any) -> bytes:
+    """Return what a lease states of who holds it, as one line of JSON."""
     command = shlex.join(["tacpipe", *sys.argv[1:]])
     value = {"host": platform.node(), "pid": os.getpid(), "command": command[:500], "since_s": int(time.time()), **more}
     return json.dumps(value).encode()

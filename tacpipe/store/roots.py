@@ -42,7 +42,7 @@ class Roots:
         known = self.get(path)
         if known is None or known["manifest"] != manifest:
             pushed = {"pushed": known["pushed"]} if known and "pushed" in known else {}
-            self.write({"path": name, "kind": kind, **_succeeding(known, manifest, lasting=lasting), **pushed})
+            self.write({"path": name, "kind": kind, **succeeding(known, manifest, lasting=lasting), **pushed})
         if durable:
             self.store.sync(self._file(kind, name))
 
@@ -50,15 +50,17 @@ class Roots:
         """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
         return self.at(self._file(*self.named(path)))
 
-    def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> None:
+    def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> bool:
         """Note that a project (``id`` and ``name``) pushed ``manifest`` as its dataset ``name``, after ``before``.
 
-        What was pushed before it stays in the history, for ever where that is ``lasting``.
+        What was pushed before it stays in the history, for ever where that is ``lasting``. Returns True: a lease sees to it
+        that nobody else pushes that name at the same time.
         """
         root = {"path": name, "kind": PUSHED, "project": dict(project)}
         if before is None or before["manifest"] != manifest or before.get("project") != project:
-            self.write({**root, **_succeeding(before, manifest, lasting=lasting)})
+            self.write({**root, **succeeding(before, manifest, lasting=lasting)})
         self.store.sync(self._file(PUSHED, name, project["id"]))
+        return True
 
     def pushed(self, name: str, project: str = "") -> Root | None:
         """Return what the project of this id pushed as ``name``, or None; without an id, what was pushed before projects."""
@@ -88,9 +90,7 @@ class Roots:
         kind, name = root["kind"], str(root["path"])
         if kind == BESIDE and Path(name).is_absolute():
             name = os.path.relpath(name, self.store.root.parent)
-        content = {key: value for key, value in root.items() if key != "check"} | {"path": name, "kind": kind}
-        text = json.dumps({**content, "check": digest(content)}, sort_keys=True)
-        self.store.write_file(self._file(kind, name, project_id(root)), text.encode())
+        self.store.write_file(self._file(kind, name, project_id(root)), encoded({**root, "path": name, "kind": kind}))
 
     def at(self, file: Path) -> Root | None:
         """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
@@ -101,12 +101,8 @@ class Roots:
             return None
         except (ValueError, RecursionError, regular.IrregularError):
             value = None
-        root: Root = value if isinstance(value, dict) else {}
-        check = root.pop("check", None)
-        if check is None and "kind" not in root and isinstance(root.get("path"), str):  # as they were once written
-            root["kind"] = ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED
-            return root if _formed(root) else None
-        if check is None or check != digest(root) or not _formed(root):
+        root = decoded(value)
+        if root is None:
             if DIGEST.fullmatch(file.stem):  # another name is not one of ours
                 self.store.quarantine(file)
             return None
@@ -141,8 +137,29 @@ class Roots:
         return ABSOLUTE, str(path)
 
     def _file(self, kind: str, name: str, project: str = "") -> Path:
-        named: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
-        return self.store.root / "roots" / f"{digest(named)}.json"
+        return self.store.root / "roots" / f"{name_of(kind, name, project)}.json"
+
+
+def name_of(kind: str, name: str, project: str = "") -> str:
+    """Return the digest under which a root is kept."""
+    named: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
+    return digest(named)
+
+
+def encoded(root: Mapping[str, Any]) -> bytes:
+    """Return a root as it is kept, with a digest of itself."""
+    content = {key: value for key, value in root.items() if key != "check"}
+    return json.dumps({**content, "check": digest(content)}, sort_keys=True).encode()
+
+
+def decoded(value: Any) -> Root | None:
+    """Return the root that a JSON value holds, None for one that is damaged."""
+    root: Root = dict(value) if isinstance(value, dict) else {}
+    check = root.pop("check", None)
+    if check is None and "kind" not in root and isinstance(root.get("path"), str):  # as they were once written
+        root["kind"] = ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED
+        return root if _formed(root) else None
+    return root if check is not None and check == digest(root) and _formed(root) else None
 
 
 def project_id(root: Mapping[str, Any]) -> str:
@@ -150,7 +167,7 @@ def project_id(root: Mapping[str, Any]) -> str:
     return str(root.get("project", {}).get("id", ""))
 
 
-def _succeeding(known: Root | None, manifest: str, *, lasting: bool) -> Root:
+def succeeding(known: Root | None, manifest: str, *, lasting: bool) -> Root:
     """Return what a root states of ``manifest`` and of those before it, the newest of which is that of ``known``."""
     history = [] if known is None else _history(known, manifest, lasting=lasting)
     previous = None if known is None else known["manifest"]

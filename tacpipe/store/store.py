@@ -7,11 +7,11 @@ import errno
 import hashlib
 import json
 import os
-import stat
+import shutil
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ from typing import Any
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import drafts, memory, places, regular
 from tacpipe.io.drafts import Draft
-from tacpipe.io.files import listed, move, present, readable_errors, sentence, sync_folders, unread, write_whole
-from tacpipe.io.hashing import DIGEST, bytes_digest, digest
+from tacpipe.io.files import listed, move, present, readable_errors, sync_folders, unread
+from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store import layout
+from tacpipe.store.directory import Directory
 from tacpipe.store.leases import Announcing, Leases
 from tacpipe.store.roots import BESIDE_NAME, Roots
 
@@ -48,29 +49,30 @@ class Store:
     ``run`` is the lease of the run that this process works for, as `at_work` gave it to the process that began it.
     """
 
+    at_once = 1  # objects that a transfer reads or writes at once
+
     def __init__(self, root: Path | str, run: str = "") -> None:
         self.root = Path(root)
         self._root = str(root)
+        self.files = Directory(root, self.draft)
         self.leases = Leases(self.root / "leases")
         self.roots = Roots(self)
         self._run = Announcing(run) if run else None
 
     # ---- places
 
-    def object_path(self, name: str) -> str:
-        """Return where the object ``name`` lies, whether or not it is there.
+    @property
+    def place(self) -> str:
+        """The place of the store, as sentences name it."""
+        return self._root
 
-        Raises `DamagedError` for a name that is not a digest: it would lead out of the store.
-        """
-        if not DIGEST.fullmatch(name):
-            raise DamagedError(
-                f"{name[:80]!r} is not a digest (64 hex digits): what names it is damaged or was made up."
-            )
-        return f"{self._root}/objects/{name[:2]}/{name}"
+    def object_path(self, name: str) -> str:
+        """Return where the object ``name`` lies, whether or not it is there; raises as `layout.object_name` does."""
+        return self.files.path(layout.object_name(name))
 
     def record_path(self, key: str) -> str:
         """Return where the record of ``key`` lies, whether or not it is there."""
-        return f"{self._root}/records/{key[:2]}/{key}.json"
+        return self.files.path(layout.record_name(key))
 
     def check(self) -> bool:
         """Return whether there is a store; False where one may be begun. Raises `UsageError` as `layout.check` does."""
@@ -115,6 +117,10 @@ class Store:
         if self._run is not None:
             self._run.close()
 
+    def exclusively(self, key: str, what: str) -> contextlib.AbstractContextManager[None]:
+        """Hold the lease of ``key`` within the block, as `Leases.hold` does."""
+        return self.leases.hold(key, what)
+
     @property
     def run(self) -> str:
         """The lease of the run at work, for the processes that work for it; empty where nobody stated so."""
@@ -130,15 +136,23 @@ class Store:
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
         try:
-            found = os.lstat(self.object_path(name))  # called once a shard: os is 5 times faster than pathlib
-        except FileNotFoundError:
-            return self._put_back(name)
-        except OSError as error:
-            raise sentence(self.root, error) from error
-        if not stat.S_ISREG(found.st_mode):
+            found = self.files.stat(layout.object_name(name))
+        except regular.IrregularError:
             self.quarantine(self.object_path(name))
             return self._put_back(name)
-        return size is None or found.st_size == size
+        if found is None:
+            return self._put_back(name)
+        return size is None or found.bytes == size
+
+    def sizes(self, names: Iterable[str]) -> dict[str, int]:
+        """Return the bytes of those objects that are there."""
+        there = (name for name in names if self.has(name))
+        return {name: entry.bytes for name in there if (entry := self.files.stat(layout.object_name(name))) is not None}
+
+    def room(self) -> int | None:
+        """Return how many bytes the disk has left, None where that is not known."""
+        disk = shutil.disk_usage(self.root)
+        return disk.free if disk.total else None
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         """Store ``content`` and return its digest and size.
@@ -173,7 +187,7 @@ class Store:
             name = draft.digest
             self.announce([name])
             if durable or not self.has(name, draft.bytes):  # a copy that is there may be damaged
-                self._refuse_linked(self.object_path(name))
+                self.files.refuse_linked(self.object_path(name))
                 with readable_errors(self.root):
                     move(path, self.object_path(name))
         if durable:
@@ -181,14 +195,18 @@ class Store:
         return Object(name, draft.bytes)
 
     def take(self, name: str, blocks: Iterable[bytes]) -> None:
-        """Store the object ``name``, durable, from ``blocks`` that are verified, as `blocks` of another store yields them.
+        """Store the object ``name`` from ``blocks`` that are verified, as `blocks` of another store yields them.
 
-        What was there is replaced.
+        What was there is replaced. After `settle` it outlasts a loss of power.
         """
         self.announce([name])
-        path = self.object_path(name)
-        self.write_file(path, blocks, mode=0o444)
-        self.sync(path)
+        self.write_file(self.object_path(name), blocks, mode=0o444)
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Have names within the store outlast a loss of power, as their contents do; each folder is synced once."""
+        with readable_errors(self.root):
+            for path in {os.path.dirname(self.files.path(name)) for name in names}:  # noqa: PTH120
+                sync_folders(path, self._root)
 
     def read(self, name: str, size: int | None = None) -> bytes:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
@@ -197,17 +215,14 @@ class Store:
         do not hash to its name: those are then moved to ``quarantine/``. Raises `StorageError` where the system fails to
         read it (EIO, EMFILE, EACCES, …) or memory is short, which states nothing of the object.
         """
-        path = self.object_path(name)
         try:
-            content = regular.content(path, None if size is None else _most(size), follow=False)
+            content = self.files.read(layout.object_name(name), None if size is None else most(size))
         except FileNotFoundError:
             if self._put_back(name):
                 return self.read(name, size)
             raise self._missing(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
-        except OSError as error:
-            raise unread(path, error) from error
         if bytes_digest(content) != name:
             raise self._damaged(name)
         return content
@@ -217,16 +232,13 @@ class Store:
         hashed = hashlib.sha256()
         try:
             self.has(name)  # puts back what a collection moved aside
-            most = sys.maxsize if size is None else _most(size)
-            for block in regular.blocks(self.object_path(name), most, follow=False):
+            for block in self.files.blocks(layout.object_name(name), sys.maxsize if size is None else most(size)):
                 hashed.update(block)
                 yield block
         except FileNotFoundError:
             raise self._missing(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
-        except OSError as error:
-            raise unread(self.object_path(name), error) from error
         if hashed.hexdigest() != name:
             raise self._damaged(name)
 
@@ -272,19 +284,15 @@ class Store:
 
         Raises `StorageError` for one that is aside and cannot be put back: it is not gone.
         """
-        path = self.object_path(name)
-        if layout.is_linked(self._root, path):
+        if layout.is_linked(self._root, self.object_path(name)):
             return False
-        with readable_errors(self.root):
-            try:
-                os.rename(self.aside(name), path)  # noqa: PTH104
-            except FileNotFoundError:
-                return False
-            except OSError:  # of a store that may only be read, whether or not anything is aside
+        try:
+            return self.files.move(f"tmp/{layout.ASIDE}{name}", layout.object_name(name))
+        except StorageError:  # of a store that may only be read, whether or not anything is aside
+            with readable_errors(self.root):
                 if present(self.aside(name)):
                     raise
-                return False
-        return True
+            return False
 
     def sync(self, path: str | Path) -> None:
         """Have the name of a file of the store outlast a loss of power, as its content does."""
@@ -302,13 +310,8 @@ class Store:
     def write_file(
         self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
     ) -> bool:
-        """Write a file of the store whole or not at all; return False if ``exclusive`` lost the race.
-
-        Raises `StorageError` where its folder is a symbolic link: what is replaced there may be anybody's.
-        """
-        self._refuse_linked(path)
-        with readable_errors(self.root):
-            return write_whole(str(path), content, self.draft(), mode=mode, exclusive=exclusive)
+        """Do as `Directory.write`."""
+        return self.files.write(path, content, mode=mode, exclusive=exclusive)
 
     def draft(self, name: str = "") -> str:
         """Return a path in ``tmp/``, of a new name or of this one (32 hex digits), that begins with the run's.
@@ -316,12 +319,6 @@ class Store:
         From that a collection sees whether the run that wrote there is over.
         """
         return f"{self._root}/tmp/{Path(self.run).stem}.{name or uuid.uuid4().hex}"
-
-    def _refuse_linked(self, path: Path | str) -> None:
-        if layout.is_linked(self._root, path):
-            raise StorageError(
-                f"{Path(path).parent} is a symbolic link, and none is followed within a store. Remove it."
-            )
 
     # ---- records
 
@@ -341,7 +338,7 @@ class Store:
         try:
             with readable_errors(self.root, reading=True):
                 record: dict[str, Any] = regular.json_value(path)
-            if _sound(record, key):
+            if sound(record, key):
                 return record
         except FileNotFoundError:
             raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
@@ -366,9 +363,7 @@ class Store:
         ``replace`` is for results whose old record names objects that are gone.
         """
         key = digest(identity)
-        body = {"identity": identity, "result": result}
-        record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
-        content = json.dumps(record, sort_keys=True).encode()
+        record, content = record_content(identity, result, provenance)
         path = self.record_path(key)
         for _ in range(2):  # a second time if the record that was there turns out to be damaged
             if self.write_file(path, content, exclusive=not replace):
@@ -381,6 +376,13 @@ class Store:
             self.sync(path)
         return record
 
+    def note_records(self, manifest: str, keys: Collection[str]) -> None:
+        """Do nothing: in a folder all records are read in little time."""
+
+    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield records and their keys, among them all that belong to a manifest: those of the store."""
+        return self.records()
+
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield every key and its record."""
         for path in layout.entries(self.root, "records"):
@@ -389,7 +391,16 @@ class Store:
                 yield path.stem, record
 
 
-def _sound(record: dict[str, Any], key: str) -> bool:
+def record_content(
+    identity: Mapping[str, Any], result: Mapping[str, Any], provenance: Mapping[str, Any]
+) -> tuple[dict[str, Any], bytes]:
+    """Return the record that ``identity`` gave ``result``, with digests of itself, and how it is kept."""
+    body = {"identity": identity, "result": result}
+    record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
+    return record, json.dumps(record, sort_keys=True).encode()
+
+
+def sound(record: dict[str, Any], key: str) -> bool:
     """Return whether a record is the key's own, and all of it is as it was written (older ones have no check)."""
     identity, provenance = record["identity"], record["provenance"]
     body = {"identity": identity, "result": record["result"]}
@@ -398,7 +409,7 @@ def _sound(record: dict[str, Any], key: str) -> bool:
     return whole and digest(identity) == key and digest(body) == record["digest"]
 
 
-def _most(size: int) -> int:
+def most(size: int) -> int:
     """Return how many bytes of an object of this declared size are read: a small one that has grown is quarantined."""
     return max(size, memory.AT_HAND)
 

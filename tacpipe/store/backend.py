@@ -1,0 +1,58 @@
+"""What a store asks of the place that keeps its bytes: six verbs on names, the same for a folder and for a bucket.
+
+A name is a path within the store, as `docs/format.md` lists them, such as ``objects/ab/ab12…``. A place that computers share
+needs no more than that one of several that create a name wins: what has to change gets another name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple, Protocol
+
+
+class Entry(NamedTuple):
+    """What a place states of one name."""
+
+    name: str
+    bytes: int
+    changed_s: float  # seconds of UTC since 1970, by the clock of the place
+
+
+class Backend(Protocol):
+    """A place that keeps bytes by name. Every verb raises `StorageError` where the place fails, which states nothing of
+    what it keeps."""
+
+    place: str  # as sentences name it
+
+    def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
+        """Keep ``content``, whole or in blocks, under a name that nothing has; return False where something has it.
+
+        Of several that create one name at once one wins. Nobody ever sees a part of the content.
+        """
+
+    def read(self, name: str, most: int | None = None) -> bytes:
+        """Return the content of at most ``most`` bytes.
+
+        Raises `FileNotFoundError` where there is none, and `IrregularError` for one that is larger or is not content.
+        """
+
+    def blocks(self, name: str, most: int) -> Iterator[bytes]:
+        """Yield the content block by block; raises as `read` does."""
+
+    def stat(self, name: str) -> Entry | None:
+        """Return what the place states of a name, None where nothing has it; raises `IrregularError` as `read` does."""
+
+    def list(self, folder: str) -> Iterator[Entry]:
+        """Yield what has the form of a store's names within ``folder``, at any depth, in no order.
+
+        What is deleted meanwhile may be left out.
+        """
+
+    def move(self, name: str, to: str) -> bool:
+        """Give content another name, and replace what has that; return False where nothing has ``name``.
+
+        Whoever looks finds it under the one name, the other, or both.
+        """
+
+    def delete(self, name: str) -> None:
+        """Keep a name no longer; one that nothing has is no mistake."""

@@ -1,0 +1,275 @@
+"""Object storage as the place of a store, by `obstore`: whole objects, and one winner of several that create a name."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import timedelta
+from itertools import chain
+from threading import Semaphore
+from typing import Any, TypeVar
+
+from tacpipe.errors import StorageError, UsageError
+from tacpipe.io import memory, regular
+from tacpipe.plugins import extras
+from tacpipe.store import addresses
+from tacpipe.store.addresses import Address
+from tacpipe.store.backend import Entry
+
+Result = TypeVar("Result")
+TRIES = 5  # of one request
+RETRIES = 2  # of the client, within each of these
+PAUSE_S = 0.2  # after the first; four times longer after each
+PART_BYTES = 8 << 20  # an object up to this size is one request
+_AHEAD = 4  # parts of one object on their way at once
+_LARGE = 4  # objects of several parts on their way at once, which bounds memory to 128 MB
+_COPY_BYTES = 5 * 10**9  # the largest object that S3 copies by itself
+_STATUS = re.compile(r"status code: (\d{3}[ A-Za-z]*)")
+_NO_BUCKET = ("NoSuchBucket", "bucket does not exist", "ContainerNotFound")
+_METADATA = ("169.254.169.254", "metadata.google.internal")  # asked last, where nothing else gives credentials
+
+
+class Bucket:
+    """A folder of a bucket. Safe to use from several threads; credentials never leave the client."""
+
+    def __init__(self, address: Address | str, client: Any = None) -> None:
+        self.place = str(address)
+        self._client = client if isinstance(address, str) else _connected(address)
+        self._large = Semaphore(_LARGE)
+
+    def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
+        """Do as `Backend.create`.
+
+        Blocks of more than one part are sent as such, and take a name whoever has it meanwhile; what ``content`` raises
+        ends that, and nothing of it is kept. It is iterated over again where the connection is lost, but an iterator is not.
+        """
+        if isinstance(content, bytes):
+            return self._create(name, content)
+        blocks = iter(content)
+        begun = _part(blocks)
+        if len(begun) <= PART_BYTES:
+            return self._create(name, begun)
+        if self.stat(name) is not None:
+            return False
+        import obstore
+
+        again: Iterable[bytes] = chain([begun], blocks)
+
+        def send() -> None:
+            nonlocal again
+            sent, again = again, content
+            obstore.put(
+                self._client, name, _parts(sent), use_multipart=True, chunk_size=PART_BYTES, max_concurrency=_AHEAD
+            )
+
+        with self._large:
+            self._tried(send, tries=1 if blocks is content else TRIES)
+        return True
+
+    def _create(self, name: str, content: bytes) -> bool:
+        import obstore
+
+        tries = 0
+
+        def put() -> bool:
+            nonlocal tries
+            tries += 1
+            try:
+                obstore.put(self._client, name, content, mode="create")
+            except obstore.exceptions.AlreadyExistsError:
+                return tries > 1 and self.read(name) == content  # an answer that was lost had kept it
+            return True
+
+        return self._tried(put)
+
+    def read(self, name: str, most: int | None = None) -> bytes:
+        """Do as `Backend.read`."""
+        return b"".join(self._blocks(name, most))
+
+    def blocks(self, name: str, most: int) -> Iterator[bytes]:
+        """Do as `Backend.blocks`: parts of a large object are fetched ahead of the one that is used."""
+        return self._blocks(name, most)
+
+    def _blocks(self, name: str, most: int | None) -> Iterator[bytes]:
+        import obstore
+
+        def begin() -> tuple[bytes, int]:
+            found = obstore.get(self._client, name)
+            size = int(found.meta["size"])
+            return bytes(found.bytes()) if size <= PART_BYTES else b"", size
+
+        first, size = self._tried(begin)
+        if most is not None and size > most:
+            raise regular.IrregularError(
+                f"{self.place}/{name} has {size:,} bytes, and should have {most:,} at most. It is damaged or was made up."
+            )
+        if most is None:
+            memory.require(size, f"{self.place}/{name}", error=StorageError)
+        if size <= PART_BYTES:
+            yield first
+            return
+        with self._large, ThreadPoolExecutor(_AHEAD) as threads:
+            waiting: deque[Future[bytes]] = deque()
+            for start in range(0, size, PART_BYTES):
+                waiting.append(threads.submit(self._range, name, start, min(start + PART_BYTES, size)))
+                if len(waiting) > _AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+
+    def _range(self, name: str, start: int, end: int) -> bytes:
+        import obstore
+
+        return self._tried(lambda: bytes(obstore.get_range(self._client, name, start=start, end=end)))
+
+    def stat(self, name: str) -> Entry | None:
+        """Do as `Backend.stat`."""
+        import obstore
+
+        try:
+            found = self._tried(lambda: obstore.head(self._client, name))
+        except FileNotFoundError:
+            return None
+        return Entry(name, found["size"], found["last_modified"].timestamp())
+
+    def list(self, folder: str) -> Iterator[Entry]:
+        """Do as `Backend.list`; what has another form than a store's names is listed too."""
+        import obstore
+
+        def found() -> list[Entry]:
+            pages = obstore.list(self._client, folder)
+            return [Entry(one["path"], one["size"], one["last_modified"].timestamp()) for page in pages for one in page]
+
+        yield from self._tried(found)
+
+    def move(self, name: str, to: str) -> bool:
+        """Do as `Backend.move`: a copy, which the server makes, and then a deletion."""
+        import obstore
+
+        there = self.stat(name)
+        if there is None:
+            return False
+        try:
+            if there.bytes > _COPY_BYTES:
+                self.create(to, self._blocks(name, None))
+            else:
+                self._tried(lambda: obstore.copy(self._client, name, to))
+        except FileNotFoundError:
+            return False
+        self.delete(name)
+        return True
+
+    def delete(self, name: str) -> None:
+        """Do as `Backend.delete`."""
+        import obstore
+
+        with contextlib.suppress(FileNotFoundError):
+            self._tried(lambda: obstore.delete(self._client, name))
+
+    def _tried(self, request: Callable[[], Result], tries: int = 0) -> Result:
+        """Return what a request gives, made again where the connection or the server fails. Raises `StorageError`."""
+        import obstore
+        from obstore.exceptions import BaseError
+
+        pause_s = PAUSE_S
+        for left in reversed(range(tries or TRIES)):
+            try:
+                return request()
+            except obstore.exceptions.GenericError as error:
+                if left == 0 or not _may_pass(error):
+                    raise self._sentence(error) from None  # its own text may hold what nobody may read
+            except FileNotFoundError as error:
+                if any(mark in str(error) for mark in _NO_BUCKET):
+                    raise self._sentence(error) from None
+                raise FileNotFoundError(f"{self.place} has no such name") from None
+            except BaseError as error:
+                raise self._sentence(error) from None
+            time.sleep(pause_s * random.uniform(0.5, 1.5))
+            pause_s *= 4
+        raise AssertionError
+
+    def _sentence(self, error: Exception) -> StorageError | UsageError:
+        """Return in words what the server answered; of its text only the status is shown."""
+        from obstore.exceptions import PermissionDeniedError, UnauthenticatedError
+
+        text = str(error)
+        status = _STATUS.search(text)
+        answer = f" It answers {status[1].strip()}." if status else ""
+        if any(mark in text for mark in _NO_BUCKET):
+            return UsageError(
+                f"There is no bucket at {self.place}. Create it, or correct its name or AWS_ENDPOINT_URL."
+            )
+        if any(mark in text for mark in _METADATA):
+            return StorageError(
+                f"No credentials were found for {self.place}. Set them in the environment (AWS_ACCESS_KEY_ID and "
+                f"AWS_SECRET_ACCESS_KEY), or name a profile in AWS_PROFILE."
+            )
+        if isinstance(error, PermissionDeniedError | UnauthenticatedError):
+            return StorageError(
+                f"{self.place} refuses the credentials.{answer} Check those of the environment or of the profile, and what "
+                f"they allow: reading, writing, listing and deleting below this address."
+            )
+        if status is None:
+            return StorageError(
+                f"{self.place} cannot be reached, or the connection is lost again and again. Check the network and "
+                f"AWS_ENDPOINT_URL, then run the same command again: what went over stays there."
+            )
+        return StorageError(f"{self.place} fails.{answer} Run the same command again: what went over stays there.")
+
+
+def _may_pass(error: Exception) -> bool:
+    """Return whether a request may succeed when it is made again: not one that the server understood and refused."""
+    text = str(error)
+    status = _STATUS.search(text)
+    lasting = status is not None and status[1][0] == "4" and status[1][:3] not in ("408", "429")
+    return not lasting and not any(mark in text for mark in (*_METADATA, "builder error"))
+
+
+def _part(blocks: Iterator[bytes]) -> bytes:
+    """Return what ``blocks`` give up to a little more than one part, or all they give."""
+    found: list[bytes] = []
+    size = 0
+    for block in blocks:
+        found.append(block)
+        size += len(block)
+        if size > PART_BYTES:
+            break
+    return found[0] if len(found) == 1 else b"".join(found)
+
+
+def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
+    """Yield the same bytes in pieces of a part or so: each step of the client costs a change of threads."""
+    blocks = iter(blocks)
+    while part := _part(blocks):
+        yield part
+
+
+def _connected(address: Address) -> Any:
+    """Return obstore's client of an address, with the credentials that the environment or a profile gives."""
+    with extras.named(f"A store at {address.scheme}://"):
+        from obstore.exceptions import BaseError
+        from obstore.store import from_url
+
+    given = addresses.settings(address)
+    options: dict[str, Any] = {"timeout": "120s", "connect_timeout": "5s", "allow_http": given.plaintext}
+    retries: dict[str, Any] = {
+        "max_retries": RETRIES,
+        "retry_timeout": timedelta(seconds=60),
+        "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=2), "base": 2},
+    }
+    more: dict[str, Any] = {} if given.provider is None else {"credential_provider": given.provider}
+    more |= {"config": given.config, "client_options": options, "retry_config": retries}
+    try:
+        return from_url(str(address), **more)
+    except (BaseError, ValueError, TypeError):  # its text may hold a credential
+        raise UsageError(
+            f"The settings for {address} cannot be used. Look at the variables {_VARIABLES[address.scheme]} and the profile."
+        ) from None
+
+
+_VARIABLES = {"s3": "AWS_…", "gs": "GOOGLE_…", "az": "AZURE_…"}

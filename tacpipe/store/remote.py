@@ -1,0 +1,376 @@
+"""A store in a place that knows no locks: objects by digest, records by key, and roots that are never written over.
+
+No promise rests on a clock, or on a lock. Whoever uses an object announces it before looking whether it is there, and a
+collection moves objects aside before it reads the announcements, as in a folder. A push keeps each version of a root under a
+number of its own: of two that push the same name at once one gets the number, and the other one looks again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import re
+import sys
+import uuid
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.io import regular, threads
+from tacpipe.io.hashing import DIGEST, bytes_digest, digest
+from tacpipe.printable import plain
+from tacpipe.store import layout, leases
+from tacpipe.store.backend import Backend, Entry
+from tacpipe.store.leases import LEASE_BYTES, Run
+from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, decoded, encoded, name_of, project_id, succeeding
+from tacpipe.store.store import AbsentError, MissingError, Object, most, record_content, sound
+
+AT_ONCE = 16  # requests on their way at once
+SNAPSHOTS = "snapshots"  # which records belong to which manifest, so that a pull need not read all
+_LISTED = 10  # objects of one shelf from which on the shelf is listed: S3 takes as much for a list as for 12 looks
+_NUMBER = "number"  # of the version that a root was read from; it is not kept
+_VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
+
+
+class RemoteStore:
+    """A store in a place such as a bucket, for `push` and `pull`. It may be used from several threads."""
+
+    at_once = AT_ONCE
+
+    def __init__(self, files: Backend) -> None:
+        self.files = files
+        self.roots = RemoteRoots(files)
+        self._announced: set[str] = set()
+        self._leases: list[str] = []
+        self._manifests: list[str] = []
+
+    @property
+    def place(self) -> str:
+        """The address of the store, as sentences name it."""
+        return self.files.place
+
+    def check(self) -> bool:
+        """Return whether there is a store. Raises `UsageError` for one of another format."""
+        try:
+            found = self.files.read(layout.MARK, regular.BLOCK_BYTES).strip().decode(errors="replace")
+        except FileNotFoundError:
+            return False
+        except regular.IrregularError as error:
+            raise UsageError(f"{self.place} is not a store: {error}") from None
+        if found != layout.FORMAT:
+            raise UsageError(
+                f"The store {self.place} has format {plain(found) or 'unknown'}; this tacpipe reads format {layout.FORMAT}."
+            )
+        return True
+
+    def prepare(self) -> None:
+        """Begin the store where there is none yet. Raises `UsageError` as `check` does, and where the server does not
+        refuse to create what is there already."""
+        mark = layout.FORMAT.encode() + b"\n"
+        if self.files.create(layout.MARK, mark) and self.files.create(layout.MARK, mark):
+            raise UsageError(
+                f"The server of {self.place} writes over what is there although it is asked not to (If-None-Match: *), so "
+                f"pushes could replace each other. Use one that supports conditional writes."
+            )
+        self.check()
+
+    # ---- runs
+
+    @contextlib.contextmanager
+    def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
+        """Have what is announced in the block kept by collections; what they read is ``manifests``.
+
+        Raises `TacpipeError` after the block if an announcement was taken for one of a process that is gone.
+        """
+        self.prepare()
+        self._manifests = sorted(manifests)
+        try:
+            yield
+            if any(self.files.stat(name) is None for name in self._leases):
+                raise TacpipeError(
+                    f"A collection in {self.place} took this command for one that was killed long ago, and may have removed "
+                    f"what was there already. Run the same command again."
+                )
+        finally:
+            for name in self._leases:
+                with contextlib.suppress(TacpipeError):  # one that stays is removed by a later collection
+                    self.files.delete(name)
+            self._leases, self._announced = [], set()
+
+    def announce(self, names: Iterable[str]) -> None:
+        """Announce objects to collections; whoever reuses one does so before looking whether it is there."""
+        new = sorted(set(names) - self._announced)
+        if not new:
+            return
+        name = f"leases/run-{uuid.uuid4().hex}.lock"
+        self._leases.append(name)
+        self.files.create(name, b"\n".join([leases.note(manifests=self._manifests), *(one.encode() for one in new)]))
+        self._announced.update(new)
+
+    def runs(self) -> dict[str, tuple[Entry, Run]]:
+        """Return what is announced now, by its name, with what the place states of it."""
+        found = {}
+        for entry in self.files.list("leases"):
+            with contextlib.suppress(FileNotFoundError):  # it is over
+                content = self.files.read(entry.name, LEASE_BYTES)
+                found[entry.name] = entry, leases.parsed(Path(entry.name), content)
+        return found
+
+    def exclusively(self, key: str, what: str) -> contextlib.AbstractContextManager[None]:
+        """Do nothing: here of two that do the same one finds out when it creates a name."""
+        return contextlib.nullcontext()
+
+    # ---- objects
+
+    def sizes(self, names: Collection[str]) -> dict[str, int]:
+        """Return the bytes of those objects that are there."""
+        shelves = defaultdict(list)
+        for name in names:
+            shelves[layout.object_name(name).rpartition("/")[0]].append(name)
+        wanted = set(names)
+        looks: list[str] = []
+        for shelf, several in shelves.items():
+            looks += [shelf] if len(several) > _LISTED else [layout.object_name(name) for name in several]
+        found = threads.each(lambda look: self._look(look, wanted), looks, AT_ONCE)
+        return {name: size for some in found for name, size in some}
+
+    def _look(self, name: str, wanted: set[str]) -> list[tuple[str, int]]:
+        """Return name and size of the wanted objects in a shelf, or of one object."""
+        if DIGEST.fullmatch(Path(name).name):
+            entry = self.files.stat(name)
+            return [] if entry is None else [(Path(name).name, entry.bytes)]
+        entries = ((Path(entry.name).name, entry.bytes) for entry in self.files.list(name))
+        return [(one, size) for one, size in entries if one in wanted]
+
+    def has(self, name: str, size: int | None = None) -> bool:
+        """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
+        entry = self.files.stat(layout.object_name(name))
+        return entry is not None and size in (None, entry.bytes)
+
+    def put(self, content: bytes, *, durable: bool = True) -> Object:
+        """Store ``content`` and return its digest and size; whatever is kept here outlasts a loss of power."""
+        name = bytes_digest(content)
+        self.take(name, [content])
+        return Object(name, len(content))
+
+    def take(self, name: str, blocks: Iterable[bytes]) -> None:
+        """Store the object ``name`` from ``blocks`` that are verified; what is there is replaced if it is damaged."""
+        self.announce([name])
+        path = layout.object_name(name)
+        if self.files.create(path, blocks):
+            return
+        with contextlib.suppress(MissingError):
+            for _ in self.blocks(name):
+                pass
+            return
+        self.files.delete(path)
+        self.files.create(path, blocks)
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Do nothing: what was created here outlasts a loss of power."""
+
+    def read(self, name: str, size: int | None = None) -> bytes:
+        """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
+
+        Raises `MissingError` where it is not there or its bytes do not hash to its name, and `StorageError` where the place
+        fails.
+        """
+        return b"".join(self.blocks(name, size))
+
+    def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
+        """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
+        hashed = hashlib.sha256()
+        limit = sys.maxsize if size is None else most(size)
+        try:
+            for block in self._found(name, limit):
+                hashed.update(block)
+                yield block
+        except regular.IrregularError as error:
+            raise MissingError(f"Object {name[:12]} cannot be read: {str(error).rstrip('.')}.") from None
+        if hashed.hexdigest() != name:
+            raise MissingError(
+                f"Object {name[:12]} in {self.place} is damaged. `tacpipe store push --verify`, from where it is sound, "
+                f"replaces it."
+            )
+
+    def _found(self, name: str, limit: int) -> Iterator[bytes]:
+        """Yield what is kept as an object, or was moved aside by a collection that runs or was killed."""
+        try:
+            yield from self.files.blocks(layout.object_name(name), limit)
+            return
+        except FileNotFoundError:
+            pass
+        for entry in self.asides(name):
+            with contextlib.suppress(FileNotFoundError):
+                yield from self.files.blocks(entry.name, limit)
+                return
+        try:  # it was put back in between
+            yield from self.files.blocks(layout.object_name(name), limit)
+        except FileNotFoundError:
+            raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None
+
+    def asides(self, name: str = "") -> Iterator[Entry]:
+        """Yield what collections have moved aside of an object, or of all."""
+        return (entry for entry in self.files.list("tmp") if entry.name.startswith(f"tmp/{layout.ASIDE}{name}"))
+
+    def begins(self, name: str, start: bytes) -> bool:
+        """Return whether an object begins so; False for one that is not there. It is not verified."""
+        with contextlib.suppress(FileNotFoundError):
+            return next(iter(self.files.blocks(layout.object_name(name), sys.maxsize))).startswith(start)
+        return False
+
+    def room(self) -> int | None:
+        """Return None: nobody knows how many bytes there is room for."""
+        return None
+
+    # ---- records
+
+    def commit(self, identity: Mapping[str, Any], result: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
+        """Record that ``identity`` gave ``result``, unless a record states what it gave: the first to finish wins."""
+        _, content = record_content(identity, result, provenance)
+        self.files.create(layout.record_name(digest(identity)), content)
+
+    def note_records(self, manifest: str, keys: Collection[str]) -> None:
+        """Note which records belong to a manifest."""
+        content = json.dumps(sorted(keys)).encode()
+        self.files.create(f"{SNAPSHOTS}/{manifest}/{bytes_digest(content)}.json", content)
+
+    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield the records that belong to a manifest, with their keys: as was noted, else all of the store's."""
+        noted = [self._keys(entry.name) for entry in self.files.list(f"{SNAPSHOTS}/{manifest}")]
+        keys = (key for some in noted for key in some) if noted else None
+        return self.records(keys)
+
+    def _keys(self, name: str) -> list[str]:
+        """Return the keys that a snapshot notes, none where it is damaged: records save work, no result rests on them."""
+        with contextlib.suppress(FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
+            found = json.loads(self.files.read(name, regular.JSON_BYTES))
+            if isinstance(found, list):
+                return [key for key in found if isinstance(key, str) and DIGEST.fullmatch(key)]
+        return []
+
+    def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield keys and their records, by default all; damaged ones count as none."""
+        if keys is None:
+            keys = [Path(entry.name).stem for entry in self.files.list("records")]
+        for key, record in threads.each(self._record, keys, AT_ONCE):
+            if record is not None:
+                yield key, record
+
+    def _record(self, key: str) -> tuple[str, dict[str, Any] | None]:
+        with contextlib.suppress(
+            FileNotFoundError, ValueError, KeyError, TypeError, AttributeError, RecursionError, regular.IrregularError
+        ):
+            content = self.files.read(layout.record_name(key), regular.JSON_BYTES)
+            regular.expect_parsed(key, len(content))
+            record: dict[str, Any] = json.loads(content)
+            if sound(record, key):
+                return key, record
+        return key, None
+
+
+class RemoteRoots:
+    """The roots of a store without locks: which project pushed which manifest under which name.
+
+    Each version has a number. The newest one counts, and holds the history of the name.
+    """
+
+    def __init__(self, files: Backend) -> None:
+        self.files = files
+
+    def all(self) -> list[Root]:
+        """Return all roots; what is damaged is named by `damaged`."""
+        return [root for _, root in self._read() if root is not None]
+
+    def damaged(self) -> list[str]:
+        """Return the names of roots whose newest version is damaged: nobody knows which datasets they represent."""
+        return sorted(name for name, root in self._read() if root is None)
+
+    def get(self, path: Path) -> Root | None:
+        """Return None: no path of this computer is a root there."""
+        return None
+
+    def pushed(self, name: str, project: str = "") -> Root | None:
+        """Return what the project of this id pushed as ``name``, or None.
+
+        Raises `DamagedError` where nobody knows any more what it was.
+        """
+        wanted = name_of(PUSHED, name, project)
+        for one, root in self._read(wanted):
+            if root is None:
+                raise DamagedError(
+                    f"The newest file in {self.files.place}/roots/{one} is damaged. Delete it, and the one before it counts."
+                )
+            return root
+        return None
+
+    def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> bool:
+        """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``, as `pushed` gave it.
+
+        Returns False where another push came first, and nothing was noted.
+        """
+        if before is not None and before["manifest"] == manifest and before.get("project") == project:
+            return True
+        root = {"path": name, "kind": PUSHED, "project": dict(project)}
+        same = before is not None and _name(before) == _name(root)
+        number = before.get(_NUMBER, 0) if before is not None and same else 0
+        return self._succeed({**root, **succeeding(before, manifest, lasting=lasting), _NUMBER: number})
+
+    def write(self, root: Root) -> None:
+        """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` where another one came first."""
+        if not self._succeed(root):
+            raise TacpipeError(
+                f"{root['path']} was pushed to {self.files.place} meanwhile. Run the same command again."
+            )
+
+    def remove(self, root: Root) -> None:
+        """Remove a root, as `all` gave it, with all its earlier versions; one that was succeeded meanwhile stays."""
+        name = _name(root)
+        if dict(self._read(name)).get(name) == root:
+            for _, file in self._versions().get(name, []):
+                self.files.delete(file)
+
+    def superseded(self) -> list[str]:
+        """Return the names of versions that no push can take for the newest any more: all but the last two of each."""
+        return [file for versions in self._versions().values() for _, file in versions[:-2]]
+
+    def _succeed(self, root: Root) -> bool:
+        name = _name(root)
+        number = root[_NUMBER] + 1
+        if not self.files.create(_version(name, number), encoded({key: root[key] for key in root if key != _NUMBER})):
+            return False
+        if number > 2:  # the version before stays, so that whoever read that one is refused this number
+            self.files.delete(_version(name, number - 2))
+        return True
+
+    def _read(self, wanted: str = "") -> Iterator[tuple[str, Root | None]]:
+        """Yield the name of each root, or of the one that is ``wanted``, and its newest version; None for a damaged one."""
+        newest = {name: found[-1] for name, found in self._versions().items() if wanted in ("", name)}
+        return zip(newest, threads.each(self._at, newest.values(), AT_ONCE), strict=True)
+
+    def _at(self, version: tuple[int, str]) -> Root | None:
+        number, file = version
+        with contextlib.suppress(FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
+            root = decoded(json.loads(self.files.read(file, ROOT_BYTES)))
+            return None if root is None else {**root, _NUMBER: number}
+        return None
+
+    def _versions(self) -> dict[str, list[tuple[int, str]]]:
+        """Return number and file of the versions of each root, the newest last; a root of a folder that was copied is 0."""
+        found: dict[str, list[tuple[int, str]]] = {}
+        for entry in self.files.list("roots"):
+            match = _VERSION.fullmatch(entry.name)
+            if match is not None:
+                found.setdefault(match[1], []).append((int(match[2] or 0), entry.name))
+        return {name: sorted(found[name]) for name in sorted(found)}
+
+
+def _name(root: Mapping[str, Any]) -> str:
+    return name_of(root["kind"], str(root["path"]), project_id(root))
+
+
+def _version(name: str, number: int) -> str:
+    return f"roots/{name}/{number:08d}.json"

