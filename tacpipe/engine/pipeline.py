@@ -60,6 +60,27 @@ def run(request: Request) -> Outcome:
         with _tracked(request, trackers, outcome, store) as ended:
             made = output.settle(store, request, inputs.plan(), work)
             ended(made)
+    return _concluded(outcome, inputs, made, started)
+
+
+def answered(request: Request) -> Outcome | None:
+    """Return what `run` would return where there is nothing to do; None where something is to be computed or written.
+
+    It raises what `run` would raise before that. Nothing is computed, and nothing is changed.
+    """
+    started = time.perf_counter()
+    if request.check or request.compare or request.rerun or request.track:  # each has a business of its own
+        return None
+    replacing.refuse_inputs(request.output, request.reads)
+    store = locate()
+    inputs = Inputs(request, store)
+    with Chosen(request.executor, request.jobs) as chosen:
+        work = _Run(request, store, inputs, inputs.identity(), chosen)
+        shown = output.shown(store, request, work)
+    return None if shown is None else _concluded(work.outcome, inputs, shown, started)
+
+
+def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest, started: float) -> Outcome:
     outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results(), *outcome.notes]
     outcome.rows = made.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
