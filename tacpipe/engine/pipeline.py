@@ -175,20 +175,16 @@ class _Run:
             return replace(made, chain=self._chain(), recordings=result["recordings"], files=result["files"])
         fitted = self._fit() if stage.fit else None
         chain: Sequence[Mapping[str, Any]] = ()
-        entries: Mapping[str, Entry] = {}
+        recordings: Mapping[str, Entry] = {}
         if stage.argument("Recording"):
             given = self.inputs.merged
             step = keys.chain_step(request.name, stage, request.params, fitted)
-            tasks = keys.shard_tasks(self.store, given, step, self.inputs.beside)
-            entries, chain = given.included, [*given.chain, step]
-        elif stage.source:
-            found, digests = self.inputs.sources, self.inputs.source_digests
-            tasks = keys.source_tasks(self.store, request.name, stage, request.params, found, digests)
-        else:
-            tasks = keys.trial_tasks(self.store, request.name, stage, request.params)
-        if not tasks:
+            recordings = self._by_recording.mapped(given, step, self.inputs.beside)
+            chain = [*given.chain, step]
+        elif tasks := self._own_tasks():
+            recordings = self._by_recording.run(request.name, tasks)
+        if not recordings and not self.outcome.bad:
             raise UsageError(f"{request.name} found no recording to work on.")
-        recordings = self._by_recording.run(request.name, tasks, entries)
         return replace(
             made,
             chain=chain,
@@ -197,6 +193,14 @@ class _Run:
             skipped=self._skipped,
             sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
         )
+
+    def _own_tasks(self) -> list[Task]:
+        """Return one task a recording of a stage that reads no dataset: of a source, or to simulate."""
+        request, stage = self.request, self.stage
+        if stage.source:
+            found, digests = self.inputs.sources, self.inputs.source_digests
+            return keys.source_tasks(self.store, request.name, stage, request.params, found, digests)
+        return keys.trial_tasks(self.store, request.name, stage, request.params)
 
     @property
     def _skipped(self) -> dict[str, str]:
