@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import directory
+from tacpipe.datasets import directory, manifest
 from tacpipe.engine import keys
+from tacpipe.errors import DamagedError
 from tacpipe.store.store import Store
 from tests.conftest import Lab
 
@@ -118,3 +122,33 @@ def test_the_provenance_of_a_group_keeps_what_its_stage_noted(lab: Lab) -> None:
 
     assert group["provenance"]["code"] == {"scale": {singles[0]["provenance"]["code"]: 3}}
     assert set(group["result"]["recordings"]) == {"trial-000", "trial-001", "trial-002"}
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner) | st.tuples(inner, inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+@given(VALUES)
+def test_a_manifest_is_indented_as_the_standard_library_does(value: Any) -> None:
+    assert manifest.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+
+
+def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
+    for value in ({"a": float("nan")}, [float("inf")], {"a": {1: 2, "b": 3}}, {"a": object()}):
+        with pytest.raises((ValueError, TypeError)) as expected:
+            json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+        with pytest.raises(expected.type):
+            manifest.indented(value)
+
+
+def test_a_manifest_that_was_edited_is_refused_though_the_sound_one_was_read(lab: Lab) -> None:
+    lab.run("simulate toy --trials 1 -o data/toy")
+    content = (lab.folder / "data/toy/manifest.json").read_bytes()
+    edited = content.replace(b'"cork"', b'"felt"')
+    assert manifest.parse(edited, "edited", verified=True).recordings != manifest.parse(content, "sound").recordings
+
+    with pytest.raises(DamagedError):
+        manifest.parse(edited, "edited")

@@ -156,7 +156,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _stale(store: Store, manifest: Manifest, directory: Path) -> list[str]:
-    return [path for path, name in manifest.objects() if not _matches(directory / path, store, name)]
+    return [path for path, name in manifest.objects() if not _matches(f"{directory}/{path}", store, name)]
 
 
 def refuse_links(directory: Path, paths: Iterable[str]) -> None:
@@ -237,7 +237,7 @@ def _link(source: str, target: Path) -> bool:
     return False
 
 
-def _matches(path: Path, store: Store, name: str) -> bool:
+def _matches(path: str, store: Store, name: str) -> bool:
     """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
     try:
         there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
