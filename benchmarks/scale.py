@@ -37,16 +37,6 @@ SIMULATE = "simulate forward --trials 1 --duration-s 4 --tactile-rate-hz 25 --ro
 STREAM, COLUMNS = "xela1", 5  # what each recording keeps of the simulated one
 LOOKS = "newfstatat,stat,lstat,statx,access,openat,getdents64"
 HIT = "synchronize recordings -o synced --quiet"
-SMALL = """
-import json, os, re, sys
-child = os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ)
-os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
-read = re.search("rchar: ([0-9]+)", open(f"/proc/{child}/io").read())
-_, status, used = os.wait4(child, 0)
-print()
-print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss * 1024, int(read[1])]))
-sys.exit(os.waitstatus_to_exitcode(status))
-"""  # a child's peak of memory is at least that of the process that it came from, so that is a small one
 
 
 @dataclass(frozen=True)
@@ -147,7 +137,7 @@ def measure(lab: Lab) -> dict[str, Cost]:
 def cost(lab: Lab, command: str) -> Cost:
     """Return what a command of tacpipe costs; its looks are not counted."""
     begun = time.perf_counter()
-    words = [timing.PYTHON, "-S", "-c", SMALL, f"{timing.BIN}/tacpipe", *shlex.split(command)]
+    words = [timing.PYTHON, "-S", "-c", timing.SMALL, f"{timing.BIN}/tacpipe", *shlex.split(command)]
     done = subprocess.run(words, cwd=lab.folder, env=timing.environment_of(), stdout=subprocess.PIPE, check=False)
     seconds = time.perf_counter() - begun
     if done.returncode:
