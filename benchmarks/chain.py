@@ -54,5 +54,13 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
     def dvc() -> None:
         timing.run("dvc repro", place, DVC_NO_ANALYTICS="1", GIT_CONFIG_GLOBAL=os.devnull)
 
-    times = timing.interleaved({"tacpipe": tacpipe, "dvc repro": dvc}, max(5, rounds // 2))
-    return [timing.at_most(f"nothing to do in a chain of {len(COMMANDS)} commands", times, "tacpipe", "dvc repro")]
+    def chain() -> None:
+        timing.run("tacpipe run dvc.yaml", place)
+
+    contestants = {"tacpipe": tacpipe, "tacpipe run": chain, "dvc repro": dvc}
+    times = timing.interleaved(contestants, max(5, rounds // 2))
+    what = f"nothing to do in a chain of {len(COMMANDS)} commands"
+    return [
+        timing.at_most(f"{what}, one process each", times, "tacpipe", "dvc repro"),
+        timing.at_most(f"{what}, `tacpipe run dvc.yaml`", times, "tacpipe run", "dvc repro", 1.0),
+    ]

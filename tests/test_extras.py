@@ -63,6 +63,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "show models/forward",
     "compare results/forward",
     "explain report.html",
+    "run dvc.yaml",
     "acquire --recover",
     "sensors list",
     "store status",
@@ -150,6 +151,8 @@ def prepare(folder: Path) -> None:
     grasp_files.write_grasp(folder / "grasps")
     points_m = shapes.seen(shapes.cylinder(0.035, 0.2)).points_m.tolist()
     lines = [" ".join(map(str, point)) for point in points_m]
+    split = "tacpipe split data/segments -o data/split-again"
+    (folder / "dvc.yaml").write_text(f"stages: {{split: {{cmd: {split}, outs: [data/split-again]}}}}\n")
     (folder / "bottle.ply").write_text(HEADER.format(len(lines)) + "\n".join(lines) + "\n")
     (folder / "tables").mkdir()
     (folder / "tables" / "a.csv").write_text("time,x\n0,1\n1,2\n")

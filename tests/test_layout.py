@@ -10,7 +10,7 @@ import pytest
 from tacpipe.datasets import directory
 from tacpipe.errors import StorageError, UsageError
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.recording import spool
+from tacpipe.recording import spool_folders
 from tacpipe.store import layout
 from tacpipe.store.store import Store
 from tests.conftest import Lab, Ran
@@ -248,7 +248,7 @@ def test_what_is_not_of_a_stores_form_is_left_alone_and_named(
     for command in (*READ, "store repair", "store verify --json"):
         ran = made.run(command)
     assert json.loads(ran.out)["foreign"] == wanted
-    assert spool.abandoned(root) == []
+    assert spool_folders.abandoned(root) == []
     assert (tree(theirs), {name: value for name, value in tree(root).items() if name in wanted}) == before
     told = made.run("store verify").out
     assert "not part of a store, left as it is: checkpoints/mine" in told and "12 more" in told and "all sound" in told

@@ -150,13 +150,13 @@ def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[
     It keeps nobody from recording. ``output`` is the dataset that this command was given.
     """
     from tacpipe.printable import plain
-    from tacpipe.recording import spool, trials
+    from tacpipe.recording import spool_folders, trials
     from tacpipe.recording.appending import NothingError
 
     sealed, left = [], 0
-    for folder in spool.abandoned(store.root):
+    for folder in spool_folders.abandoned(store.root):
         try:
-            with spool.locked(folder) as ours:
+            with spool_folders.locked(folder) as ours:
                 if not ours:
                     continue
                 one = trials.recover(store, folder, output)
@@ -175,14 +175,14 @@ def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[
 
 def _report_others(store: Store) -> None:
     """Print whose the spools are that another user recorded, in a store that is shared."""
-    from tacpipe.recording import spool
+    from tacpipe.recording import spool_folders
 
     with contextlib.suppress(OSError):  # of a disk that failed, which was stated already
-        others = spool.owners(store.root)
-        ours = spool.users(store.root / spool.FOLDER, others.values())
+        others = spool_folders.owners(store.root)
+        ours = spool_folders.users(store.root / spool_folders.FOLDER, others.values())
         for folder in [folder for folder, owner in others.items() if owner not in ours]:
             owner = others[folder]
-            terminal.note(f"The spool {folder} belongs to {spool.user(owner)}, who alone can seal it.")
+            terminal.note(f"The spool {folder} belongs to {spool_folders.user(owner)}, who alone can seal it.")
 
 
 def _dry_run(rig: Rig, *, as_json: bool) -> str:

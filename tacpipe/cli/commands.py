@@ -20,6 +20,7 @@ SUMMARIES = {
     "compare": "Compare results: the best first, columns for what differs.",
     "track": "Give models and results to trackers of experiments.",
     "view": "Show recordings on one time axis, in Rerun's viewer.",
+    "run": "Run the stages of a dvc.yaml that have something to do.",
     "explain": "Show where a dataset comes from and what changed.",
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage what keeps the bytes: verify, repair, push, pull.",
@@ -205,6 +206,12 @@ def _view(program: typer.Typer) -> None:
     view.add(program, SUMMARIES["view"])
 
 
+def _run(program: typer.Typer) -> None:
+    from tacpipe.cli import run
+
+    run.add(program, SUMMARIES["run"])
+
+
 def _acquire(program: typer.Typer) -> None:
     from tacpipe.cli import acquire
 
@@ -223,6 +230,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "compare": _compare,
     "track": _track,
     "view": _view,
+    "run": _run,
     "explain": _explain,
     "sensors": _sensors,
     "store": _store,

@@ -59,7 +59,9 @@ def app(arguments: Sequence[str]) -> typer.Typer:
     if first in commands.NAMES:
         commands.NAMES[first](program)
     elif first in groups:
-        _add_stages(program, first, [name for name in names if name.partition(".")[0] == first], arguments)
+        from tacpipe.cli import stages
+
+        stages.add_group(program, first, arguments)
     else:
         _add_summaries(program)
     return program
@@ -161,34 +163,11 @@ def _misuse() -> type[Any]:
     return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
-def _add_stages(program: typer.Typer, group: str, names: list[str], arguments: Sequence[str]) -> None:
-    import typer
-
-    from tacpipe.cli import stages
-    from tacpipe.plugins import registry
-
-    if names == [group]:
-        stages.add(program, group, group)
-        return
-    methods = typer.Typer(help=registry.commands()[group], no_args_is_help=True, rich_markup_mode=None)
-    by_method = {name.partition(".")[2]: name for name in names}
-    asked = [method for method in by_method if method in arguments]
-    for method in asked:  # and no other: a broken method spoils itself alone
-        stages.add(methods, by_method[method], method)
-    for method in () if asked else by_method:
-        methods.command(method, help=registry.summary(by_method[method]))(_nothing)
-    program.add_typer(methods, name=group)
-
-
 def _add_summaries(program: typer.Typer) -> None:
     """Add every command with its help line alone: enough for ``tacpipe --help`` and for a name that does not exist."""
-    from tacpipe.cli import commands
+    from tacpipe.cli import commands, stages
     from tacpipe.plugins import registry
 
     lines = registry.commands()
     for name in (*lines, *commands.NAMES):
-        program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(_nothing)
-
-
-def _nothing() -> None:
-    """Represent a command that was not requested."""
+        program.command(name, help=lines.get(name) or commands.SUMMARIES[name])(stages.nothing)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -25,6 +27,43 @@ from tacpipe.plugins.stage import AnyStage
 EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
 
 
+_answering: ContextVar[bool] = ContextVar("answering", default=False)
+
+
+class UnansweredError(Exception):
+    """A command has something to compute or to write, or is one that always does something."""
+
+
+@contextlib.contextmanager
+def answering() -> Iterator[None]:
+    """Have the commands of stages in the block report what is there already, and raise `UnansweredError` where it is not."""
+    token = _answering.set(True)
+    try:
+        yield
+    finally:
+        _answering.reset(token)
+
+
+def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> None:
+    """Add the command ``group`` to ``program``: a stage, or those whose names begin so, of which ``arguments`` name one."""
+    names = [name for name in registry.stages() if name.partition(".")[0] == group]
+    if names == [group]:
+        add(program, group, group)
+        return
+    methods = typer.Typer(help=registry.commands()[group], no_args_is_help=True, rich_markup_mode=None)
+    by_method = {name.partition(".")[2]: name for name in names}
+    asked = [method for method in by_method if method in arguments]
+    for method in asked:  # and no other: a broken method spoils itself alone
+        add(methods, by_method[method], method)
+    for method in () if asked else by_method:
+        methods.command(method, help=registry.summary(by_method[method]))(nothing)
+    program.add_typer(methods, name=group)
+
+
+def nothing() -> None:
+    """Represent a command that was not requested."""
+
+
 def add(program: typer.Typer, name: str, command: str) -> None:
     """Add stage ``name`` to ``program`` as ``command``."""
     stage = registry.load(name)
@@ -40,6 +79,9 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 
 
 def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str]) -> None:
+    answering = _answering.get()
+    if answering and any(given.get(look) for look in ("guess", "print_params", "dry_run")):
+        raise UnansweredError
     progress.set_quiet(given["quiet"])
     folds = grid.folds(given.get("fold") or "0")
     for flag, kind in OPTIONS.items():
@@ -84,6 +126,13 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     )
     shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
     requests = grid.requests(request, folds)
+    if answering:
+        outcomes = [outcome for one in requests if (outcome := pipeline.answered(one)) is not None]
+        if len(outcomes) < len(requests):
+            raise UnansweredError
+        for outcome in outcomes:
+            _report(outcome, shown, as_json=given["json_"], quiet=given["quiet"])
+        return
     if len(requests) == 1:
         _report(pipeline.run(requests[0]), shown, as_json=given["json_"], quiet=given["quiet"])
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import stat
 import uuid
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -79,9 +80,17 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
     check_output(store, directory)
     objects = dict(manifest.objects())
     current = _current(directory, manifest.content)
-    known = current or manifest.exported  # files of an export are large copies, so those that are right stay
-    stale = [] if relabelled else _stale(store, manifest, directory) if known else list(objects)
-    gone = set() if relabelled else _named(directory) - set(objects)
+    shown = {} if relabelled or current else _named(directory)
+    if relabelled:
+        stale = []
+    elif current or manifest.exported:  # files of an export are large copies, so those that are right stay
+        stale = _stale(store, manifest, directory)
+    else:  # what the manifest before named already stays, so that a recording that comes costs itself
+        sizes = dict(manifest.sizes())
+        stale = [
+            path for path, name in objects.items() if shown.get(path) != name or not _lies(directory, path, sizes[name])
+        ]
+    gone = set(shown) - set(objects)
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
@@ -147,7 +156,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _stale(store: Store, manifest: Manifest, directory: Path) -> list[str]:
-    return [path for path, name in manifest.objects() if not _matches(directory / path, store, name)]
+    return [path for path, name in manifest.objects() if not _matches(f"{directory}/{path}", store, name)]
 
 
 def refuse_links(directory: Path, paths: Iterable[str]) -> None:
@@ -228,7 +237,7 @@ def _link(source: str, target: Path) -> bool:
     return False
 
 
-def _matches(path: Path, store: Store, name: str) -> bool:
+def _matches(path: str, store: Store, name: str) -> bool:
     """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
     try:
         there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
@@ -246,10 +255,19 @@ def _current(directory: Path, content: bytes) -> bool:
         return False
 
 
-def _named(directory: Path) -> set[str]:
-    """Return the paths that the manifest in ``directory`` names; none if there is no readable one."""
+def _lies(directory: Path, path: str, size: int) -> bool:
+    """Return whether a regular file of this size lies at a path of a dataset."""
+    try:
+        there = os.lstat(f"{directory}/{path}")
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return stat.S_ISREG(there.st_mode) and there.st_size == size
+
+
+def _named(directory: Path) -> dict[str, str]:
+    """Return path and digest of all that the manifest in ``directory`` names; nothing if there is no readable one."""
     try:
         content = regular.content(directory / NAME, regular.JSON_BYTES)
-        return {path for path, _ in parse(content, str(directory)).objects()}
+        return dict(parse(content, str(directory)).objects())
     except (FileNotFoundError, TacpipeError):
-        return set()
+        return {}

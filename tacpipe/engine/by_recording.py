@@ -8,7 +8,7 @@ from typing import Any
 
 from tacpipe.datasets import manifest
 from tacpipe.datasets.manifest import Entry, Manifest
-from tacpipe.engine import execution, keys
+from tacpipe.engine import execution, keys, provenance
 from tacpipe.engine.execution import Done, Task
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
@@ -30,43 +30,77 @@ class ByRecording:
     outcome: Outcome
     chosen: Chosen
 
-    def run(self, name: str, tasks: Sequence[Task], entries: Mapping[str, Entry]) -> dict[str, Entry]:
-        """Return what each task of stage ``name`` gives, with the attributes of ``entries`` before its own.
+    def mapped(self, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> dict[str, Entry]:
+        """Return what the map stage of a link of a chain gives for each recording of ``given``; raises as `run`.
+
+        A group of recordings has a record of its own, besides those of its recordings. So a dataset of which one recording
+        changed takes one record a group, and one for each recording of the group that changed.
+        """
+        entries, name, stage = given.included, step["stage"], execution.stage_of(step["stage"])
+        found: dict[str, Entry] = {}
+        unknown: list[tuple[dict[str, Any], list[str]]] = []
+        for group in keys.groups(entries):
+            identity = keys.of_group(step, stage, {one: entries[one] for one in group})
+            record = None if self.request.compare or self._reruns(name) else self.store.record(digest(identity))
+            if record is None or not records.complete(self.store, record):
+                unknown.append((identity, group))
+                continue
+            found |= record["result"]["recordings"]
+            self.outcome.reused += len(group)
+            self.outcome.add_group(record["provenance"])
+        left = replace(given, recordings={one: entries[one] for _, group in unknown for one in group})
+        made = self._records(name, keys.shard_tasks(self.store, left, step, beside), len(found)) if unknown else {}
+        for identity, group in unknown if self.store.run else ():
+            if len(group) > 1 and made.keys() >= set(group):
+                self._remember_group(name, identity, {one: made[one] for one in group})
+        return _after({**found, **{one: record["result"]["recordings"][""] for one, record in made.items()}}, entries)
+
+    def run(self, name: str, tasks: Sequence[Task]) -> dict[str, Entry]:
+        """Return what each task of stage ``name`` gives.
 
         Raises `TacpipeError` where recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
         would run.
         """
-        recordings: dict[str, Entry] = {}
-        for recording, result in sorted(self.results(name, tasks).items()):
-            made = result["recordings"][""]
-            before = entries[recording]["attributes"] if recording in entries else {}
-            recordings[recording] = {"attributes": {**before, **made["attributes"]}, "shards": made["shards"]}
-        return recordings
+        return _after({one: result["recordings"][""] for one, result in self.results(name, tasks).items()}, {})
 
     def results(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
         """Return what the record of each task of stage ``name`` holds as its result, by recording; raises as `run`."""
-        results: dict[str, Mapping[str, Any]] = {}
-        stored: dict[str, Mapping[str, Any]] = {}  # records
+        return {recording: record["result"] for recording, record in self._records(name, tasks).items()}
+
+    def _reruns(self, name: str) -> bool:
+        return self.request.rerun and registry.whole(name) == self.request.name
+
+    def _records(self, name: str, tasks: Sequence[Task], others: int = 0) -> dict[str, Mapping[str, Any]]:
+        """Return the record of each task, by recording; ``others`` are recordings whose results are known already."""
+        found: dict[str, Mapping[str, Any]] = {}
         missing: list[Task] = []
-        rerun = self.request.rerun and registry.whole(name) == self.request.name
+        rerun = self._reruns(name)
         for task in tasks:
             record = self.store.record(digest(task.identity))
             if record is not None and not rerun and records.complete(self.store, record):
-                stored[task.recording], results[task.recording] = record, record["result"]
+                found[task.recording] = record
                 self.outcome.add_record(name, task.recording, record)
             else:
                 missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
+        count = len(tasks) + others
         if missing and self.request.check:
-            raise WouldChangeError(f"{registry.whole(name)} would run for {len(missing)} of {len(tasks)} recordings.")
+            raise WouldChangeError(f"{registry.whole(name)} would run for {len(missing)} of {count} recordings.")
         if self.request.compare:
             missing = [replace(task, dry=True) for task in tasks]
         self.outcome.reused += len(tasks) - len(missing)
-        results.update(self._compute(name, missing, stored))
-        if not results:
+        found.update(self._compute(name, missing, found))
+        if not found and not others:
             lines = _lines(self.outcome.bad)
             whole = registry.whole(name)
             raise error(FAILED, f"{whole} could not read any of the {len(tasks)} recordings:\n{lines}")
-        return results
+        return found
+
+    def _remember_group(self, name: str, identity: Mapping[str, Any], made: Mapping[str, Mapping[str, Any]]) -> None:
+        stated = Outcome(self.outcome.output)
+        for recording, record in made.items():
+            stated.add_record(name, recording, record)
+        result = {"recordings": {one: record["result"]["recordings"][""] for one, record in made.items()}, "files": {}}
+        self.store.commit(identity, result, {**provenance.of(0.0), **stated.of_results()}, replace=True)
 
     def replay(self, given: Manifest, model: Manifest, beside: tuple[str, ...], where: str) -> Manifest:
         """Return ``given`` after the stages that a model was trained behind, from wherever it is among them now.
@@ -88,8 +122,7 @@ class ByRecording:
                     f"The model was trained behind version {step['version']} of {step['stage']}; this tacpipe has version "
                     f"{stage.version}. Train it again."
                 )
-            tasks = keys.shard_tasks(self.store, given, step, beside)
-            recordings = self.run(step["stage"], tasks, given.included)
+            recordings = self.mapped(given, step, beside)
             files = {name: model.files[name] for name in step["fitted"] or {}}
             given = Manifest(
                 step["stage"], step["version"], step["params"], {}, [*given.chain, step], recordings, files
@@ -99,9 +132,10 @@ class ByRecording:
     def _compute(
         self, name: str, tasks: Sequence[Task], stored: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Mapping[str, Any]]:
-        results: dict[str, Mapping[str, Any]] = {}
+        """Return the records of tasks that are computed, and compare them with those that are ``stored``."""
+        found: dict[str, Mapping[str, Any]] = {}
         if not tasks:
-            return results
+            return found
         bad: dict[str, Done] = {}
         executor = self.chosen.opened()
         module = registry.stages()[registry.whole(name)].partition(":")[0]
@@ -115,11 +149,11 @@ class ByRecording:
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
                 self.outcome.add_record(name, done.recording, done.record)
-                results[done.recording] = done.record["result"]
+                found[done.recording] = done.record
                 if self.request.compare and done.recording in stored:
                     self.outcome.compare(stored[done.recording], done.record, done.recording)
         self._refuse(name, bad)
-        return results
+        return found
 
     def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
         source = f"{self.request.source}/"  # where the files lay is no part of a manifest
@@ -140,6 +174,19 @@ class ByRecording:
             f"{registry.whole(name)} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; "
             f"{advice}",
         )
+
+
+def _after(made: Mapping[str, Entry], entries: Mapping[str, Entry]) -> dict[str, Entry]:
+    """Return what a stage made of recordings, with the attributes of ``entries`` before its own, in the order of names."""
+    return {
+        name: {
+            "attributes": {**entries[name]["attributes"], **one["attributes"]}
+            if name in entries
+            else one["attributes"],
+            "shards": one["shards"],
+        }
+        for name, one in sorted(made.items())
+    }
 
 
 def error(exit_code: int, sentence: str) -> TacpipeError:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution
 from tacpipe.engine.execution import Task
+from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
+
+GROUPED = 256  # names in a group, in the mean
 
 
 def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -50,8 +54,34 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
     return {"stage": name, "version": stage.version, "params": params_of.to_json(params), "fitted": files}
 
 
+def groups(names: Iterable[str]) -> Iterator[list[str]]:
+    """Yield names, sorted, in groups of some `GROUPED`, of which one more or one less name changes one or two.
+
+    Where a group ends depends on the name after it alone.
+
+    >>> names = [f"trial-{number:04d}" for number in range(2000)]
+    >>> before, now = (set(map(tuple, groups(some))) for some in (names, [*names, "trial-0500-again"]))
+    >>> len(before) > 2, len(now - before) <= 2
+    (True, True)
+    """
+    group: list[str] = []
+    for name in sorted(names):
+        if group and zlib.crc32(name.encode(errors="surrogatepass")) % GROUPED == 0:
+            yield group
+            group = []
+        group.append(name)
+    if group:
+        yield group
+
+
+def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Entry]) -> dict[str, Any]:
+    """Return what names the results of a map stage for several recordings, by all that their own keys hold."""
+    described = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
+    return {"group": step["stage"], "step": step, "recordings": described}
+
+
 def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> list[Task]:
-    """Return one task a recording of ``given`` for the map stage of a link of a chain."""
+    """Return one task a recording of ``given``, excluded ones left out, for the map stage of a link of a chain."""
     stage = execution.stage_of(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")

@@ -46,6 +46,15 @@ class Outcome:
             counts = self.code.setdefault(stage, {})
             counts[made["code"]] = counts.get(made["code"], 0) + 1
 
+    def add_group(self, kept: Mapping[str, Any]) -> None:
+        """Add what `of_results` returned for a group of recordings."""
+        for note, recordings in (kept.get("notes") or {}).items():
+            self.stated.setdefault(note, []).extend(recordings)
+        for stage, numbers in (kept.get("code") or {}).items():
+            counts = self.code.setdefault(stage, {})
+            for code, number in numbers.items():
+                counts[code] = counts.get(code, 0) + number
+
     def compare(self, stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> None:
         """Add what differs between two records of one result; ``name`` is that of the stage or of the recording."""
         differs = execution.differences(stored["result"], made["result"], name)

@@ -47,7 +47,7 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
     published nothing that it is made of is collected. Where the store turns out to be damaged as it is linked, the result
     is recomputed.
     """
-    place: _Place = _File(store, request) if request.single_file else _Directory(store, request)
+    place = _place(store, request)
     hit = None if request.compare or request.rerun else work.answer()
     shown = hit is not None and place.shows(hit)
     if not (shown or request.compare):
@@ -62,6 +62,17 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
             return place.publish(work.result(rerun=request.rerun))
         except MissingError:  # damaged in the store, which shows when it is linked: then it is recomputed
             return place.publish(work.result(rerun=False))
+
+
+def shown(store: Store, request: Request, work: Work) -> Manifest | None:
+    """Return the manifest that the output shows where it shows the store's answer already, else None; nothing is changed."""
+    place = _place(store, request)
+    hit = work.answer()
+    return place.settled(hit) if hit is not None and place.shows(hit) else None
+
+
+def _place(store: Store, request: Request) -> _Place:
+    return _File(store, request) if request.single_file else _Directory(store, request)
 
 
 class _Place(ABC):

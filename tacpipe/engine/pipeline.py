@@ -60,6 +60,27 @@ def run(request: Request) -> Outcome:
         with _tracked(request, trackers, outcome, store) as ended:
             made = output.settle(store, request, inputs.plan(), work)
             ended(made)
+    return _concluded(outcome, inputs, made, started)
+
+
+def answered(request: Request) -> Outcome | None:
+    """Return what `run` would return where there is nothing to do; None where something is to be computed or written.
+
+    It raises what `run` would raise before that. Nothing is computed, and nothing is changed.
+    """
+    started = time.perf_counter()
+    if request.check or request.compare or request.rerun or request.track:  # each has a business of its own
+        return None
+    replacing.refuse_inputs(request.output, request.reads)
+    store = locate()
+    inputs = Inputs(request, store)
+    with Chosen(request.executor, request.jobs) as chosen:
+        work = _Run(request, store, inputs, inputs.identity(), chosen)
+        shown = output.shown(store, request, work)
+    return None if shown is None else _concluded(work.outcome, inputs, shown, started)
+
+
+def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest, started: float) -> Outcome:
     outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results(), *outcome.notes]
     outcome.rows = made.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
@@ -154,20 +175,16 @@ class _Run:
             return replace(made, chain=self._chain(), recordings=result["recordings"], files=result["files"])
         fitted = self._fit() if stage.fit else None
         chain: Sequence[Mapping[str, Any]] = ()
-        entries: Mapping[str, Entry] = {}
+        recordings: Mapping[str, Entry] = {}
         if stage.argument("Recording"):
             given = self.inputs.merged
             step = keys.chain_step(request.name, stage, request.params, fitted)
-            tasks = keys.shard_tasks(self.store, given, step, self.inputs.beside)
-            entries, chain = given.included, [*given.chain, step]
-        elif stage.source:
-            found, digests = self.inputs.sources, self.inputs.source_digests
-            tasks = keys.source_tasks(self.store, request.name, stage, request.params, found, digests)
-        else:
-            tasks = keys.trial_tasks(self.store, request.name, stage, request.params)
-        if not tasks:
+            recordings = self._by_recording.mapped(given, step, self.inputs.beside)
+            chain = [*given.chain, step]
+        elif tasks := self._own_tasks():
+            recordings = self._by_recording.run(request.name, tasks)
+        if not recordings and not self.outcome.bad:
             raise UsageError(f"{request.name} found no recording to work on.")
-        recordings = self._by_recording.run(request.name, tasks, entries)
         return replace(
             made,
             chain=chain,
@@ -176,6 +193,14 @@ class _Run:
             skipped=self._skipped,
             sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
         )
+
+    def _own_tasks(self) -> list[Task]:
+        """Return one task a recording of a stage that reads no dataset: of a source, or to simulate."""
+        request, stage = self.request, self.stage
+        if stage.source:
+            found, digests = self.inputs.sources, self.inputs.source_digests
+            return keys.source_tasks(self.store, request.name, stage, request.params, found, digests)
+        return keys.trial_tasks(self.store, request.name, stage, request.params)
 
     @property
     def _skipped(self) -> dict[str, str]:

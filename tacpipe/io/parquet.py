@@ -159,17 +159,20 @@ def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Tab
 
 
 class ParquetTable:
-    """The table of a Parquet file's bytes, of which columns are decoded when asked for; raises as `from_parquet` does."""
+    """The table of a Parquet file's bytes, of which columns are decoded when asked for; raises as `from_parquet` does.
 
-    def __init__(self, content: bytes) -> None:
-        self._content = owned(content)
+    A buffer of Arrow's own is read as it is, bytes of Python's are copied into one.
+    """
+
+    def __init__(self, content: bytes | pa.Buffer) -> None:
+        self._content = content if isinstance(content, pa.Buffer) else owned(content)
         try:
             self._file = pq.ParquetFile(pa.BufferReader(self._content))
             stored = (self._file.metadata.metadata or {}).get(_KEY)
             self._fields = None if stored is None else json.loads(stored)
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
-            raise _unread(len(content), error) from error
+            raise _unread(self._content.size, error) from error
 
     @property
     def num_rows(self) -> int:

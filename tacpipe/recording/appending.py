@@ -19,11 +19,13 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
-from tacpipe.recording.spool import Spooled
+from tacpipe.recording.spooled import Spooled
 from tacpipe.store.store import Object, Store
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from tacpipe.io.parquet import ParquetTable
 
 VERSION = 1
 BYTES = "bytes"  # and under this one its spool, where a driver could not read all of it
@@ -150,22 +152,31 @@ def _free(wanted: str, taken: Mapping[str, Any]) -> str:
 
 
 def _shard(store: Store, stream: str, table: pa.Table) -> dict[str, Any]:
-    from tacpipe.io.parquet import to_parquet
+    from tacpipe.io import parquet
 
-    stored: Object = store.put(to_parquet(table), durable=True)
-    if not _same(store.read(stored.digest), table):
+    stored: Object = store.put_written(lambda file: parquet.write(table, file), durable=True)
+    if not _same(parquet.ParquetTable(_read(store, stored)), table):
         raise DamagedError(f"Stream {stream} does not read as it was written: the disk is not to be trusted.")
     return {"digest": stored.digest, "rows": table.num_rows, "bytes": stored.bytes}
 
 
-def _same(content: bytes, written: pa.Table) -> bool:
-    """Return whether a shard's bytes hold a table to the bit, NaN equal to itself; a column at a time, to save memory."""
+def _read(store: Store, stored: Object) -> pa.Buffer:
+    """Return what the store holds of a shard, verified, once in memory."""
     import pyarrow as pa
 
-    from tacpipe.io.parquet import from_parquet
+    content = pa.allocate_buffer(stored.bytes)
+    with pa.FixedSizeBufferWriter(content) as sink:
+        for block in store.blocks(stored.digest, stored.bytes):
+            sink.write(block)
+    return content
+
+
+def _same(stored: ParquetTable, written: pa.Table) -> bool:
+    """Return whether a shard holds a table to the bit, NaN equal to itself; a column at a time, to save memory."""
+    import pyarrow as pa
 
     for kind in written.schema:
-        read = from_parquet(content, [kind.name])
+        read = stored.read([kind.name])
         if not read.schema.equals(pa.schema([kind])):
             return False
         ours, theirs = read.column(0), written.column(kind.name)

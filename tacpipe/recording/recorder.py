@@ -12,7 +12,8 @@ from tacpipe.errors import DeviceError
 from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import STALL_NS
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import Note, Spool
+from tacpipe.recording.spool import Spool
+from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import LOST, Station
 from tacpipe.recording.watch import Watch
 from tacpipe.sensors.framing import Chunks

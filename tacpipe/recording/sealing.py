@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import MOST_CATCH_UP_NS, parsed
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import Note, Spooled
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import CAUGHT_UP, LOST, OPENED, OVERRUN, STALLED
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -26,7 +27,7 @@ END_S = 0.5  # by which a stream may end before the others without a word
 UNDECODED = "undecoded"  # bytes at which the driver gave up
 CRASH = "crash"  # what a process had read and not yet written when it ended
 UNCERTAIN = "t_uncertain_ns"  # column, only where this program was held up
-MOST_BYTES = 8 << 20  # of a stream's chunks that are decoded in one go
+MOST_BYTES = 2 << 20  # of a stream's chunks that are decoded in one go
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,54 @@ class Sealed:
     uncertain: int = 0  # samples that had waited while this program was held up
 
 
-@dataclass
+class _Column:
+    """Values (sample,) that grow in place: pieces that are joined in the end would be in memory twice."""
+
+    def __init__(self) -> None:
+        self._values: AnyArray = np.zeros(0)
+        self._count = 0
+
+    def add(self, values: AnyArray) -> None:
+        stop = self._count + len(values)
+        kind = np.result_type(self._values, values) if self._count else values.dtype
+        if kind != self._values.dtype:
+            self._values = self._values.astype(kind)
+        if stop > len(self._values):
+            self._values.resize(stop + stop // 4, refcheck=False)
+        self._values[self._count : stop] = values
+        self._count = stop
+
+    def taken(self, kind: pa.DataType) -> pa.Array:
+        """Return the values, which are here no longer."""
+        import pyarrow as pa
+
+        values, self._values = self._values, np.zeros(0)
+        values.resize(self._count, refcheck=False)
+        return pa.array(values if self._count else [], kind)
+
+
 class _Parts:
-    batches: list[Batch] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
+    """What was decoded of a stream so far: its channels one by one, as the table will hold them, and all else in batches."""
+
+    def __init__(self, fields: Sequence[pa.Field]) -> None:
+        self.fields = fields
+        self.batches: list[Batch] = []  # without their values
+        self.events: list[Event] = []
+        self._columns = [_Column() for _ in fields]
 
     def add(self, batch: Batch) -> None:
         self.events += batch.events
-        if len(batch):
-            self.batches.append(batch)
+        if not len(batch):
+            return
+        channels = [block[:, number] for block in batch.values for number in range(block.shape[1])]
+        for column, values in zip(self._columns, channels, strict=True):
+            column.add(values)
+        self.batches.append(replace(batch, values=()))
+
+    def channels(self) -> Iterator[pa.Array]:
+        """Yield the values of each channel (sample,), which are here no longer: a recording of hours is large."""
+        for kind, column in zip(self.fields, self._columns, strict=True):
+            yield column.taken(kind.type)
 
 
 class _Stalls:
@@ -103,7 +143,7 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
     ``end_ns`` is when the last byte of any stream came: one that fell silent long before states it.
     """
     sensor = rig.streams[name].sensor
-    reading, parts, stalls = Reading(sensor), _Parts(), _Stalls()
+    reading, parts, stalls = Reading(sensor), _Parts(sensor.fields()), _Stalls()
     chunks = size = undecoded = 0
     away = False
     for block in _gathered(spooled, name):
@@ -136,7 +176,7 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
     lost = sum(event.frames for event in events)
     t_ns = _joined([batch.t_ns for batch in parts.batches], np.int64)
     uncertain_ns = stalls.uncertain_ns(t_ns)
-    made = table(sensor.fields(), parts.batches, spooled.utc_ns(stalls.awake_ns(t_ns)), uncertain_ns)
+    made = _table(parts, spooled.utc_ns(stalls.awake_ns(t_ns)), uncertain_ns)
     late = int(np.count_nonzero(uncertain_ns))
     return Sealed(made, events, lost, received=size, undecoded=undecoded, crashed=crashed, uncertain=late)
 
@@ -181,8 +221,8 @@ def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
         yield Chunks.joined(waiting)
 
 
-def table(fields: Sequence[pa.Field], batches: Sequence[Batch], t_ns: Times, uncertain_ns: Times) -> pa.Table:
-    """Return batches as the table of a stream with these stamps (sample,), and how uncertain they are where any is."""
+def _table(parts: _Parts, t_ns: Times, uncertain_ns: Times) -> pa.Table:
+    """Return the table of a stream with these stamps (sample,), and how uncertain they are where any is."""
     import pyarrow as pa
 
     from tacpipe.channels import schema
@@ -192,6 +232,7 @@ def table(fields: Sequence[pa.Field], batches: Sequence[Batch], t_ns: Times, unc
     if uncertain_ns.any():
         kind = pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"})
         columns.append((kind, uncertain_ns))
+    batches = parts.batches
     first = batches[0] if batches else None
     if first is not None and first.t_device_ns is not None:
         kind = pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
@@ -200,21 +241,8 @@ def table(fields: Sequence[pa.Field], batches: Sequence[Batch], t_ns: Times, unc
         if first is not None and getattr(first, name) is not None:
             kind = pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"})
             columns.append((kind, _joined([getattr(batch, name) for batch in batches], np.int64)))
-    columns += zip(fields, _columns(fields, batches), strict=True)
-    arrays = [pa.array(values, kind.type) for kind, values in columns]
-    return pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
-
-
-def _columns(fields: Sequence[pa.Field], batches: Sequence[Batch]) -> list[AnyArray]:
-    """Return the values of each channel (sample,), each copied once: a recording of hours is large."""
-    if not batches:
-        return [np.zeros(0, dtype=kind.type.to_pandas_dtype()) for kind in fields]
-    widths = [block.shape[1] for block in batches[0].values]
-    return [
-        np.concatenate([batch.values[number][:, column] for batch in batches])
-        for number, width in enumerate(widths)
-        for column in range(width)
-    ]
+    arrays = [*(pa.array(values, kind.type) for kind, values in columns), *parts.channels()]
+    return pa.Table.from_arrays(arrays, schema=pa.schema([*(kind for kind, _ in columns), *parts.fields]))
 
 
 def _joined(parts: Sequence[Any], kind: Any) -> AnyArray:

@@ -16,7 +16,7 @@ from tacpipe.links.link import Link, LinkLostError
 from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import Pace
 from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool_blocks import Note
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 

@@ -18,7 +18,10 @@ from tacpipe.recording import appending, clock, header, sealing, triggers
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
-from tacpipe.recording.spool import ENDED, Note, Spool, Spooled, users
+from tacpipe.recording.spool import ENDED, Spool
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spool_folders import users
+from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.view import View
 from tacpipe.store.store import Store
 

@@ -12,7 +12,7 @@ from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.recording.rig import Stream
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 

@@ -24,7 +24,7 @@ from tacpipe.links.opening import open_link
 from tacpipe.links.recognition import recognise
 from tacpipe.recording import completing, rig
 from tacpipe.recording.reading import Reading
-from tacpipe.recording.spool import Note
+from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import Station
 from tacpipe.sensors import lsl
 from tacpipe.sensors.framing import Chunks

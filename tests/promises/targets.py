@@ -36,7 +36,7 @@ from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import report_descriptor
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Source
-from tacpipe.recording import header, rig, spool
+from tacpipe.recording import header, rig, spool, spool_blocks, spooled
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
@@ -150,7 +150,7 @@ def _spool(data: bytes) -> object:
     headed = data[:1] == b"\1"
     _written("spool/header.json", data[1:] if headed else json.dumps(HEADER).encode())
     _written("spool/bytes", _spools()[0][1:] if headed else data[1:])
-    found = spool.Spooled(_folder() / "spool")
+    found = spooled.Spooled(_folder() / "spool")
     read = list(found.blocks())
     for _, block in read:
         if isinstance(block, Chunks):
@@ -165,7 +165,7 @@ def _spools() -> list[bytes]:
     made = spool.Spool(_folder(), HEADER, ["a", "b"])
     for number in range(5):
         made.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
-        made.note(spool.Note(number, "a", "lost", "unplugged"))
+        made.note(spool_blocks.Note(number, "a", "lost", "unplugged"))
     made.write()
     content = (made.folder / "bytes").read_bytes()
     made.close()

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.recording import appending, spool
+from tacpipe.recording import appending, spool_folders
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.sealing import seal
-from tacpipe.recording.spool import Spool, Spooled
+from tacpipe.recording.spool import Spool
+from tacpipe.recording.spooled import Spooled
 from tacpipe.sensors.framing import Chunks
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.store import store as store_of
@@ -191,7 +192,7 @@ def test_a_spool_that_is_being_sealed_is_left_to_the_process_that_does_it(
     real = appending.append
 
     def append(store: store_of.Store, *more: Any) -> str:
-        seen.append((live.spools(lab.folder), spool.abandoned(store.root)))
+        seen.append((live.spools(lab.folder), spool_folders.abandoned(store.root)))
         return real(store, *more)
 
     monkeypatch.setattr(appending, "append", append)

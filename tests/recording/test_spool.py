@@ -15,8 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.recording import spool
-from tacpipe.recording.spool import Note, Spool, Spooled
+from tacpipe.recording import spool_folders, spooled
+from tacpipe.recording.spool import Spool
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spooled import Spooled
 from tacpipe.sensors.framing import Chunks
 
 STREAMS = ["a", "b"]
@@ -137,9 +139,9 @@ def test_one_stream_is_read_alone(tmp_path: Path) -> None:
 
 def test_a_spool_that_is_written_is_not_abandoned_and_one_of_a_killed_process_is(tmp_path: Path) -> None:
     made = Spool(tmp_path, HEADER, STREAMS)
-    assert spool.abandoned(tmp_path) == []
+    assert spool_folders.abandoned(tmp_path) == []
     made.close()
-    assert spool.abandoned(tmp_path) == [made.folder]
+    assert spool_folders.abandoned(tmp_path) == [made.folder]
     program = f"""
 import time
 from pathlib import Path
@@ -156,16 +158,16 @@ time.sleep(60)
     child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert child.stdout is not None
     child.stdout.readline()
-    assert len(spool.abandoned(tmp_path)) == 1
+    assert len(spool_folders.abandoned(tmp_path)) == 1
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
     child.stdout.close()
 
-    folder = next(path for path in spool.abandoned(tmp_path) if path != made.folder)
+    folder = next(path for path in spool_folders.abandoned(tmp_path) if path != made.folder)
     read = Spooled(folder)
 
     assert pairs(list(read.blocks())) == [("a", 1, b"one"), ("a", 2, b"two")]
-    assert read.tallied() == {"a": spool.Tallied(7, 70, 123)}
+    assert read.tallied() == {"a": spooled.Tallied(7, 70, 123)}
 
 
 def test_a_spool_without_a_header_is_refused_with_a_sentence(tmp_path: Path) -> None:

@@ -18,7 +18,9 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
-from tacpipe.recording.spool import Note, Spool, Spooled
+from tacpipe.recording.spool import Spool
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.spooled import Spooled
 from tacpipe.recording.station import READ_S, Station
 from tests.conftest import Lab
 from tests.recording import force_rig, live

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.recording import spool
+from tacpipe.recording import spool_folders
 from tests.conftest import Lab
 from tests.recording import force_rig, live
 from tests.recording.scripted import Script
@@ -159,7 +159,7 @@ def test_spools_of_other_users_are_neither_sealed_nor_removed(lab: Lab, monkeypa
     monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: (_ for _ in ()).throw(PermissionError()))
     ran = lab.run("acquire --recover")
 
-    mine = spool.user(folder.stat().st_uid)
+    mine = spool_folders.user(folder.stat().st_uid)
     for left in (folder, begun):
         assert f"The spool {left} belongs to {mine}, who alone can seal it.\n" in ran.err
         assert (left / "bytes").exists()

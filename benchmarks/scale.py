@@ -1,0 +1,197 @@
+"""How commands grow with the number of recordings, measured on simulated stores of tiny shards.
+
+    python benchmarks/scale.py [--counts 10000 100000] [--folder FOLDER]
+
+Objects, records and directories are written by the library's own functions, in bulk and without waiting for the disk.
+Each recording is a copy of one that was simulated, with bytes of its own before the footer, so that each has another
+digest. Each command is a process of its own: seconds, peak of resident memory, bytes read and system calls that look at
+files (by `strace`, where it is installed, in a run of its own) are those of the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import timing
+
+from tacpipe.datasets import directory
+from tacpipe.datasets.manifest import Entry, find
+from tacpipe.engine import keys
+from tacpipe.io import parquet
+from tacpipe.io.hashing import digest
+from tacpipe.store.store import Store
+
+COUNTS = (10_000, 100_000)
+SIMULATE = "simulate forward --trials 1 --duration-s 4 --tactile-rate-hz 25 --robot-rate-hz 50 -o seed --quiet"
+STREAM, COLUMNS = "xela1", 5  # what each recording keeps of the simulated one
+LOOKS = "newfstatat,stat,lstat,statx,access,openat,getdents64"
+HIT = "synchronize recordings -o synced --quiet"
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one process took."""
+
+    seconds: float
+    cpu_s: float  # of the processor, on all cores
+    memory_bytes: int  # peak of resident memory
+    read_bytes: int
+    looks: int | None = None  # system calls that look at files, where they were counted
+
+
+class Lab:
+    """A project of many recordings, all of which were synchronized before, each alone."""
+
+    def __init__(self, folder: Path, count: int) -> None:
+        folder.mkdir(parents=True)
+        (folder / ".tacpipe").mkdir()
+        self.folder, self.store = folder, Store(folder / ".tacpipe")
+        timing.run(f"tacpipe {SIMULATE}", folder)
+        made = find(folder / "seed").manifest
+        shard = made.recordings["trial-000"]["shards"][STREAM]
+        table = parquet.from_parquet(self.store.read(shard["digest"]))
+        self._raw = parquet.to_parquet(table.select(table.column_names[:COLUMNS]))
+        self._rows = table.num_rows
+        self._made = replace(made, recordings={})
+        self.count = 0
+        self.entries: dict[str, Entry] = {}
+        self.add(1)
+        timing.run(f"tacpipe {HIT}", folder)
+        synced = find(folder / "synced").manifest
+        self._step = synced.chain[-1]
+        self._one = self._record(self.entries)
+        (stored,) = self._one["result"]["recordings"][""]["shards"].values()
+        self._synced = self.store.read(stored["digest"])
+        self.add(count - 1, synchronized=True)
+
+    def add(self, count: int, *, synchronized: bool = False) -> None:
+        """Add recordings to the dataset, whose results are in the store where they were ``synchronized``."""
+        new = {f"trial-{number:07d}": self._entry(number) for number in range(self.count, self.count + count)}
+        self.count += count
+        self.entries |= new
+        if synchronized:
+            result, provenance = self._one["result"], self._one["provenance"]
+            for number, task in enumerate(
+                keys.shard_tasks(self.store, replace(self._made, recordings=new), self._step, ())
+            ):
+                shards = {"": {**result["recordings"][""]["shards"][""], **self._put(self._synced, number)}}
+                made = {"recordings": {"": {**result["recordings"][""], "shards": shards}}, "files": {}}
+                self.store.commit(task.identity, made, provenance)
+        manifest = replace(self._made, recordings=self.entries)
+        self.store.put(manifest.content)
+        directory.publish(self.store, manifest, self.folder / "recordings")
+
+    def _entry(self, number: int) -> Entry:
+        attributes = {"material": f"m{number % 20}", "sensor": "xela-uskin", "trial": number}
+        return {"attributes": attributes, "shards": {STREAM: {**self._put(self._raw, number), "rows": self._rows}}}
+
+    def _record(self, entries: dict[str, Entry]) -> dict[str, Any]:
+        (task,) = keys.shard_tasks(self.store, replace(self._made, recordings=entries), self._step, ())
+        return self.store.read_record(digest(task.identity))
+
+    def _put(self, content: bytes, number: int) -> dict[str, Any]:
+        """Store a Parquet file with a number before its footer, where no reader looks."""
+        footer = int.from_bytes(content[-8:-4], "little") + 8
+        return vars(self.store.put(content[:-footer] + number.to_bytes(8, "little") + content[-footer:]))
+
+
+STEPS = {  # in this order; those that change the dataset come last
+    "all results stored, the run new": HIT,
+    "hit": HIT,
+    "show": "show recordings",
+    "explain": "explain synced",
+    "split": "split synced -o split --quiet",
+    "store status": "store status",
+    "store verify": "store verify",
+    "store gc": "store gc --dry-run",
+    "one label": "label recordings trial-0000001 --set material=felt",
+    "one label, synchronized": HIT,
+    "one new recording": HIT,
+}
+
+
+def measure(lab: Lab) -> dict[str, Cost]:
+    """Return what each step costs."""
+    found = {}
+    for name, command in STEPS.items():
+        if name == "one new recording":
+            lab.add(1)
+        found[name] = cost(lab, command)
+    lab.add(1)
+    for name in ("one new recording", "hit", "show", "explain"):
+        found[name] = replace(found[name], looks=looks(lab, STEPS[name]))
+    return found
+
+
+def cost(lab: Lab, command: str) -> Cost:
+    """Return what a command of tacpipe costs; its looks are not counted."""
+    begun = time.perf_counter()
+    words = [timing.PYTHON, "-S", "-c", timing.SMALL, f"{timing.BIN}/tacpipe", *shlex.split(command)]
+    done = subprocess.run(words, cwd=lab.folder, env=timing.environment_of(), stdout=subprocess.PIPE, check=False)
+    seconds = time.perf_counter() - begun
+    if done.returncode:
+        raise SystemExit(f"tacpipe {command} ended with {done.returncode}")
+    cpu_s, memory_bytes, read_bytes = json.loads(done.stdout.splitlines()[-1])
+    return Cost(seconds, cpu_s, memory_bytes, read_bytes)
+
+
+def looks(lab: Lab, command: str) -> int | None:
+    """Return how many system calls of a command look at files, or None without strace."""
+    if shutil.which("strace") is None:
+        return None
+    with tempfile.NamedTemporaryFile("r") as counts:
+        trace = ["strace", "-f", "-c", "--seccomp-bpf", "-U", "calls,name", "-o", counts.name, "-e", f"trace={LOOKS}"]
+        timing.run([*trace, "tacpipe", *shlex.split(command)], lab.folder)
+        return sum(int(found[1]) for found in re.finditer(r"^ *(\d+) +(?!total)\w+$", counts.read(), re.MULTILINE))
+
+
+def table(found: dict[int, dict[str, Cost]]) -> str:
+    """Return what was found as a table of Markdown: a row a step, the counts next to each other, and the growth."""
+    counts = sorted(found)
+    heads = [f"{count:,}: s | CPU s | MB | MB read | looks" for count in counts] + ["growth of CPU s"] * (
+        len(counts) > 1
+    )
+    lines = [f"| step | {' | '.join(heads)} |", "| --- |" + " ---: |" * (5 * len(counts) + (len(counts) > 1))]
+    for name in STEPS:
+        cells = [name]
+        for cost in (found[count][name] for count in counts):
+            megabytes = (f"{size / 1e6:,.0f}" for size in (cost.memory_bytes, cost.read_bytes))
+            cells += [
+                f"{cost.seconds:.2f}",
+                f"{cost.cpu_s:.2f}",
+                *megabytes,
+                "" if cost.looks is None else f"{cost.looks:,}",
+            ]
+        if len(counts) > 1:
+            cells.append(f"{found[counts[-1]][name].cpu_s / found[counts[0]][name].cpu_s:.1f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure for each count and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
+    parser.add_argument("--folder", type=Path, help="Where to make the stores; they stay there.")
+    given = parser.parse_args()
+    setattr(os, "fsync", lambda handle: None)  # noqa: B010  (of this process alone, which makes what is measured)
+    found = {}
+    with tempfile.TemporaryDirectory(prefix="tacpipe-scale-") as temporary:
+        for count in given.counts:
+            found[count] = measure(Lab((given.folder or Path(temporary)) / str(count), count))
+    print(table(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""`tacpipe run`: the stages of a ``dvc.yaml``, each after those that it depends on.
+
+What is there already is found in this process, stage after stage. What has something to do runs as a process of its own, as
+it would from a shell: it computes, warns and ends in the same way, and leaves nothing behind in this one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tacpipe.cli import addresses, stages
+from tacpipe.engine.chains import chain as chains
+from tacpipe.engine.chains.chain import Chain, ChainStage
+from tacpipe.errors import DONE, INTERRUPTED
+from tacpipe.io import progress, terminal, termination
+from tacpipe.plugins import registry
+
+PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # without -P modules would be found in the folder of the chain
+_SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # what a shell does more with than splitting words
+_PATTERN = re.compile(r"[*?\[]")
+_QUOTES = re.compile(r"[\"']")
+
+
+class Became(Enum):
+    """What became of a stage."""
+
+    UNCHANGED = "unchanged"
+    RAN = "ran"
+    FAILED = "failed"
+    BLOCKED = "not run"
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the command ``run`` to ``program``."""
+
+    @program.command(
+        "run",
+        help=f"{summary}\n\nStages run in the order of their deps and outs, from the folder of the file. A stage whose "
+        "results are there is passed over; one that fails keeps back only what depends on it. Commands of other programs "
+        "are run by the shell, each time.\n\nExample: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate",
+    )
+    def run(
+        file: Annotated[Path, typer.Argument(help="A file with stages, as DVC's dvc.yaml.")],
+        names: Annotated[
+            list[str] | None,
+            typer.Argument(metavar="STAGES", help="Stages to run, with all that they depend on; by default all."),
+        ] = None,
+        quiet: Annotated[bool, typer.Option("--quiet", help="No names of stages, no summary.")] = False,
+    ) -> None:
+        chain = chains.load(file, names or ())
+        with contextlib.chdir(file.absolute().parent):
+            code = _run(chain, quiet=quiet)
+        if code:
+            raise typer.Exit(code)
+
+
+def _run(chain: Chain, *, quiet: bool) -> int:
+    """Run the stages of a chain; return the exit code of the first that failed, or 0."""
+    became: dict[str, Became] = {}
+    first = DONE
+    for stage in chain.stages:
+        missing = sorted(
+            name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED)
+        )
+        if missing:
+            became[stage.name] = Became.BLOCKED
+            terminal.note(f"tacpipe: {stage.name} was not run: it depends on {missing[0]}.")
+            continue
+        if stage.frozen:
+            became[stage.name] = Became.UNCHANGED
+            continue
+        if not quiet:
+            terminal.note(f"{stage.name}:")
+        became[stage.name], code = _stage(stage)
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
+        if code:
+            terminal.note(f"tacpipe: {stage.name} failed with exit code {code}.")
+            first = first or code
+    progress.set_quiet(quiet)
+    if not quiet:
+        counts = {kind: sum(one is kind for one in became.values()) for kind in Became}
+        terminal.note(", ".join(f"{count} {kind.value}" for kind, count in counts.items() if count))
+    return first
+
+
+def _stage(stage: ChainStage) -> tuple[Became, int]:
+    """Run the commands of a stage until one fails; return what became of it, and the exit code."""
+    became = Became.UNCHANGED
+    for command in stage.commands:
+        words = _words(command)
+        if words is not None and _answered(words[1:]):
+            continue
+        became = Became.RAN
+        code = _process(command if words is None else [*PROGRAM, *words[1:]])
+        if code:
+            return Became.FAILED, code
+    return became, DONE
+
+
+def _words(command: str) -> list[str] | None:
+    """Return the words of a command of tacpipe, its patterns expanded as a shell does; None for what only a shell reads."""
+    if _SHELL.search(command):
+        return None
+    try:
+        words, raw = shlex.split(command), shlex.split(command, posix=False)
+    except ValueError:  # a quotation that does not end
+        return None
+    if not words or words[0] != "tacpipe" or len(words) != len(raw):
+        return None
+    found = []
+    for word, written in zip(words, raw, strict=True):
+        quoted = _QUOTES.search(written) is not None
+        if quoted and _PATTERN.search(word):
+            return None  # of which some letters may be meant as they are
+        found += (sorted(glob.glob(word)) or [word]) if _PATTERN.search(word) else [word]  # noqa: PTH207  (as it is written)
+    return found
+
+
+def _answered(arguments: Sequence[str]) -> bool:
+    """Return whether a command had nothing to do; it has reported so then, as it does by itself.
+
+    Whatever else became of it is for its own process to report.
+    """
+    groups = {name.partition(".")[0] for name in registry.stages()}
+    if not arguments or arguments[0] not in groups:
+        return False
+    program = typer.Typer(rich_markup_mode=None)
+    program.callback()(stages.nothing)
+    try:
+        stages.add_group(program, arguments[0], arguments)
+        addresses.refuse(program)
+        with stages.answering():
+            code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
+    except Exception:
+        return False
+    return code in (None, DONE)
+
+
+def _process(command: str | list[str]) -> int:
+    """Run a command, by the shell where it is a text, and return its exit code; an interrupt is the command's to report."""
+    sys.stdout.flush()
+    shell = isinstance(command, str)
+    with termination.reporting(""):
+        process = subprocess.Popen(command, shell=shell)
+        try:
+            code = process.wait()
+        except KeyboardInterrupt:
+            with contextlib.suppress(OSError):
+                process.send_signal(signal.SIGINT)  # a terminal has sent it already, a scheduler has not
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(termination.GRACE_S)
+            raise
+    return code if code >= 0 else 128 - code

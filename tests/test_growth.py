@@ -1,0 +1,154 @@
+"""What grows with the number of recordings, counted and not timed: what one more costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import tacpipe
+from tacpipe.datasets import directory, manifest
+from tacpipe.engine import keys
+from tacpipe.errors import DamagedError
+from tacpipe.store.store import Store
+from tests.conftest import Lab
+
+GROUPED, COUNT = 4, 40
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], dict[str, int]]]:
+    """A function that returns how often records were read and files were written into datasets, since it was called last."""
+    calls = {"records": 0, "placed": 0}
+    read, place = Store.read_record, directory.place
+
+    def reading(self: Store, key: str) -> dict[str, Any]:
+        calls["records"] += 1
+        return read(self, key)
+
+    def placing(*given: Any, **how: Any) -> None:
+        calls["placed"] += 1
+        place(*given, **how)
+
+    monkeypatch.setattr(Store, "read_record", reading)
+    monkeypatch.setattr(directory, "place", placing)
+    monkeypatch.setattr(keys, "GROUPED", GROUPED)
+
+    def taken() -> dict[str, int]:
+        found = dict(calls)
+        calls.update(records=0, placed=0)
+        return found
+
+    yield taken
+
+
+def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_files(
+    lab: Lab, counted: Callable[[], dict[str, int]]
+) -> None:
+    lab.run(f"simulate toy --rows 2 --trials {COUNT} -o data/toy")
+    lab.run("scale data/toy -o data/scaled --jobs 1")
+    names = list(tacpipe.open(lab.folder / "data/toy").recordings)
+    sizes = [len(group) for group in keys.groups(names)]
+    assert max(sizes) < COUNT / 2
+    before = {path: path.stat().st_ino for path in (lab.folder / "data/toy").rglob("*.parquet")}
+
+    counted()
+    lab.run(f"simulate toy --rows 2 --trials {COUNT + 1} -o data/toy --jobs 1")
+    assert counted()["placed"] == 2  # the streams of the new one
+    assert {path: path.stat().st_ino for path in before} == before
+
+    ran = lab.run("scale data/toy -o data/scaled --jobs 1 --json")
+    once = counted()
+    assert once["placed"] == 1
+    assert once["records"] < len(sizes) + 2 * (max(sizes) + 1) + 8 < COUNT
+    assert f'"reused": {COUNT}' in ran.out and '"ran": 1,' in ran.out
+
+
+def test_groups_hold_every_recording_and_the_results_are_those_without_groups(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run("simulate toy --trials 9 -o data/toy")
+    lab.run("scale data/toy -o alone")
+    monkeypatch.setattr(keys, "GROUPED", 2)
+    lab.run("label data/toy trial-003 --set material=felt")
+    lab.run("scale data/toy -o first --jobs 1")
+    lab.run("label data/toy trial-003 --set material=silk")
+    ran = lab.run("scale data/toy -o again --jobs 1")
+
+    assert "0 ran, 9 reused" in ran.err
+    entries = {place: tacpipe.open(lab.folder / place).source.recordings for place in ("alone", "first", "again")}
+    assert entries["again"]["trial-003"]["attributes"]["material"] == "silk"
+    for name, entry in entries["alone"].items():
+        assert entry["shards"] == entries["first"][name]["shards"] == entries["again"][name]["shards"]
+
+
+def test_a_lost_object_of_a_group_is_computed_again_and_nothing_else_is(
+    lab: Lab, counted: Callable[[], dict[str, int]]
+) -> None:
+    lab.run("simulate toy --rows 2 --trials 12 -o data/toy")
+    lab.run("scale data/toy -o data/scaled --jobs 1")
+    shard = tacpipe.open(lab.folder / "data/scaled").recordings["trial-005"].digest
+    Path(Store(lab.folder / ".tacpipe").object_path(shard)).unlink()
+
+    assert "1 ran, 11 reused" in lab.run("scale data/toy -o data/scaled --jobs 1").err
+    assert "0 ran" in lab.run("scale data/toy -o data/scaled --jobs 1").err
+
+
+def test_a_file_that_is_gone_or_has_another_size_is_placed_again_when_another_recording_comes(lab: Lab) -> None:
+    lab.run("simulate toy --trials 3 -o data/toy")
+    lab.run("scale data/toy -o data/scaled")
+    content = {path: path.read_bytes() for path in sorted((lab.folder / "data/scaled").glob("*.parquet"))}
+    gone, cut, _ = content
+    gone.unlink()
+    cut.unlink()
+    cut.write_bytes(b"cut")
+    lab.run("simulate toy --trials 4 -o data/toy")
+    lab.run("scale data/toy -o data/scaled")
+
+    assert {path: path.read_bytes() for path in content} == content
+
+
+def test_the_provenance_of_a_group_keeps_what_its_stage_noted(lab: Lab) -> None:
+    lab.run("simulate toy --trials 3 -o data/toy")
+    lab.run("scale data/toy -o data/scaled --jobs 1")
+    store = Store(lab.folder / ".tacpipe")
+    (group,) = [record for _, record in store.records() if "group" in record["identity"]]
+    singles = [record for _, record in store.records() if record["identity"].get("stage") == "scale"]
+
+    assert group["provenance"]["code"] == {"scale": {singles[0]["provenance"]["code"]: 3}}
+    assert set(group["result"]["recordings"]) == {"trial-000", "trial-001", "trial-002"}
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner) | st.tuples(inner, inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+@given(VALUES)
+def test_a_manifest_is_indented_as_the_standard_library_does(value: Any) -> None:
+    assert manifest.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+
+
+def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
+    for value in ({"a": float("nan")}, [float("inf")], {"a": {1: 2, "b": 3}}, {"a": object()}):
+        with pytest.raises((ValueError, TypeError)) as expected:
+            json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+        with pytest.raises(expected.type):
+            manifest.indented(value)
+
+
+def test_a_manifest_that_was_edited_is_refused_though_the_sound_one_was_read(lab: Lab) -> None:
+    lab.run("simulate toy --trials 1 -o data/toy")
+    content = (lab.folder / "data/toy/manifest.json").read_bytes()
+    edited = content.replace(b'"cork"', b'"felt"')
+    assert manifest.parse(edited, "edited", verified=True).recordings != manifest.parse(content, "sound").recordings
+
+    with pytest.raises(DamagedError):
+        manifest.parse(edited, "edited")

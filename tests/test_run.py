@@ -1,0 +1,254 @@
+"""`tacpipe run`: a chain gives what its commands give one by one, and does again only what has something to do."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tacpipe.cli import run
+from tacpipe.engine.chains import chain as chains
+from tacpipe.errors import UsageError
+from tests.conftest import Lab, tacpipe
+
+ROOT = Path(__file__).parents[1]
+STAGES: dict[str, dict[str, Any]] = {
+    "total": {"cmd": "tacpipe total data/scaled -o total", "deps": ["data/scaled/manifest.json"], "outs": ["total"]},
+    "scaled": {
+        "cmd": "tacpipe scale data/toy -o data/scaled --factor ${factor}",
+        "deps": ["data/toy/manifest.json"],
+        "outs": ["data/scaled/manifest.json"],
+    },
+    "toy": {"cmd": "tacpipe simulate toy -o data/toy", "outs": [{"data/toy/manifest.json": {"persist": True}}]},
+}
+
+
+def written(stages: Mapping[str, Any], folder: Path = Path(), **params: Any) -> Path:
+    """Return a chain's file, with its params next to it."""
+    (folder / "dvc.yaml").write_text(yaml.safe_dump({"stages": stages}, sort_keys=False))
+    (folder / "params.yaml").write_text(yaml.safe_dump({"factor": 3, **params}))
+    return folder / "dvc.yaml"
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Return every file of a project's datasets."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for place in ("data", "total")
+        for path in sorted((folder / place).rglob("*"))
+        if path.is_file()
+    }
+
+
+def one(value: str) -> dict[str, Any]:
+    """Return a stage whose command adds a line to the file ``ran``."""
+    return {"cmd": f"echo {value} >> ran"}
+
+
+def test_a_chain_gives_the_bytes_that_its_commands_give_one_by_one(lab: Lab, tmp_path: Path) -> None:
+    written(STAGES)
+    lab.run("run dvc.yaml")
+    alone = tmp_path / "alone"
+    (alone / ".tacpipe").mkdir(parents=True)
+    for name in ("toy", "scaled", "total"):
+        command = str(STAGES[name]["cmd"]).removeprefix("tacpipe ").replace("${factor}", "3")
+        assert tacpipe(alone, command).returncode == 0
+
+    assert content(alone) and content(lab.folder) == content(alone)
+
+
+def test_with_nothing_to_do_no_process_is_started_and_each_command_reports_as_by_itself(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(STAGES)
+    lab.run("run dvc.yaml")
+    before = content(lab.folder)
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("a process was started"))
+    ran = lab.run("run dvc.yaml")
+
+    alone = lab.run("scale data/toy -o data/scaled --factor 3")
+    assert ran.out.split() == ["data/toy", "data/scaled", "total"]
+    assert alone.err.partition(",")[0] in ran.err and "0 ran, 4 reused" in alone.err
+    assert content(lab.folder) == before
+
+
+def test_a_stage_is_run_where_its_params_its_input_or_a_file_of_its_output_changed(lab: Lab) -> None:
+    written(STAGES)
+    lab.run("run dvc.yaml")
+    before = content(lab.folder)
+
+    (shard,) = (lab.folder / "data/scaled").glob("trial-000*")
+    shard.unlink()
+    assert "1 ran" in lab.run("run dvc.yaml").err.splitlines()[-1]
+    assert content(lab.folder) == before
+
+    written(STAGES, factor=4)
+    assert lab.run("run dvc.yaml").err.splitlines()[-1] == "1 unchanged, 2 ran"
+    lab.run("scale data/toy -o expected --factor 4")
+    assert (Path("expected") / shard.name).read_bytes() == (Path("data/scaled") / shard.name).read_bytes()
+
+
+def test_a_failing_stage_keeps_back_what_depends_on_it_and_nothing_else(lab: Lab) -> None:
+    scaled = {**STAGES["scaled"], "cmd": "tacpipe scale data/toy -o data/scaled --factor many"}
+    written({**STAGES, "scaled": scaled, "other": one("other")})
+    failed = lab.call("run dvc.yaml")
+
+    assert failed.code == 2
+    assert Path("data/toy/manifest.json").exists() and Path("ran").read_text() == "other\n"
+    assert not Path("data/scaled").exists() and not Path("total").exists()
+    assert "total was not run" in failed.err
+
+
+def test_the_commands_of_a_stage_end_with_the_first_that_fails(lab: Lab) -> None:
+    written({"several": {"cmd": ["echo first >> ran", "exit 7", "echo third >> ran"]}})
+
+    assert lab.call("run dvc.yaml").code == 7
+    assert Path("ran").read_text() == "first\n"
+
+
+def test_named_stages_run_with_all_that_they_depend_on(lab: Lab) -> None:
+    written({**STAGES, "other": one("other")})
+    lab.run("run dvc.yaml scaled")
+
+    assert Path("data/scaled/manifest.json").exists()
+    assert not Path("total").exists() and not Path("ran").exists()
+
+
+def test_a_chain_elsewhere_runs_in_its_own_folder(lab: Lab) -> None:
+    (lab.folder / "project").mkdir()
+    written({"here": one("here")}, lab.folder / "project")
+    lab.run("run project/dvc.yaml")
+
+    assert (lab.folder / "project/ran").exists() and not (lab.folder / "ran").exists()
+
+
+def test_patterns_of_paths_are_expanded_as_a_shell_expands_them(lab: Lab) -> None:
+    for name in ("b", "a", ".hidden"):
+        Path(f"data-{name}").mkdir() if name[0] != "." else Path(name).mkdir()
+
+    assert run._words("tacpipe scale data-* -o x") == ["tacpipe", "scale", "data-a", "data-b", "-o", "x"]
+    assert run._words("tacpipe scale none-* -o 'a b'") == ["tacpipe", "scale", "none-*", "-o", "a b"]
+    for shell in (
+        "tacpipe a | tee b",
+        "tacpipe $A",
+        "tacpipe 'data-*'",
+        "tacpipe {a,b}",
+        "tacpipe a\ntacpipe b",
+        "echo",
+    ):
+        assert run._words(shell) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("stages: [1]", "stages"),
+        ("stages: {a: {cmd: x, wdir: sub}}", "wdir"),
+        ("stages: {a: {cmd: 'x ${nothing.here}'}}", "nothing.here"),
+        ("stages: {a: {deps: [b]}}", "cmd"),
+        ("stages: {a: {cmd: x, deps: [one], outs: [two]}, b: {cmd: x, deps: [two], outs: [one]}}", "a -> b -> a"),
+        ("stages: {a: {cmd: x, outs: [one]}, b: {cmd: x, outs: [one]}}", "both write one"),
+        ("stages: {a: {foreach: 3, do: {cmd: x}}}", "foreach"),
+        ("stages: {a: {matrix: [1], cmd: x}}", "matrix"),
+        ("stages: {a: {cmd: x}}\nvars: [hydra.json]", "hydra.json"),
+        ("[", "YAML"),
+    ],
+)
+def test_a_chain_that_cannot_be_run_is_refused_before_anything_runs(lab: Lab, text: str, named: str) -> None:
+    Path("dvc.yaml").write_text(text)
+    refused = lab.call("run dvc.yaml")
+
+    assert refused.code == 2 and named in refused.err
+
+
+def test_an_unknown_stage_and_a_missing_file_are_refused(lab: Lab) -> None:
+    written(STAGES)
+
+    assert "scaled" in lab.call("run dvc.yaml polish").err
+    assert lab.call("run nowhere.yaml").code == 2
+
+
+def test_stages_of_foreach_and_matrix_have_the_names_and_values_that_the_format_gives_them(tmp_path: Path) -> None:
+    stages = {
+        "each": {"foreach": ["a", 2], "do": {"cmd": "x ${item}"}},
+        "keyed": {"foreach": "${sets}", "do": {"cmd": "x ${key} ${item.n}"}},
+        "grid": {"matrix": {"m": ["u", {"v": True}], "fold": [0, 1]}, "cmd": "x ${item.fold}"},
+    }
+    found = chains.load(written(stages, tmp_path, sets={"one": {"n": 1}, "two": {"n": 2}})).stages
+
+    assert {stage.name: stage.commands[0] for stage in found} == {
+        "each@a": "x a",
+        "each@2": "x 2",
+        "keyed@one": "x one 1",
+        "keyed@two": "x two 2",
+        "grid@u-0": "x 0",
+        "grid@u-1": "x 1",
+        "grid@m1-0": "x 0",
+        "grid@m1-1": "x 1",
+    }
+
+
+def test_dvc_reads_the_stages_of_this_project_in_the_same_way() -> None:
+    parsing = pytest.importorskip("dvc.parsing")
+    repo = pytest.importorskip("dvc.repo").Repo(str(ROOT), uninitialized=True)
+    resolver = parsing.DataResolver(repo, str(ROOT), yaml.safe_load((ROOT / "dvc.yaml").read_text()))
+    expected = resolver.resolve()["stages"]
+    found = {stage.name: stage for stage in chains.load(ROOT / "dvc.yaml").stages}
+
+    assert set(found) == set(expected) and len(found) > 100
+    for name, stage in found.items():
+        commands = expected[name]["cmd"]
+        assert list(stage.commands) == ([commands] if isinstance(commands, str) else commands)
+        assert list(stage.reads) == expected[name].get("deps", [])
+
+
+def test_each_stage_of_this_project_comes_after_those_whose_outputs_it_reads() -> None:
+    chain = chains.load(ROOT / "dvc.yaml")
+    done: list[str] = []
+    for stage in chain.stages:
+        assert set(chain.after[stage.name]) <= set(done)
+        done.append(stage.name)
+    assert "forward-synced" in chain.after["forward-segments"]
+    assert any(name.startswith("forward-raw") or name.startswith("forward-latent") for name in chain.after["forward"])
+
+
+def test_names_with_values_that_are_missing_are_named() -> None:
+    from tacpipe.engine.chains import template
+
+    with pytest.raises(UsageError, match=r"a\.c"):
+        template.filled("${a.c}", {"a": {"b": 1}}, "dvc.yaml")
+    assert template.filled(r"\${a} ${a}", {"a": False}, "dvc.yaml") == "${a} false"
+
+
+@pytest.mark.long
+def test_an_interrupt_ends_the_stage_at_work_and_the_chain_with_the_exit_code_of_interrupts(lab: Lab) -> None:
+    work = "import pathlib, time; pathlib.Path('began').touch(); time.sleep(600)"
+    written({"slow": {"cmd": f'exec {sys.executable} -c "{work}"'}, "after": {**one("after"), "deps": ["x"]}})
+    command = [sys.executable, "-m", "tacpipe", "run", "dvc.yaml"]
+    process = subprocess.Popen(command, env=dict(os.environ), stderr=subprocess.PIPE, text=True)
+    while not Path("began").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    _, printed = process.communicate(timeout=60)
+
+    assert process.returncode == 130
+    assert 'File "' not in printed.replace('File "<string>"', "")  # the only traceback is that of what ran
+    assert not Path("ran").exists()
+
+
+def test_json_of_a_command_within_a_chain_is_what_it_prints_by_itself(lab: Lab) -> None:
+    written({"toy": {"cmd": "tacpipe simulate toy -o data/toy --json --quiet"}})
+    lab.run("run dvc.yaml")
+    value, alone = (json.loads(lab.run(command).out) for command in ("run dvc.yaml", "simulate toy -o data/toy --json"))
+
+    assert {**value, "seconds": 0} == {**alone, "seconds": 0}
