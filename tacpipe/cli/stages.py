@@ -21,6 +21,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.requirements import Requirements
 from tacpipe.plugins.stage import AnyStage
+from tacpipe.training.devices import AUTO, Compute, Device
 
 EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
 
@@ -74,6 +75,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         role=given.get("role"),
         jobs=given["jobs"],
         executor=given["executor"] or "",
+        compute=Compute(given.get("device") or AUTO, given.get("devices") or 1),
         skip_bad=given["skip_bad"],
         check=given["check"],
         compare=given["compare"],
@@ -175,6 +177,10 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     if "init" in stage.arguments:
         text = "A model to begin with."
         found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+    if stage.trains:
+        text = "What to train on; auto: cuda where there is one, else cpu."
+        option = typer.Option(None, "--device", help=text, metavar=f"[{'|'.join(get_args(Device))}]")
+        found.append(_parameter("device", str | None, option))
     if stage.tracked:
         text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
         found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))

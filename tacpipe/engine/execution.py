@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -26,7 +26,8 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Object, Store
-from tacpipe.training import display, following
+from tacpipe.training import devices, display, following
+from tacpipe.training.devices import Compute
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Task:
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
     rerun: bool = False  # compute although a result is stored
+    compute: Compute = field(default_factory=Compute)  # what networks are trained on
     run: str = ""  # the lease of the run that it is part of
 
 
@@ -61,24 +63,8 @@ def compute(task: Task) -> Done:
     """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
     store, key = Store(task.store, task.run), digest(task.identity)
     try:
-        if task.dry:
-            result, _ = execute(task, store, _Scratch())
-            return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
-        with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
-            record = store.record(key)
-            if record is not None and not task.rerun and records.complete(store, record):
-                return Done(task.recording, record, made=False)
-            started = time.perf_counter()
-            replace = task.replace or record is not None
-            result, notes = execute(task, store, store)
-            stage = stage_of(task.name)
-            made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
-            made |= {"code": provenance.code(stage), "notes": notes}
-            if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
-                store.put(_manifest_of(task, stage, result).content, durable=True)
-            record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
-            shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
-            return Done(task.recording, record)
+        with devices.given(task.compute):
+            return _computed(task, store, key)
     except TacpipeError as error:
         with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
             (store.root / "checkpoints" / key).rmdir()
@@ -86,6 +72,27 @@ def compute(task: Task) -> Done:
         return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
     finally:
         store.close()
+
+
+def _computed(task: Task, store: Store, key: str) -> Done:
+    if task.dry:
+        result, _ = execute(task, store, _Scratch())
+        return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
+    with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
+        record = store.record(key)
+        if record is not None and not task.rerun and records.complete(store, record):
+            return Done(task.recording, record, made=False)
+        started = time.perf_counter()
+        replace = task.replace or record is not None
+        result, notes = execute(task, store, store)
+        stage = stage_of(task.name)
+        made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+        made |= {"code": provenance.code(stage), "notes": notes}
+        if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
+            store.put(_manifest_of(task, stage, result).content, durable=True)
+        record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
+        shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
+        return Done(task.recording, record)
 
 
 class _Scratch:

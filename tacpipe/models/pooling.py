@@ -39,7 +39,8 @@ class NormalisedLinear(nn.Module):
     def affine(self, given: Tensor) -> tuple[Tensor, Tensor]:
         """Return weight (output, input) and bias (output,) of the layer for these inputs (…, input)."""
         if self.training:
-            mean, variance = self._moments(given.reshape(-1, given.shape[-1]))
+            with torch.autocast(given.device.type, enabled=False):  # small differences of sums over many points
+                mean, variance = self._moments(given.reshape(-1, given.shape[-1]).to(self.weight.dtype))
         else:
             mean, variance = self.mean, self.variance
         gain = self.scale * torch.rsqrt(variance + EPSILON)
@@ -106,5 +107,7 @@ def _largest_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 def largest(layer: NormalisedLinear, points: Tensor) -> Tensor:
     """Return the largest value over points (cloud, output) of the layer on clouds (cloud, point, input)."""
-    found: Tensor = LargestOverPoints.apply(points, *layer.affine(points))  # type: ignore[no-untyped-call]
+    weight, bias = layer.affine(points)
+    with torch.autocast(points.device.type, enabled=False):
+        found: Tensor = LargestOverPoints.apply(points.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
     return found

@@ -8,6 +8,7 @@ gives the same bits as one that was not, on a CPU; a GPU adds in another order e
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import math
@@ -84,7 +85,7 @@ class Windows:
         """Return the mean loss over all validation windows."""
         total: Tensor | float = 0.0
         for indices in _pieces(torch.arange(self.validation.count), self.batch):
-            total = total + self.validation.loss(model, indices).double() * len(indices)
+            total = total + precise(self.validation.loss(model, indices)) * len(indices)
         return {"val_loss": float(total) / self.validation.count}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
@@ -199,16 +200,18 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
     total: Tensor | float = 0.0
     count = 0
     batches = work.batches(epoch)
+    reduced = _reduced(run.model, schedule)
     for step, batch in enumerate(batches):
         for group in run.optimiser.param_groups:
             group["lr"] = schedule.rate((epoch + step / len(batches)) / schedule.epochs)
-        loss, weight = work.loss(run.model, batch, epoch)
+        with reduced:
+            loss, weight = work.loss(run.model, batch, epoch)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         if math.isfinite(schedule.gradient_clip):
             nn.utils.clip_grad_norm_(run.model.parameters(), schedule.gradient_clip)
         run.optimiser.step()
-        total = total + loss.detach().double() * weight
+        total = total + precise(loss) * weight
         count += weight
         followers.batch((step + 1) / len(batches), functools.partial(_mean, total, count))
     run.model.eval()
@@ -226,6 +229,17 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
         run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(better))}
     run.history.append(line)
     return line
+
+
+def _reduced(model: nn.Module, schedule: Schedule) -> contextlib.AbstractContextManager[Any]:
+    """Return what has products in its block computed in the precision of the schedule."""
+    device = next(model.parameters()).device.type
+    return torch.autocast(device, torch.bfloat16, enabled=schedule.precision == "bfloat16")
+
+
+def precise(value: Tensor) -> Tensor:
+    """Return a value in float64 to add it up, without waiting for the device; in float32 where that has no float64."""
+    return value.detach().to(torch.float32 if value.device.type == "mps" else torch.float64)
 
 
 def _mean(total: Tensor | float, count: int) -> float:
