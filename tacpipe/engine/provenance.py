@@ -47,8 +47,6 @@ def _here() -> dict[str, Any]:
 def of(seconds: float) -> dict[str, Any]:
     """Return libraries, git commit, host, device, processor and worker of this process, and the ``seconds`` of something."""
     made = {**_here(), "device": devices.kind(), "processor": processor.here(), "seconds": seconds}
-    if devices.current().devices > 1:
-        made["devices"] = devices.current().devices
     return {**made, "worker": _worker.get()} if _worker.get() else made
 
 

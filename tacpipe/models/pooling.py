@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from tacpipe.models import batch
+
 EPSILON = 1e-5  # added to a variance, as in torch
 MOMENTUM = 0.1  # weight of a batch in the running mean and variance, as in torch
 
@@ -52,13 +54,13 @@ class NormalisedLinear(nn.Module):
 
     def _moments(self, given: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance (output,) over rows (row, input), and let the running ones follow."""
-        centre = given.mean(dim=0)
+        centre, rows = batch.mean(given), batch.count(len(given))
         centred = given - centre
-        covariance = centred.T @ centred / len(given)  # (input, input)
+        covariance = batch.total(centred.T @ centred) / rows  # (input, input)
         mean = self.weight @ centre
         variance = ((self.weight @ covariance) * self.weight).sum(dim=1).clamp_min(0)
         with torch.no_grad():
-            unbiased = variance * (len(given) / max(len(given) - 1, 1))
+            unbiased = variance * (rows / max(rows - 1, 1))
             self.mean.lerp_(mean, MOMENTUM)
             self.variance.lerp_(unbiased, MOMENTUM)
         return mean, variance

@@ -16,8 +16,9 @@ from tests.tasks.material import textures
 from tests.tasks.touch import handmade
 
 Trains = Callable[..., Mapping[str, bytes]]  # of a workspace and params: the files of a model
-RAEC = {"architecture": "raec", "epochs": 3, "align_from": 1, "learning_rate": 1e-3}
-PATCHES = {"architecture": "patches", "inputs": "xyz"}
+RAEC: dict[str, Any] = {"architecture": "raec", "epochs": 3, "align_from": 1, "learning_rate": 1e-3}
+PATCHES: dict[str, Any] = {"architecture": "patches", "inputs": "xyz"}
+POINTNET: dict[str, Any] = dict(handmade.POINTNET)
 NETWORKS: dict[str, Trains] = {
     **{f"forward {name}": partial(trials.trained, architecture=name, epochs=3) for name in ARCHITECTURES},
     "forward shuffled": partial(trials.trained, architecture="gru", epochs=3, actions="shuffled"),
@@ -26,7 +27,7 @@ NETWORKS: dict[str, Trains] = {
     "material x-lstm": partial(textures.trained, architecture="x-lstm", epochs=3),
     "touch patches": partial(handmade.trained, **PATCHES),
     "touch edges": partial(handmade.trained, **PATCHES, backbone="edges"),
-    "touch pointnet": partial(handmade.trained, **handmade.POINTNET, rotation_deg=45.0),
+    "touch pointnet": partial(handmade.trained, **POINTNET, rotation_deg=45.0),
 }
 
 
