@@ -38,10 +38,10 @@ def forward(architecture: str, features: int, windows: int, hidden: int) -> Case
         model = RecurrentForecast(features, hidden)
     else:
         layout = LAYOUT if architecture == "taxelwise" else ()
-        sizes = {"hidden": hidden, "context": CONTEXT, "horizon": HORIZON}
-        model = build(architecture, features, layout, dropout=0.0, loss="absolute", **sizes)
-    model.calibrate(given, ahead)  # type: ignore[operator]
-    return model, lambda: model.loss(given, ahead)  # type: ignore[operator]
+        make = partial(build, hidden=hidden, context=CONTEXT, horizon=HORIZON)
+        model = make(architecture, features, layout, dropout=0.0, loss="absolute")
+    model.calibrate(given, ahead)
+    return model, lambda: model.loss(given, ahead)
 
 
 def raec(slides: int) -> Case:

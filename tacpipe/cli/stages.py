@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import typer
 
-from tacpipe.engine import by_recording, grid, pipeline, rank_processes
+from tacpipe.engine import by_recording, estimate, grid, pipeline, rank_processes
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError, UsageError
@@ -91,7 +91,16 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     elif len(requests) == 1:
         _report(pipeline.run(requests[0]), shown, as_json=given["json_"], quiet=given["quiet"])
     else:
+        if stage.trains and not (given["quiet"] or given["check"] or given["compare"]):
+            _estimate(requests)
         _run_folds(requests, shown, as_json=given["json_"], quiet=given["quiet"])
+
+
+def _estimate(requests: Sequence[Request]) -> None:
+    """Print how long the models that are missing take, as far as it can be known before."""
+    found = estimate.of(requests, requests[0].jobs)
+    if found is not None:
+        terminal.note(f"tacpipe: {found}")
 
 
 def _run_launched(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:

@@ -24,6 +24,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import batch
 from tacpipe.models.batch import Part
 from tacpipe.training import ranks
+from tacpipe.training.devices import Compute
 from tests.conftest import Lab, tacpipe
 from tests.training.networks import NETWORKS, losses, weights
 
@@ -210,7 +211,7 @@ def test_torchrun_starts_the_processes_of_a_command(project: Path) -> None:
 
 
 def test_without_a_training_no_other_process_is_started() -> None:
-    with rank_processes.available("{}", rank_processes.Compute("cpu", 2)) as found:
+    with rank_processes.available("{}", Compute("cpu", 2)) as found:
         assert found is not None and not found.started
 
 
@@ -220,7 +221,7 @@ def test_without_a_training_no_other_process_is_started() -> None:
 def test_a_rank_that_cannot_begin_is_reported(tmp_path: Path) -> None:
     with (
         pytest.raises(TacpipeError, match="Rank 1 of 2"),
-        rank_processes.available("no task", rank_processes.Compute("cpu", 2)),
+        rank_processes.available("no task", Compute("cpu", 2)),
     ):
         ranks.current()
 
