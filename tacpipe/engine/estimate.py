@@ -31,9 +31,10 @@ class Estimate:
 
     def __str__(self) -> str:
         """Return it as a sentence."""
+        noun = "model" if self.models == 1 else "models"
         return (
-            f"estimate: {self.models} model{'s' if self.models > 1 else ''} to train, {self.at_once} at a time, at most {display.duration(self.each_s)} "
-            f"each alone, {self.hours:.2g} h in all; timed on batches of the first, here and now."
+            f"estimate: {self.models} {noun} to train, {self.at_once} at a time, at most "
+            f"{display.duration(self.each_s)} each alone, {self.hours:.2g} h in all; timed on batches of the first, here and now."
         )
 
 
