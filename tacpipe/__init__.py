@@ -8,7 +8,7 @@ The Python API. `open` gives a `Dataset`, whose items are `Recording` objects; `
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import (
     DamagedError,
@@ -100,6 +100,8 @@ def run(
     block: str | None = None,
     jobs: int = 0,
     executor: str = "",
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto",
+    devices: int = 1,
     skip_bad: bool = False,
     rerun: bool = False,
     replace: bool = False,
@@ -126,6 +128,8 @@ def run(
     :param preset: a preset of params. A file of params is read only if ``params_file`` names one (``block``: its block).
     :param jobs: processes to use; 0: one a core. ``skip_bad`` leaves out recordings that cannot be read, ``rerun``
         computes what is stored too, ``replace`` lets the output replace what it must not lose otherwise.
+    :param device: what networks are trained on: cpu, cuda or mps; auto is cuda where there is one. ``devices``: how many of
+        them train one network.
     :param progress: show progress on a terminal, and print what a command prints while it runs.
     :param track: trackers that follow a training, as ``("tensorboard", "mlflow:http://127.0.0.1:5000")``.
     :param params: params of the stage, checked as on the command line.
@@ -144,7 +148,22 @@ def run(
         output,
         {key: given for key, given in named.items() if given is not None},
         params,
-        calling.How(fold, role, preset, params_file, block, jobs, executor, skip_bad, rerun, replace, progress, track),
+        calling.How(
+            fold=fold,
+            role=role,
+            preset=preset,
+            params_file=params_file,
+            block=block,
+            jobs=jobs,
+            executor=executor,
+            device=device,
+            devices=devices,
+            skip_bad=skip_bad,
+            rerun=rerun,
+            replace=replace,
+            progress=progress,
+            track=track,
+        ),
     )
 
 

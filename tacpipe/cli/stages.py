@@ -13,16 +13,17 @@ from typing import Any, Literal, get_args, get_origin
 
 import typer
 
-from tacpipe.engine import by_recording, grid, pipeline
+from tacpipe.engine import by_recording, estimate, grid, pipeline, rank_processes
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import OPTIONS, PATHS, Request
-from tacpipe.errors import FAILED, TacpipeError
+from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.requirements import Requirements
 from tacpipe.plugins.stage import AnyStage
+from tacpipe.training.devices import AUTO, Compute, Device
 
 EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
 
@@ -116,6 +117,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         role=given.get("role"),
         jobs=given["jobs"],
         executor=given["executor"] or "",
+        compute=Compute(given.get("device") or AUTO, rank_processes.asked(given.get("devices")) if stage.trains else 1),
         skip_bad=given["skip_bad"],
         check=given["check"],
         compare=given["compare"],
@@ -133,10 +135,34 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         for outcome in outcomes:
             _report(outcome, shown, as_json=given["json_"], quiet=given["quiet"])
         return
-    if len(requests) == 1:
+    if stage.trains and rank_processes.launched():
+        _run_launched(requests, shown, as_json=given["json_"], quiet=given["quiet"])
+    elif len(requests) == 1:
         _report(pipeline.run(requests[0]), shown, as_json=given["json_"], quiet=given["quiet"])
     else:
+        if stage.trains and not (given["quiet"] or given["check"] or given["compare"]):
+            _estimate(requests)
         _run_folds(requests, shown, as_json=given["json_"], quiet=given["quiet"])
+
+
+def _estimate(requests: Sequence[Request]) -> None:
+    """Print how long the models that are missing take, as far as it can be known before."""
+    found = estimate.of(requests, requests[0].jobs)
+    if found is not None:
+        terminal.note(f"tacpipe: {found}")
+
+
+def _run_launched(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
+    """Run a request as one of the processes of ``torchrun``: the first one does, and others train along."""
+    if len(requests) > 1:
+        raise UsageError(f"torchrun has started processes to train one network together, not {len(requests)} folds.")
+    if rank_processes.first():
+        with rank_processes.leading():
+            _report(pipeline.run(requests[0]), headline, as_json=as_json, quiet=quiet)
+    else:
+        from tacpipe.engine import rank
+
+        rank.follow()
 
 
 def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
@@ -224,6 +250,12 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     if "init" in stage.arguments:
         text = "A model to begin with."
         found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+    if stage.trains:
+        text = "What to train on; auto: cuda where there is one, else cpu."
+        option = typer.Option(None, "--device", help=text, metavar=f"[{'|'.join(get_args(Device))}]")
+        found.append(_parameter("device", str | None, option))
+        text = "Devices that train one network together, each in a process [1]."
+        found.append(_parameter("devices", int | None, typer.Option(None, "--devices", help=text)))
     if stage.tracked:
         text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
         found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))

@@ -25,7 +25,8 @@ from tacpipe.codecs.autoencoder import Autoencoder, scaled
 from tacpipe.codecs.standard import standard
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
-from tacpipe.training import loop
+from tacpipe.models.batch import Rows
+from tacpipe.training import devices, loop
 
 if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
@@ -106,7 +107,7 @@ def fit(
             "recordings with contact."
         )
     mean, scale = standard(train[:, -width:], representation)
-    learned, watched = (torch.from_numpy(scaled(part, mean, scale)) for part in (train, val))
+    learned, watched = (torch.from_numpy(scaled(part, mean, scale)).to(devices.kind()) for part in (train, val))
     found = [
         _trained(learned, watched, network, schedule, workspace, (index, len(tried)), components, representation)
         for index, network in enumerate(tried)
@@ -129,6 +130,8 @@ def fit(
 
 class _Mirrored(nn.Module):
     """Encoder and decoder whose layers mirror each other."""
+
+    ROWS = Rows(given=0, returned=(0,))
 
     def __init__(self, widths: Sequence[int], *, bias: bool) -> None:
         super().__init__()
@@ -168,7 +171,7 @@ def _trained(
         return loop.Part(len(rows), loss)
 
     return loop.train(
-        lambda: _Mirrored(widths, bias=representation == frame_stacking.LEVELS),
+        lambda: _Mirrored(widths, bias=representation == frame_stacking.LEVELS).to(learned.device),
         loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace / f"{index:02d}",

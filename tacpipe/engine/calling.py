@@ -17,6 +17,7 @@ from tacpipe.io import progress
 from tacpipe.plugins import fields, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage
+from tacpipe.training.devices import AUTO, Compute, Device
 
 Given = str | PathLike[str] | Dataset
 _STACK = 3  # frames from a warning to who called `tacpipe.run`
@@ -33,6 +34,8 @@ class How:
     block: str | None = None
     jobs: int = 0
     executor: str = ""
+    device: Device = AUTO
+    devices: int = 1
     skip_bad: bool = False
     rerun: bool = False
     replace: bool = False
@@ -72,6 +75,7 @@ def call(
         role=how.role,
         jobs=how.jobs,
         executor=how.executor,
+        compute=Compute(how.device, how.devices),
         skip_bad=how.skip_bad,
         rerun=how.rerun,
         replace=how.replace,
@@ -98,8 +102,9 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         "extend": "Roles" in kinds,
     }
     given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
-    given["track"] = bool(how.track)
+    given |= {"track": bool(how.track), "device": how.device != AUTO, "devices": how.devices != 1}
     reads |= {"fold": reads["split"], "role": stage.reads_model, "track": stage.tracked}
+    reads |= {"device": stage.trains, "devices": stage.trains}
     for key in given:
         if given[key] and not reads[key]:
             raise UsageError(f"The stage {name} does not read {key}; leave it out.")

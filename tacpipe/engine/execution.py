@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,7 +16,8 @@ from typing import Any
 from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest, shard_path
-from tacpipe.engine import provenance
+from tacpipe.engine import provenance, rank_processes
+from tacpipe.engine.rank_processes import Crew
 from tacpipe.engine.shared import SharedFiles
 from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
 from tacpipe.io import memory
@@ -26,7 +28,10 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Object, Store
-from tacpipe.training import display, following
+from tacpipe.training import devices, display, following
+from tacpipe.training.devices import Compute
+
+ALONE = "no network was trained, so one process computed it, whatever --devices is"
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,18 @@ class Task:
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
     rerun: bool = False  # compute although a result is stored
+    compute: Compute = field(default_factory=Compute)  # what networks are trained on
     run: str = ""  # the lease of the run that it is part of
+
+    def to_text(self) -> str:
+        """Return what `task_of` reads."""
+        return json.dumps(asdict(self))
+
+
+def task_of(text: str) -> Task:
+    """Return the task that `Task.to_text` wrote."""
+    given = json.loads(text)
+    return Task(**{**given, "beside": tuple(given["beside"]), "compute": Compute(**given["compute"])})
 
 
 @dataclass(frozen=True)
@@ -61,24 +77,8 @@ def compute(task: Task) -> Done:
     """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
     store, key = Store(task.store, task.run), digest(task.identity)
     try:
-        if task.dry:
-            result, _ = execute(task, store, _Scratch())
-            return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
-        with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
-            record = store.record(key)
-            if record is not None and not task.rerun and records.complete(store, record):
-                return Done(task.recording, record, made=False)
-            started = time.perf_counter()
-            replace = task.replace or record is not None
-            result, notes = execute(task, store, store)
-            stage = stage_of(task.name)
-            made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
-            made |= {"code": provenance.code(stage), "notes": notes}
-            if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
-                store.put(_manifest_of(task, stage, result).content, durable=True)
-            record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
-            shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
-            return Done(task.recording, record)
+        with devices.given(task.compute), rank_processes.available(task.to_text(), task.compute) as crew:
+            return _computed(task, store, key, crew)
     except TacpipeError as error:
         with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
             (store.root / "checkpoints" / key).rmdir()
@@ -88,23 +88,53 @@ def compute(task: Task) -> Done:
         store.close()
 
 
-class _Scratch:
+def _computed(task: Task, store: Store, key: str, crew: Crew | None) -> Done:
+    if task.dry:
+        result, _ = execute(task, store, Scratch())
+        return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
+    with store.leases.hold(key, f"{task.name} {task.recording}".strip()):
+        record = store.record(key)
+        if record is not None and not task.rerun and records.complete(store, record):
+            return Done(task.recording, record, made=False)
+        started = time.perf_counter()
+        replace = task.replace or record is not None
+        result, notes = execute(task, store, store)
+        stage = stage_of(task.name)
+        made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+        made |= {"code": provenance.code(stage), "notes": notes}
+        if crew is not None:
+            made |= {"devices": task.compute.devices} if crew.started else {"notes": [*notes, ALONE]}
+        if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
+            store.put(_manifest_of(task, stage, result).content, durable=True)
+        record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
+        shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
+        return Done(task.recording, record)
+
+
+class Scratch:
     """Takes content as a store does, and keeps only its name."""
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
+        """Return name and size of the content."""
         return Object(bytes_digest(content), len(content))
 
     def put_written(self, write: Callable[[Any], object], *, durable: bool = False) -> Object:
+        """Return name and size of what is written."""
         hashed = Hashed()
         write(hashed)
         return Object(hashed.digest, hashed.bytes)
 
 
-def execute(task: Task, store: Store, sink: Store | _Scratch) -> tuple[dict[str, Any], list[str]]:
-    """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes."""
+def execute(
+    task: Task, store: Store, sink: Store | Scratch, *, followed: bool = True
+) -> tuple[dict[str, Any], list[str]]:
+    """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes.
+
+    What it trains is ``followed`` by whoever looks, or by no one.
+    """
     stage, stage_name = stage_of(task.name), registry.whole(task.name)
     params = params_of.from_json(stage, task.identity["params"])
-    with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments):
+    with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments if followed else {}):
         try:
             with memory.raising_shortage(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
                 returned = _result(task.name, stage, stage(params, **arguments))
@@ -122,7 +152,7 @@ def _result(name: str, stage: AnyStage, returned: Any) -> Result:
     return Result(recordings={"": _recording(name, returned)}) if stage.mapped else _files(name, returned)
 
 
-def _stored(returned: Result, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
+def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[str, Any]:
     recordings = {
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
@@ -350,12 +380,12 @@ def _files(name: str, returned: Any) -> Result:
     raise TacpipeError(f"Stage {name} returned a {type(returned).__name__}; it should be a Result or files by name.")
 
 
-def _entry(recording: RecordingOutput, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
+def _entry(recording: RecordingOutput, sink: Store | Scratch, *, durable: bool) -> dict[str, Any]:
     shards = {stream: _shard(table, sink, durable=durable) for stream, table in sorted(recording.streams.items())}
     return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
 
 
-def _shard(table: Any, sink: Store | _Scratch, *, durable: bool) -> dict[str, Any]:
+def _shard(table: Any, sink: Store | Scratch, *, durable: bool) -> dict[str, Any]:
     """Store a table, or batches as they come, as a shard."""
     from tacpipe.io import parquet
 

@@ -317,6 +317,7 @@ class _Run:
             replace=record is not None,
             dry=self.request.compare,
             rerun=self.request.rerun,
+            compute=self.request.compute,
             run=self.store.run,
         )
         (done,) = self.chosen.opened().run(execution.compute, [task], [])

@@ -14,6 +14,7 @@ from typing import Any
 from tacpipe.engine import processor
 from tacpipe.io.hashing import remembered_file_digest
 from tacpipe.plugins.stage import AnyStage
+from tacpipe.training import devices
 
 _worker: ContextVar[str] = ContextVar("worker", default="")
 _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
@@ -45,9 +46,7 @@ def _here() -> dict[str, Any]:
 
 def of(seconds: float) -> dict[str, Any]:
     """Return libraries, git commit, host, device, processor and worker of this process, and the ``seconds`` of something."""
-    torch = sys.modules.get("torch")
-    device = "cuda" if torch is not None and torch.cuda.is_available() else "cpu"
-    made = {**_here(), "device": device, "processor": processor.here(), "seconds": seconds}
+    made = {**_here(), "device": devices.kind(), "processor": processor.here(), "seconds": seconds}
     return {**made, "worker": _worker.get()} if _worker.get() else made
 
 
@@ -68,7 +67,7 @@ def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     ['threads: 1, now 2']
     """
     found = []
-    for name in ("device", "processor", "libraries"):
+    for name in ("device", "devices", "processor", "libraries"):
         before, after = stored.get(name), now.get(name)
         if isinstance(before, Mapping) and isinstance(after, Mapping):
             there = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]

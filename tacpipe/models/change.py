@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from tacpipe.models.batch import Dropout, Rows
 from tacpipe.models.windows import Windows, held, motion
 
 MOTION, UP = 15, 3
@@ -24,6 +25,8 @@ class ChangeForecast(nn.Module):
     ``increments`` means that features are changes from row to row already; then the change itself is predicted.
     """
 
+    ROWS = Rows(given=1, returned=(1,))
+    DROPPED = 0  # dimension of the windows in what dropout is given
     change_only = True
     change_scale: Tensor
     touch_mean: Tensor
@@ -38,7 +41,7 @@ class ChangeForecast(nn.Module):
         super().__init__()
         self.features, self.context, self.horizon = features, context, horizon
         self.kind, self.increments = loss, increments
-        self.drop = nn.Dropout(dropout)
+        self.drop = Dropout(dropout, rows=self.DROPPED)
         self.register_buffer("change_scale", torch.ones(()))
         self.register_buffer("touch_mean", torch.zeros(features))
         self.register_buffer("touch_scale", torch.ones(features))
@@ -81,6 +84,8 @@ class SequenceForecast(ChangeForecast):
     convolutions over both (Bai, Kolter and Koltun, 2018), touch being zero where it is to come. Each step's prediction
     rests on the plan up to that step.
     """
+
+    DROPPED = 1
 
     def __init__(self, features: int, *, cell: str, hidden: int, **shared: object) -> None:
         """Make a model of random weights that begins at persistence."""

@@ -40,12 +40,15 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
 
     The state before the first step is zero where none is given. ``lead`` adds inputs that exist in the first step only.
     """
-    if inputs.is_cuda or not torch.is_grad_enabled():
+    if inputs.device.type != "cpu" or not torch.is_grad_enabled():
         return _of_torch(inputs, state, weights, lead)
     first = None if lead is None else lead[0] @ lead[1].t()
     hidden, cell = (None, None) if state is None else state
     from_input, from_state, bias = weights
-    states, last_hidden, last_cell = _Layer.apply(inputs, first, hidden, cell, from_input, from_state, bias)  # type: ignore[no-untyped-call]
+    given = (inputs, first, hidden, cell, from_input, from_state, bias)
+    with torch.autocast("cpu", enabled=False):  # its products go to memory that is made before
+        whole = (one if one is None else one.to(from_state.dtype) for one in given)
+        states, last_hidden, last_cell = _Layer.apply(*whole)  # type: ignore[no-untyped-call]
     return states, (last_hidden, last_cell)
 
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from tacpipe.models.batch import Dropout, Rows
+
 BACKBONES = ("points", "edges")
 NEIGHBOURS = 12
 WIDTHS = (64, 128, 256)
@@ -20,6 +22,8 @@ WIDTHS = (64, 128, 256)
 
 class PatchNetwork(nn.Module):
     """From patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number) to touch (cloud, value)."""
+
+    ROWS = Rows(given=0, returned=(0,))
 
     def __init__(
         self, channels: int, numbers: int, outputs: int, *, backbone: str, hidden: int, dropout: float
@@ -32,10 +36,10 @@ class PatchNetwork(nn.Module):
             nn.Linear(3 * 2 * WIDTHS[-1] + numbers, hidden),
             nn.LayerNorm(hidden),
             nn.ReLU(),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(hidden, hidden // 2),
             nn.ReLU(),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(hidden // 2, outputs),
         )
 

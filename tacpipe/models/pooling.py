@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from tacpipe.models import batch
+
 EPSILON = 1e-5  # added to a variance, as in torch
 MOMENTUM = 0.1  # weight of a batch in the running mean and variance, as in torch
 
@@ -39,7 +41,8 @@ class NormalisedLinear(nn.Module):
     def affine(self, given: Tensor) -> tuple[Tensor, Tensor]:
         """Return weight (output, input) and bias (output,) of the layer for these inputs (…, input)."""
         if self.training:
-            mean, variance = self._moments(given.reshape(-1, given.shape[-1]))
+            with torch.autocast(given.device.type, enabled=False):  # small differences of sums over many points
+                mean, variance = self._moments(given.reshape(-1, given.shape[-1]).to(self.weight.dtype))
         else:
             mean, variance = self.mean, self.variance
         gain = self.scale * torch.rsqrt(variance + EPSILON)
@@ -51,13 +54,13 @@ class NormalisedLinear(nn.Module):
 
     def _moments(self, given: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance (output,) over rows (row, input), and let the running ones follow."""
-        centre = given.mean(dim=0)
+        centre, rows = batch.mean(given), batch.count(len(given))
         centred = given - centre
-        covariance = centred.T @ centred / len(given)  # (input, input)
+        covariance = batch.total(centred.T @ centred) / rows  # (input, input)
         mean = self.weight @ centre
         variance = ((self.weight @ covariance) * self.weight).sum(dim=1).clamp_min(0)
         with torch.no_grad():
-            unbiased = variance * (len(given) / max(len(given) - 1, 1))
+            unbiased = variance * (rows / max(rows - 1, 1))
             self.mean.lerp_(mean, MOMENTUM)
             self.variance.lerp_(unbiased, MOMENTUM)
         return mean, variance
@@ -106,5 +109,7 @@ def _largest_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 def largest(layer: NormalisedLinear, points: Tensor) -> Tensor:
     """Return the largest value over points (cloud, output) of the layer on clouds (cloud, point, input)."""
-    found: Tensor = LargestOverPoints.apply(points, *layer.affine(points))  # type: ignore[no-untyped-call]
+    weight, bias = layer.affine(points)
+    with torch.autocast(points.device.type, enabled=False):
+        found: Tensor = LargestOverPoints.apply(points.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
     return found

@@ -188,8 +188,12 @@ class Stage(Generic[P, R]):
     @property
     def tracked(self) -> bool:
         """Whether trackers can follow the stage: it trains in a workspace, or its result has headlines."""
-        trains = any(one is not None and one.argument("Workspace") is not None for one in (self, self.fit))
-        return trains or self.headline is not None
+        return self.trains or self.headline is not None
+
+    @property
+    def trains(self) -> bool:
+        """Whether the stage, or its fit, trains networks: it has a workspace for their checkpoints."""
+        return any(one is not None and one.argument("Workspace") is not None for one in (self, self.fit))
 
 
 AnyStage: TypeAlias = Stage[..., Any]

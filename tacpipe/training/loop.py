@@ -3,11 +3,13 @@
 What is learned comes as `Work`: its batches, its loss, and what is watched after each epoch. Batches are rows of tensors
 picked by index, so no loader stands between the data and the step. All randomness (first weights, dropout, shuffles)
 comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and resumed
-gives the same bits as one that was not, on a CPU; a GPU adds in another order each time.
+gives the same bits as one that was not, on a CPU; a GPU adds in another order each time. Several
+processes may share each batch (`tacpipe.training.ranks`): all run this loop, draw alike and take the same steps.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import math
@@ -21,9 +23,10 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.tensors import under
-from tacpipe.training import checkpoint, following
+from tacpipe.training import checkpoint, following, ranks
 from tacpipe.training.following import Followers, Network
 from tacpipe.training.following import Line as Line
+from tacpipe.training.ranks import Alone
 from tacpipe.training.schedule import Schedule as Schedule
 
 Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
@@ -84,7 +87,7 @@ class Windows:
         """Return the mean loss over all validation windows."""
         total: Tensor | float = 0.0
         for indices in _pieces(torch.arange(self.validation.count), self.batch):
-            total = total + self.validation.loss(model, indices).double() * len(indices)
+            total = total + precise(self.validation.loss(model, indices)) * len(indices)
         return {"val_loss": float(total) / self.validation.count}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
@@ -114,8 +117,11 @@ class _Run:
     optimiser: torch.optim.Adam
     best: dict[str, Tensor]
     history: list[Line]
+    rank: Alone
 
     def save(self, folder: Path) -> None:
+        if self.rank.rank:
+            return
         slots = self.optimiser.state_dict()["state"]
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
@@ -124,7 +130,7 @@ class _Run:
         checkpoint.write(folder, tensors, {"history": self.history})
 
     def resume(self, folder: Path) -> None:
-        found = checkpoint.read(folder)
+        found = self.rank.agreed(lambda: checkpoint.read(folder))
         if found is None:
             return
         tensors, state = found
@@ -165,12 +171,15 @@ def train(
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(schedule.seed)
+        rank = ranks.current()
         model = build()
         learned = [weight for weight in model.parameters() if weight.requires_grad]
         optimiser = torch.optim.Adam(learned, lr=schedule.learning_rate, weight_decay=weight_decay, fused=True)
-        run = _Run(model, optimiser, {}, [])
+        run = _Run(model, optimiser, {}, [], rank)
         run.resume(workspace)
-        _follow(run, work, schedule, workspace, Network(schedule.epochs, number, count, labels or {}))
+        model.load_state_dict(rank.agreed(lambda: {name: value.cpu() for name, value in model.state_dict().items()}))
+        with rank.sharing(model):
+            _follow(run, work, schedule, workspace, Network(schedule.epochs, number, count, labels or {}))
     return Trained(
         {name: value.cpu() for name, value in run.best.items()},
         run.history,
@@ -196,25 +205,29 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
     """Train for one epoch, add its line to the history and return it."""
     run.model.train()
     epoch = len(run.history)
+    torch.set_rng_state(run.rank.agreed(torch.get_rng_state))
     total: Tensor | float = 0.0
     count = 0
     batches = work.batches(epoch)
+    reduced = _reduced(run.model, schedule)
     for step, batch in enumerate(batches):
         for group in run.optimiser.param_groups:
             group["lr"] = schedule.rate((epoch + step / len(batches)) / schedule.epochs)
-        loss, weight = work.loss(run.model, batch, epoch)
+        with reduced:
+            loss, weight = work.loss(run.model, batch, epoch)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        run.rank.sum_gradients(run.model.parameters())
         if math.isfinite(schedule.gradient_clip):
             nn.utils.clip_grad_norm_(run.model.parameters(), schedule.gradient_clip)
         run.optimiser.step()
-        total = total + loss.detach().double() * weight
+        total = total + precise(loss) * weight
         count += weight
         followers.batch((step + 1) / len(batches), functools.partial(_mean, total, count))
     run.model.eval()
     with torch.no_grad():
         watched = work.watch(run.model)
-    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched}
+    line: Line = run.rank.agreed(lambda: {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched})
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."
@@ -226,6 +239,17 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
         run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(better))}
     run.history.append(line)
     return line
+
+
+def _reduced(model: nn.Module, schedule: Schedule) -> contextlib.AbstractContextManager[Any]:
+    """Return what has products in its block computed in the precision of the schedule."""
+    device = next(model.parameters()).device.type
+    return torch.autocast(device, torch.bfloat16, enabled=schedule.precision == "bfloat16")
+
+
+def precise(value: Tensor) -> Tensor:
+    """Return a value in float64 to add it up, without waiting for the device; in float32 where that has no float64."""
+    return value.detach().to(torch.float32 if value.device.type == "mps" else torch.float64)
 
 
 def _mean(total: Tensor | float, count: int) -> float:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from tacpipe.errors import TacpipeError
+from tacpipe.training.devices import Precision
 
 RISE = 0.3  # fraction of all epochs over which the learning rate of a cycle rises
 
@@ -34,6 +35,8 @@ class Schedule:
     gradient_clip: float  # largest norm of the gradient
     seed: int
     cycle: bool = False  # whether the rate rises over the first part of all epochs and falls over the rest
+    # bfloat16: of products in forward and backward passes; weights, their sums and what is validated stay in float32
+    precision: Precision = "float32"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained with."""

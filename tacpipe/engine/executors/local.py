@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tacpipe.engine.executors import chunks
 from tacpipe.engine.processor import usable_cores
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import memory, termination
+from tacpipe.io import memory, processes, termination
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -118,16 +117,8 @@ def _start_server() -> None:
 
 
 def _work(tasks: Connection, alive: Connection) -> None:
-    """Compute what comes over ``tasks`` for as long as the process at the other end of ``alive`` lives.
-
-    The kernel reports its end by a signal that ends this process too, in the middle of a long call in C as well.
-    """
-    import fcntl
-    import signal
-
-    signal.signal(signal.SIGIO, signal.SIG_DFL)
-    fcntl.fcntl(alive.fileno(), fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(alive.fileno(), fcntl.F_SETFL, os.O_ASYNC)
+    """Compute what comes over ``tasks`` for as long as the process at the other end of ``alive`` lives."""
+    processes.end_with(alive.fileno())
     while True:
         try:
             compute, chunk = tasks.recv()

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
+from tacpipe.training.devices import Precision
 
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -34,12 +35,14 @@ class Forward:
     context: PositiveInt = 10  # past rows that the model reads
     horizon: PositiveInt = 10  # future rows that it predicts
     baselines: bool = True  # fit the linear baselines too, for evaluate to compare with
+    # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
+    precision: Precision = added("float32")
     arm: str = added("")  # stream whose position and orientation are the motion; empty: the only one with a position
     PANELS: ClassVar[Panels] = {
         "Model": ("architecture", "actions", "hidden", "dropout", "context", "horizon"),
         "Training": (
             *("loss", "epochs", "batch", "learning_rate", "cycle", "patience", "gradient_clip"),
-            *("seed", "baselines"),
+            *("precision", "seed", "baselines"),
         ),
         "Data": ("windows", "stride", "arm"),
     }

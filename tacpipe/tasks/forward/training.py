@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
-import torch
 from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
 from torch import nn
@@ -41,7 +40,7 @@ from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, rows
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.seen import seen
-from tacpipe.training import loop, scaling
+from tacpipe.training import devices, loop, scaling
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -84,7 +83,7 @@ def train(
     rate_hz = tracks.rate_hz([one for part in parts for one in part])
     reference = start.orientation if start else _reference([one.arm[one.usable, 3:7] for one in parts[0]])
     parts = [[dataclasses.replace(one, arm=tracks.aligned(one.arm, reference)) for one in part] for part in parts]
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = devices.kind()
     known, watched = (
         _windows(part, params, stride, device) for part, stride in zip(parts, (params.stride, 1), strict=True)
     )
@@ -106,6 +105,7 @@ def train(
         gradient_clip=params.gradient_clip,
         seed=params.seed,
         cycle=params.cycle,
+        precision=params.precision,
     )
     trained = loop.train(build, loop.Windows(known.part, watched.part, schedule.batch), schedule, workspace)
     best = min(trained.history, key=lambda line: line["val_loss"])

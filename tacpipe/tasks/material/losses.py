@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.recurrent_autoencoder import NetworkOutput, RecurrentAutoencoder, RecurrentClassifier
 from tacpipe.tasks.material.pairs import NONE, Pairs
-from tacpipe.training.loop import Line
+from tacpipe.training.loop import Line, precise
 
 Network = RecurrentAutoencoder | RecurrentClassifier
 TEMPERATURE = 0.1  # of contrast: the published one
@@ -58,7 +58,7 @@ class _Sums:
     counts: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, mean: Tensor, count: int) -> None:
-        self.values[name] = self.values.get(name, 0.0) + mean.detach().double() * count
+        self.values[name] = self.values.get(name, 0.0) + precise(mean) * count
         self.counts[name] = self.counts.get(name, 0) + count
 
     def mean(self, name: str) -> float | None:

@@ -20,6 +20,7 @@ from tacpipe.plugins.constraints import (
     StoredAs,
 )
 from tacpipe.plugins.params import added
+from tacpipe.training.devices import Precision
 
 KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
@@ -52,7 +53,7 @@ class Material:
         "Training": (
             *("reconstruction_weight", "classification_weight", "alignment_weight", "alignment_loss", "align_from"),
             *("epochs", "batch", "learning_rate", "cycle", "patience", "shuffle", "drop_last", "select"),
-            *("seed", "baselines"),
+            *("precision", "seed", "baselines"),
         ),
         "Data": (
             *("label", "sensors", "quantities", "labels", "hold_out", "speeds", "use_validation", "pairing"),
@@ -108,6 +109,8 @@ class Network(Material):
     drop_last: bool = False  # leave out the batch that is not full, in evaluation too, as the published code does
     # weights to keep: best, of the highest validation accuracy; last, of the last epoch
     select: Literal["best", "last"] = "best"
+    # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
+    precision: Precision = added("float32")
 
     def check(self) -> None:
         """Refuse a subsampled sensor whose batches are shuffled, and a percentage without a sensor."""

@@ -41,7 +41,7 @@ from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
 from tacpipe.tasks.material.params import XLSTM, Minirocket, Params, Raec, Spectra
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.seen import seen
-from tacpipe.training import loop
+from tacpipe.training import devices, loop
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def _networks(
             f"No recording of {missing[0]} has the role val, and a network is chosen by its validation slides. "
             f"Make a split that has some of every sensor."
         )
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = devices.kind()
     start = Classifier.load(init) if init else None
     joint = isinstance(params, Raec) and params.joint and len(known) > 1
     mapped_to = _frozen(params)
@@ -235,6 +235,7 @@ def _schedule(params: NetworkParams) -> loop.Schedule:
         gradient_clip=math.inf,
         seed=params.seed,
         cycle=params.cycle,
+        precision=params.precision,
     )
 
 

@@ -17,6 +17,8 @@ from tacpipe.plugins.constraints import (
     StoredAs,
     Unit,
 )
+from tacpipe.plugins.params import added
+from tacpipe.training.devices import Precision
 
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -43,7 +45,7 @@ class Touch:
         ),
         "Training": (
             *("loss", "epochs", "batch", "learning_rate", "cycle", "weight_decay", "patience", "select"),
-            *("rotation_deg", "seed", "baselines"),
+            *("rotation_deg", "precision", "seed", "baselines"),
         ),
         "Data": ("targets", "use_validation", "run_label"),
     }
@@ -83,6 +85,8 @@ class PointNetwork(Touch):
     patience: NonNegativeInt = 0  # epochs without a lower validation loss after which training ends; 0: all epochs
     # weights to keep: last, of the last epoch; best, of the lowest validation loss
     select: Literal["last", "best"] = "last"
+    # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
+    precision: Precision = added("float32")
 
 
 @dataclass(frozen=True)

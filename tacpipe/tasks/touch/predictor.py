@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
@@ -24,6 +23,7 @@ from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.params import Params, Trees
+from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
 Config = dict[str, Any]
@@ -72,7 +72,7 @@ class Predictor:
         config = model_files.tree(files, CONFIG, NEEDED)
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = devices.kind()
         with model_files.validated("the model"):
             found = [
                 _member(params, about, under(f"{number}.", tensors), device)

@@ -31,7 +31,7 @@ from tacpipe.tasks.touch.members import NetworkParams
 from tacpipe.tasks.touch.params import Params, Trees
 from tacpipe.tasks.touch.patches import require_colours
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
-from tacpipe.training import loop
+from tacpipe.training import devices, loop
 from tacpipe.training.scaling import Affine
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _learn(
             "No recording has the role val, and select best and patience choose a network's epoch by these. Make a split "
             "with some, or train with --select last --patience 0."
         )
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = devices.kind()
     learned = (members.sources(params, known), known)
     followed = (members.sources(params, watched), watched) if watched else learned  # without any, what was learned
     parameters = 0
@@ -240,4 +240,5 @@ def _schedule(params: NetworkParams, seed: int) -> loop.Schedule:
         gradient_clip=math.inf,
         seed=seed,
         cycle=params.cycle,
+        precision=params.precision,
     )

@@ -1,0 +1,120 @@
+"""How long a grid of trainings takes, estimated before it begins: batches of the first missing one are timed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from tacpipe.engine import pipeline
+from tacpipe.engine.processor import threads, usable_cores
+from tacpipe.engine.request import Inputs, Request
+from tacpipe.errors import TacpipeError
+from tacpipe.io import progress
+from tacpipe.io.hashing import digest
+from tacpipe.store.store import locate
+from tacpipe.training import display, following
+from tacpipe.training.following import Line, Network
+
+TIMED_S = 3.0  # of batches, behind the first one, which is slower
+_HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a grid takes at most, if each model takes as long as the first and no patience ends it."""
+
+    models: int  # that are missing
+    at_once: int
+    each_s: float  # alone
+    hours: float  # of all
+
+    def __str__(self) -> str:
+        """Return it as a sentence."""
+        noun = "model" if self.models == 1 else "models"
+        return (
+            f"estimate: {self.models} {noun} to train, {self.at_once} at a time, at most "
+            f"{display.duration(self.each_s)} each alone, {self.hours:.2g} h in all; timed on batches of the first, here and now."
+        )
+
+
+def of(requests: Sequence[Request], jobs: int) -> Estimate | None:
+    """Return how long the missing ones of several trainings take, ``jobs`` at a time; None where it cannot be known.
+
+    That is where nothing is missing, where no network is trained, and where the first one fails.
+    """
+    with progress.shown(False):
+        try:
+            missing = [one for one in requests if _is_missing(one)]
+            each_s = _timed(missing[0]) if missing else None
+        except TacpipeError:  # the grid reports it
+            return None
+    if each_s is None:
+        return None
+    at_once = min(jobs or usable_cores(), len(missing))
+    hours = total_s(each_s, len(missing), at_once, threads(), usable_cores()) / _HOUR_S
+    return Estimate(len(missing), at_once, each_s, hours)
+
+
+def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) -> float:
+    """Return how long ``models`` take that take ``each_s`` alone with so many threads, where these share the cores.
+
+    >>> total_s(60, 5, 1, 2, 2), total_s(60, 4, 2, 1, 2), total_s(60, 4, 2, 2, 2)
+    (300.0, 120.0, 240.0)
+    """
+    rounds = -(-models // at_once)
+    return float(each_s * rounds * max(1.0, at_once * threads / cores))
+
+
+def _is_missing(request: Request) -> bool:
+    """Return whether the store has no answer to a request."""
+    store = locate()
+    return request.rerun or store.record(digest(Inputs(request, store).identity())) is None
+
+
+def _timed(request: Request) -> float | None:
+    stopwatch = _Stopwatch()
+    try:
+        with following.tracked([stopwatch]):
+            pipeline.run(replace(request, executor="local", track=()))
+    except _TimedError:
+        return stopwatch.all_s
+    return None  # it is made already, and trained no network
+
+
+class _TimedError(Exception):
+    """Enough batches were timed; nothing is wrong."""
+
+
+class _Stopwatch:
+    """Times batches of the first network, and ends its training."""
+
+    def __init__(self) -> None:
+        self.all_s = 0.0  # of reading and of all epochs of all networks that are left
+        self._started_s = self._begun_s = time.monotonic()
+        self._first: tuple[float, float] | None = None  # time and fraction of the epoch after the first batch
+        self._network, self._done = Network(1), 0
+
+    def begin(self, network: Network, history: Sequence[Line]) -> None:
+        self._begun_s = time.monotonic()
+        self._network, self._done = network, len(history)
+
+    def batch(self, passed: float, loss: Callable[[], float]) -> None:
+        loss()  # waits for the device
+        now_s = time.monotonic()
+        if self._first is None and passed < 1:
+            self._first = now_s, passed
+            return
+        since_s, before = self._first or (self._begun_s, 0.0)
+        if passed < 1 and now_s - since_s < TIMED_S:
+            return
+        epoch_s = (now_s - since_s) / (passed - before)
+        left = self._network.epochs - self._done + self._network.epochs * (self._network.count - self._network.number)
+        self.all_s = self._begun_s - self._started_s + epoch_s * left
+        raise _TimedError
+
+    def line(self, line: Line, learning_rate: float) -> None:
+        pass
+
+    def end(self, *, trained: bool) -> None:
+        pass
