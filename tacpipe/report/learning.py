@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -29,3 +30,12 @@ def by_epoch(
         mean = np.mean([curve[:length] for curve in curves], axis=0)
         several.append(Line(name, range(1, length + 1), mean))
     return charts.lines(several, "epoch", quantity, order=order, log=log, points=False)
+
+
+def stated(values: Sequence[float | None]) -> list[float]:
+    """Return one value an epoch, NaN where an epoch states none; empty where no epoch states any.
+
+    >>> stated([None, 1]), stated([None, None])
+    ([nan, 1.0], [])
+    """
+    return [] if all(one is None for one in values) else [math.nan if one is None else float(one) for one in values]

@@ -15,7 +15,7 @@ from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.metrics import pairing
 from tacpipe.metrics.forecast import Interval
-from tacpipe.report import blocks, charts, contents
+from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
@@ -113,15 +113,15 @@ def caveats(context: Context) -> list[str]:
         f"In the first run, {effective[0]}." if effective else "",
         both if any(len(one) > 1 for one in known.values()) else "",
         "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it perfectly."
-        if any(by_method.actions(run.config) == "planned" for run in runs)
+        if any(run.actions == "planned" for run in runs)
         else "",
-        "; ".join(f"{name}: {single_run.EXPLAINED[name]}" for name in _predictors(context)) + ".",
+        "; ".join(f"{single_run.spelled(name)}: {single_run.EXPLAINED[name]}" for name in _predictors(context)) + ".",
     ]  # fmt: skip
 
 
 def about_run(run: Run) -> dict[str, Cell | str]:
     """Return more columns of the table of runs."""
-    epochs = len(contents.history(run.dataset))
+    epochs = len(run.details.history)
     return {"epochs": str(epochs) if epochs else NONE}
 
 
@@ -259,7 +259,7 @@ def _anticipation(context: Context) -> list[Fold]:
     source = max(context.methods, key=lambda one: len(one.runs))
     described = [(one.name, anticipation(one, MODEL)) for one in context.methods]
     names = {name for run in source.runs for name in run.details.metrics.get("anticipation", {})} - {MODEL}
-    described += [(name, anticipation(source, name)) for name in sorted(names)]
+    described += [(single_run.spelled(name), anticipation(source, name)) for name in sorted(names)]
     measures = ("median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
     rows: list[Sequence[str | Cell]] = [
         [name, f"{found['events']:,.0f}", number(100 * found["recall"]), *(number(found[key]) for key in measures)]
@@ -355,7 +355,7 @@ def _training(context: Context) -> list[Fold]:
     """Return training and validation loss by epoch of the representative runs."""
     drawn = []
     for method, run in _representatives(context):
-        history = contents.history(run.dataset)
+        history = run.details.history
         if not history:
             continue
         best = min(history, key=lambda line: line["val_loss"])
@@ -457,5 +457,5 @@ def _families(methods: Sequence[Method], what: str) -> list[list[Method]]:
     """Return the methods that differ in one setting alone, where there are several such."""
     found: dict[str, list[Method]] = {}
     for method in methods:
-        found.setdefault(by_method.key_without(method, what), []).append(method)
+        found.setdefault(method.key_without(what), []).append(method)
     return [family for family in found.values() if len(family) > 1]

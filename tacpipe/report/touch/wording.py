@@ -6,10 +6,11 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
+from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.touch import printed
-from tacpipe.report.touch.methods import PAPERS, Method, Run
+from tacpipe.report.touch.methods import PAPERS, Result
 from tacpipe.report.touch.scores import Score
 from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
@@ -38,18 +39,9 @@ def caution(methods: Sequence[Method]) -> str:
     """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
     if methods and all(one.simulated for one in methods):
         return SIMULATED
-    found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.runs]
+    found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.details]
     same, every = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
     return RECORDED.format(same=f"{same:,}", all=f"{every:,}") if every and same / every >= IN_A_ROW else ""
-
-
-def form(what: str, text: str, published: bool) -> str:
-    """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
-
-    >>> form("Table II", "number of points", True), form("Table II", "number of points", False)
-    ("Table II in the paper's form: number of points", 'Number of points')
-    """
-    return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
 
 
 def baseline(predictor: str) -> str:
@@ -110,7 +102,7 @@ def place(described: str, simulated: bool) -> str:
     return f"{name}, simulated" if simulated and "simulated" not in name else name
 
 
-def schedule(run: Run) -> str:
+def schedule(run: Result) -> str:
     """Return how a run was trained, and whether that is the paper's way."""
     if not run.history:
         return "fitted without epochs"
@@ -126,7 +118,7 @@ def schedule(run: Run) -> str:
 
 def basis(methods: Sequence[Method]) -> str:
     """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
-    runs = [run for one in methods for run in one.runs]
+    runs = [run for one in methods for run in one.details]
     described = [
         f"{count} run{'s' if count > 1 else ''}: {one}"
         for one, count in Counter(schedule(run) for run in runs).most_common()
