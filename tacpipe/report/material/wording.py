@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from tacpipe.comparison.runs import Method
+from tacpipe.report import provenance
 from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.material.accuracy import Accuracy
 
@@ -13,13 +14,12 @@ SESSIONS = (
     "Each material was recorded in one session, so texture cannot be distinguished from session in these data: a model that "
     "recognises a session by its drift or its mean level is right as well."
 )
-SIMULATED = "These slides were simulated: nothing here is evidence about a real sensor."
 
 
 def caution(methods: Sequence[Method]) -> str:
     """Return what these slides cannot show, next to every table of accuracies; empty where nothing is known against them."""
     if any(one.simulated for one in methods):
-        return SIMULATED
+        return provenance.SIMULATED
     held = [result.predictions for one in methods for result in one.details]
     return SESSIONS if held and all(one.one_session_each for one in held) else ""
 

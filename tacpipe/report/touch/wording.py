@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from tacpipe.comparison.runs import Method
-from tacpipe.report import blocks
+from tacpipe.report import blocks, provenance
 from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.touch import printed
 from tacpipe.report.touch.methods import PAPERS, Result
@@ -27,7 +27,6 @@ BASELINES = {  # rows that every table has
     NEAREST_IN_TIME: "mean of the nearest in time",
 }
 OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
-SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor."
 RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
     "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
@@ -38,7 +37,7 @@ IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by
 def caution(methods: Sequence[Method]) -> str:
     """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
     if methods and all(one.simulated for one in methods):
-        return SIMULATED
+        return provenance.SIMULATED
     found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.details]
     same, every = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
     return RECORDED.format(same=f"{same:,}", all=f"{every:,}") if every and same / every >= IN_A_ROW else ""
