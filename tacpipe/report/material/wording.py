@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from tacpipe.comparison.runs import Method
 from tacpipe.report import provenance
-from tacpipe.report.blocks import NONE, Cell
+from tacpipe.report.blocks import NONE, Cell, fixed
 from tacpipe.report.material.accuracy import Accuracy
 
 SESSIONS = (
@@ -30,7 +30,7 @@ def percent(fraction: float) -> str:
     >>> percent(0.995), percent(float("nan"))
     ('99.5', '–')
     """
-    return NONE if math.isnan(fraction) else f"{100 * fraction:.1f}"
+    return fixed(100 * fraction, 1)
 
 
 def fraction(found: Accuracy | None) -> Cell:

@@ -12,6 +12,7 @@ from tacpipe.report.blocks import Chart
 from tacpipe.report.contents import Tree
 from tacpipe.report.touch import forms, wording
 from tacpipe.report.touch.methods import PAPERS, main
+from tacpipe.tasks.touch import headline as headlines
 
 ALL = "all"  # stands where one network predicts all targets
 UNWATCHED = (
@@ -25,7 +26,7 @@ def charts_of(methods: Sequence[Method]) -> list[Chart]:
     for target in (*biotac_sp.TARGETS, ALL):
         curves = {one.name: found for one in shown if (found := _curves(one, target, "val_loss"))}
         if curves:
-            name = wording.TARGETS.get(target, "one network for all targets")
+            name = headlines.TARGETS.get(target, "one network for all targets")
             spec = learning.by_epoch(curves, "validation loss", log=True)
             caption = "Each method's own loss. Thick: mean over runs; thin: single runs."
             drawn.append(Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched(shown)}"))
@@ -46,7 +47,7 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
     named = {"training": "train_loss", "validation": "val_loss"}
     curves = {name: described for name, loss in named.items() if (described := _curves(method, target, loss))}
     quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
-    text = f"training and validation loss by epoch, {method.name}, {wording.TARGETS.get(target, 'all targets')}"
+    text = f"training and validation loss by epoch, {method.name}, {headlines.TARGETS.get(target, 'all targets')}"
     printed = " The paper's figure has 1,000 epochs." if method.published else ""
     caption = f"{wording.basis([method])}{printed}{_unwatched([method])}{' Simulated.' if method.simulated else ''}"
     return [

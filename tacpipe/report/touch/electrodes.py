@@ -16,6 +16,7 @@ from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
 from tacpipe.report.touch import scores, tables, wording
 from tacpipe.report.touch.methods import targets
 from tacpipe.report.touch.predictions import Predictions
+from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 FINGERS = ("e_th", "e_mf")
@@ -77,7 +78,7 @@ def _explained(method: Method, fingers: Sequence[str], known: bool) -> Chart | N
             rows += _tip(wording.FINGERS[target], strength, [wording.signed_short(value) for value in found], "R²")
     if not rows:
         return None
-    return Chart(f"R² of each electrode, {wording.OBJECTS[known]}", _plane(rows))
+    return Chart(f"R² of each electrode, {headlines.PARTS[known]}", _plane(rows))
 
 
 def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
@@ -95,7 +96,7 @@ def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
                 f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts"
             )
         errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
-    known = wording.OBJECTS[bool(rows.known[one.row])].removesuffix("s")
+    known = headlines.PARTS[bool(rows.known[one.row])].removesuffix("s")
     caption = f"{rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of the range; {', '.join(errors)}."
     return Chart(f"True next to predicted: {one.place} by error, {one.recording}", _plane(tips), caption, wide=True)
 

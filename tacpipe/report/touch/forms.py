@@ -13,6 +13,7 @@ from tacpipe.report.charts import Dot
 from tacpipe.report.touch import printed, scores, tables, wording
 from tacpipe.report.touch.methods import PAPERS
 from tacpipe.report.touch.scores import Score
+from tacpipe.tasks.touch import headline as headlines
 
 TARGET = "pdc_th"  # on which the paper compares settings
 
@@ -150,7 +151,7 @@ def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
     ]
     notes += [ESTIMATED] if any(one.settings.get("wrist") == "estimated" for one in found.values()) else []
     drawn = [_chart(form, described, dict(baselines))] if form.drawn else []
-    table = blocks.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)
+    table = blocks.table(f"{title}; {headlines.TARGETS[TARGET]}, known objects", heads, rows, kinds)
     return [table, *drawn, Note(" ".join(one for one in notes if one))]
 
 

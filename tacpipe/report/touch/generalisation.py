@@ -10,6 +10,7 @@ from tacpipe.report.blocks import NONE, Block, Cell, Note
 from tacpipe.report.touch import printed, scores, tables, wording
 from tacpipe.report.touch.methods import DEFAULT, PAPERS, targets
 from tacpipe.report.touch.scores import Score
+from tacpipe.tasks.touch import headline as headlines
 
 TITLE = "Figures 10 and 11", "known objects (test) next to novel ones"
 PARTS = ("RMSE over runs", "R²", "skill")
@@ -49,7 +50,7 @@ def _table(known: Method, novel: Method) -> list[Block]:
     rows: list[list[str | Cell]] = []
     pairs: list[tuple[Score | None, Score | None]] = []
     kinds: dict[int, str] = {}
-    for target, name in wording.TARGETS.items():
+    for target, name in headlines.TARGETS.items():
         test, other = (scores.score(tables.predictions(one), target, of) for one, of in ((known, True), (novel, False)))
         if test is None and other is None:
             continue

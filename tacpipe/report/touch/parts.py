@@ -65,7 +65,7 @@ def folds(context: Context) -> list[Fold]:
 
 def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
     """Return more columns of the table of all methods: R², skill over the constant, mean absolute error and batch means."""
-    target = next(name for name, title in wording.TARGETS.items() if title == comparison.question.target)
+    target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
     known = comparison.question.part.startswith(headlines.PARTS[True])
 
     @functools.cache
@@ -77,10 +77,10 @@ def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callabl
         return lambda row: value(found) if (found := score(row)) else Cell(NONE)
 
     return [
-        ("R²", cell(lambda one: Cell(wording.signed(one.r2), value=None if math.isnan(one.r2) else one.r2))),
-        ("skill over the constant", cell(wording.skill)),
+        ("R²", cell(lambda one: Cell(blocks.fixed(one.r2, 2), value=None if math.isnan(one.r2) else one.r2))),
+        ("skill over the constant", cell(lambda one: blocks.interval(*one.skill))),
         ("RMSE over runs", cell(lambda one: blocks.with_sd(one.each.mean, one.each.sd))),
-        ("batch mean", cell(lambda one: Cell(wording.percentage(one.batch_mean), value=one.batch_mean))),
+        ("batch mean", cell(lambda one: Cell(blocks.fixed(one.batch_mean, 4), value=one.batch_mean))),
         ("MAE (counts)", cell(lambda one: blocks.number(scores.in_counts(one.target, one.mae), 3))),
     ]
 
@@ -102,7 +102,7 @@ def about_run(run: Run) -> dict[str, str | Cell]:
         for target in run.details.predictions.targets:
             found = scores.score([run.details.predictions], target, known)
             rsquared += (
-                [f"{wording.TARGETS[target]}, {wording.OBJECTS[known]}: {wording.signed(found.r2)}"] if found else []
+                [f"{headlines.TARGETS[target]}, {headlines.PARTS[known]}: {blocks.fixed(found.r2, 2)}"] if found else []
             )
     return {
         "split": wording.split(run.details.split),

@@ -7,7 +7,7 @@ import numpy as np
 from tacpipe.comparison.runs import Method
 from tacpipe.report import charts
 from tacpipe.report.blocks import Chart, Charts, Fold, fold
-from tacpipe.report.touch import wording
+from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 PRESSURES = ("pdc_th", "pdc_mf")
@@ -34,7 +34,7 @@ def _chart(method: Method, target: str) -> Chart:
     ]
     constant = rows.predicted.get(CONSTANT, {}).get(target)
     level = None if constant is None else ("constant", float(constant[0, 0]))
-    name = wording.TARGETS[target]
+    name = headlines.TARGETS[target]
     spec = charts.scatter(dots, "true (counts)", "predicted (counts)", diagonal=True, level=level)
     some = f"{len(rows.recordings):,} of {total:,}" if len(rows.recordings) < total else f"{total:,}"
     return Chart(name, spec, f"{some} unseen grasps of the first run. Line: predicted as true; dashed: the constant.")

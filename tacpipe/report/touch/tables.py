@@ -11,6 +11,7 @@ from tacpipe.report.touch import scores, wording
 from tacpipe.report.touch.methods import main, targets
 from tacpipe.report.touch.predictions import Predictions
 from tacpipe.report.touch.scores import Score
+from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import MODEL, OBJECT_MEAN
 
 ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # of a table in the paper's form
@@ -27,7 +28,14 @@ def cells(found: Score | None) -> list[str | Cell]:
         return [NONE] * len(ROWS)
     error = blocks.with_sd(found.each.mean, found.each.sd)
     counts = f"{scores.in_counts(found.target, found.each.mean):.0f}"
-    return [error, counts, wording.signed(found.r2), wording.skill(found), f"{found.grasps:,}", str(found.runs)]
+    return [
+        error,
+        counts,
+        blocks.fixed(found.r2, 2),
+        blocks.interval(*found.skill),
+        f"{found.grasps:,}",
+        str(found.runs),
+    ]
 
 
 def baseline_rows(methods: Sequence[Method], target: str, known: bool | None) -> list[tuple[str, Score | None]]:
@@ -62,7 +70,7 @@ def _by_object(method: Method) -> Table | None:
             rows.append([name if known else f"{name} (novel)", f"{counted:,}", *row])
     if not rows:
         return None
-    heads = ["", "grasps", *(part for target in predicted for part in (wording.TARGETS[target], "skill"))]
+    heads = ["", "grasps", *(part for target in predicted for part in (headlines.TARGETS[target], "skill"))]
     return blocks.table(f"By object, {method.name}: RMSE above that of the object's mean", heads, rows, kinds)
 
 
@@ -71,5 +79,5 @@ def _of_object(runs: Sequence[Predictions], target: str, known: bool) -> list[st
     found, mean = (scores.score(runs, target, known, one) for one in (MODEL, OBJECT_MEAN))
     if found is None:
         return [NONE, NONE]
-    below = wording.percentage(mean.rmse) if mean and known else ""
-    return [Cell(wording.percentage(found.rmse), below, found.rmse), blocks.signed(found.skill.mean)]
+    below = blocks.fixed(mean.rmse, 4) if mean and known else ""
+    return [Cell(blocks.fixed(found.rmse, 4), below, found.rmse), blocks.signed(found.skill.mean)]

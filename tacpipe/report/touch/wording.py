@@ -8,25 +8,16 @@ from collections.abc import Sequence
 
 from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, provenance
-from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.touch import printed
 from tacpipe.report.touch.methods import PAPERS, Result
-from tacpipe.report.touch.scores import Score
 from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
-TARGETS = {
-    "pdc_th": "PDC thumb",
-    "pdc_mf": "PDC middle finger",
-    "e_th": "electrodes thumb",
-    "e_mf": "electrodes middle finger",
-}
 FINGERS = {"e_th": "thumb", "e_mf": "middle finger"}
 BASELINES = {  # rows that every table has
     CONSTANT: "constant: the mean of training",
     OBJECT_MEAN: "mean of the object",
     NEAREST_IN_TIME: "mean of the nearest in time",
 }
-OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
 RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
     "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
@@ -52,29 +43,6 @@ def baseline(predictor: str) -> str:
     return BASELINES.get(predictor, predictor.replace("_", " "))
 
 
-def skill(found: Score) -> Cell:
-    """Return a skill over the constant above its interval."""
-    return blocks.interval(*found.skill)
-
-
-def percentage(value: float) -> str:
-    """Return an error as a fraction of a range.
-
-    >>> percentage(0.05496), percentage(float("nan"))
-    ('0.0550', '–')
-    """
-    return NONE if math.isnan(value) else f"{value:.4f}"
-
-
-def signed(value: float) -> str:
-    """Return R², which may lie below 0.
-
-    >>> signed(0.4567), signed(-0.02), signed(-0.001), signed(float("nan"))
-    ('0.46', '−0.02', '0.00', '–')
-    """
-    return NONE if math.isnan(value) else f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
-
-
 def signed_short(value: float) -> str:
     """Return R² where there is little room.
 
@@ -82,7 +50,7 @@ def signed_short(value: float) -> str:
     ['0.46', '−0.02', '−3.0', '< −9']
     """
     if value >= -1 or math.isnan(value):
-        return signed(value)
+        return blocks.fixed(value, 2)
     return f"−{-value:.1f}" if value > -9 else "< −9"
 
 

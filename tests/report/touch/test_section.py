@@ -11,9 +11,10 @@ from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
 from tacpipe.report import provenance
 from tacpipe.report.blocks import Section
-from tacpipe.report.touch import clouds, curves, electrodes, pressure, wording
+from tacpipe.report.touch import clouds, curves, electrodes, pressure
 from tacpipe.report.touch.methods import Result
 from tacpipe.report.touch.parts import NO_EVIDENCE
+from tacpipe.tasks.touch import headline as headlines
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.touch.touch_fakes import NOVEL, recorded, result
@@ -45,7 +46,9 @@ def whole() -> Section:
 
 def test_the_first_screen_has_a_row_a_target_on_known_and_on_novel_objects(whole: Section) -> None:
     assert whole.table is not None
-    assert [parts.text(row.cells[0]) for row in whole.table.rows] == [wording.TARGETS[one] for one in biotac_sp.TARGETS]
+    assert [parts.text(row.cells[0]) for row in whole.table.rows] == [
+        headlines.TARGETS[one] for one in biotac_sp.TARGETS
+    ]
     assert len(whole.table.heads) == 7
     assert whole.counts[:2] == ["4 methods", "5 results"]
 
