@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.comparison.naming import distinct_names
+from tacpipe.metrics import pairing
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
@@ -103,12 +104,11 @@ class Method:
 
     def sums(self, question: Question, predictor: str = MODEL) -> Sums:
         """Return what a predictor of its runs errs, by seed and recording; of several runs with a seed, added up."""
-        found: dict[tuple[Hashable, str], AnyFloats] = {}
-        for run in self.of(question):
-            for name, one in run.questions[question].sums.get(predictor, {}).items():
-                key = run.seed, name
-                found[key] = found[key] + one if key in found else one
-        return found
+        return pairing.added(
+            ((run.seed, name), one)
+            for run in self.of(question)
+            for name, one in run.questions[question].sums.get(predictor, {}).items()
+        )
 
     def predictors(self, question: Question) -> list[str]:
         """Return the predictors that any of its runs holds, in the order in which they come."""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Run, grouped
 from tacpipe.comparison.specification import Task
-from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.metrics import pairing
+from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, plain, provenance, screen
 from tacpipe.report.blocks import NONE, Cell, Chart, Fold, Group, Note, Section, Table, counted, fold, number, p_value
 from tacpipe.report.blocks import Row as Line
@@ -155,8 +155,9 @@ def recordings(context: Context) -> list[Fold]:
 def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
     measure, question = one.measure, one.question
     best = next((base for base in one.of("baseline") if base.name == row.baseline), None)
-    mine = _pooled(row.method.sums(question))
-    others = _pooled(best.method.sums(question, best.predictor)) if best else {}
+    mine = pairing.added((name, one) for (_, name), one in row.method.sums(question).items())
+    based_on = best.method.sums(question, best.predictor) if best else {}
+    others = pairing.added((name, one) for (_, name), one in based_on.items())
     names = sorted(mine)
     errors, based = (
         np.array([float(measure.error(held[name][None])[0]) if name in held else np.nan for name in names])
@@ -193,14 +194,6 @@ def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
     if not rows:
         return [*found, Note(f"{title}: all {len(names):,} are without error.")]
     return [*found, blocks.table(f"{title}, {about}{right}", heads, rows)]
-
-
-def _pooled(sums: Sums) -> dict[str, AnyFloats]:
-    """Return sums by recording, those of several seeds added up."""
-    found: dict[str, AnyFloats] = {}
-    for (_, name), values in sums.items():
-        found[name] = found[name] + values if name in found else values
-    return found
 
 
 def every_run(context: Context) -> list[Fold]:

@@ -15,7 +15,7 @@ from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.metrics import pairing
 from tacpipe.metrics.forecast import Interval
-from tacpipe.report import blocks, charts
+from tacpipe.report import blocks, charts, learning
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
@@ -33,6 +33,7 @@ Tree = Mapping[str, Any]
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FLOOR = -1.0  # skill at which figures end
 TRACE_STEPS = (1, 5, 10)
+LOSSES = {"training": "train_loss", "validation": "val_loss"}
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
 
 
@@ -359,21 +360,12 @@ def _training(context: Context) -> list[Fold]:
         if not history:
             continue
         best = min(history, key=lambda line: line["val_loss"])
-        epochs = [float(line["epoch"]) for line in history]
-        several = [
-            Line(name, epochs, [float(line[key]) for line in history])
-            for name, key in (("training", "train_loss"), ("validation", "val_loss"))
-        ]
-        caption = (
+        curves = {name: [[one[key] for one in history]] for name, key in LOSSES.items()}
+        spec = {**learning.by_epoch(curves, "loss (scaled latents)", log=True), "height": 190}
+        kept = (
             f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
         )
-        drawn.append(
-            Chart(
-                f"Loss by epoch: {method.name}",
-                charts.lines(several, "epoch", "loss (scaled latents)", log=True, height=190),
-                caption,
-            )
-        )
+        drawn.append(Chart(f"Loss by epoch: {method.name}", spec, kept))
     return fold("Training", Charts(drawn)) if drawn else []
 
 
@@ -405,12 +397,11 @@ def _sums(row: Row, steps: Sequence[int], known: bool | None, group: str = "both
 
 
 def _of(method: Method, predictor: str, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
-    found: dict[tuple[Any, str], AnyFloats] = {}
-    for run in method.runs:
-        for name, one in reading.sums(run.details, predictor, steps, known, group).items():
-            key = run.seed, name
-            found[key] = found[key] + one if key in found else one
-    return found
+    return pairing.added(
+        ((run.seed, name), one)
+        for run in method.runs
+        for name, one in reading.sums(run.details, predictor, steps, known, group).items()
+    )
 
 
 def _skill_of(steps: int) -> Callable[[AnyFloats], AnyFloats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 from tacpipe.comparison.runs import Method
@@ -29,11 +30,7 @@ def convergence(methods: Sequence[Method]) -> list[Chart]:
     order = [one.name for one in chosen]
     drawn = []
     for sensor in sensors_of(chosen):
-        curves = {
-            one.name: [curve for run in of(one, sensor) if (curve := _validation(run.details, sensor))]
-            for one in chosen
-        }
-        held = {name: found for name, found in curves.items() if found}
+        held = learning.of_methods(chosen, functools.partial(_validation, sensor=sensor))
         if held:
             spec = learning.by_epoch(held, "validation accuracy (%)", order)
             title = blocks.form(
@@ -46,8 +43,7 @@ def convergence(methods: Sequence[Method]) -> list[Chart]:
 def alignment(methods: Sequence[Method]) -> list[Chart]:
     """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; none where none is given."""
     chosen = [one for one in methods if (plain(one.settings) or comparison.control(one)) and one.settings["joint"]]
-    curves = {one.name: [curve for run in one.details if (curve := aligned(run))] for one in chosen}
-    held = {name: found for name, found in curves.items() if found}
+    held = learning.of_methods(chosen, aligned)
     if not held:
         return []
     spec = learning.by_epoch(held, "mean squared latent difference", log=True)

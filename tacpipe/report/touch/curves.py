@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -9,9 +10,8 @@ from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, learning
 from tacpipe.report.blocks import Chart
-from tacpipe.report.contents import Tree
 from tacpipe.report.touch import forms, wording
-from tacpipe.report.touch.methods import PAPERS, main
+from tacpipe.report.touch.methods import PAPERS, Result, main
 from tacpipe.tasks.touch import headline as headlines
 
 ALL = "all"  # stands where one network predicts all targets
@@ -24,7 +24,7 @@ def charts_of(methods: Sequence[Method]) -> list[Chart]:
     """Return validation losses of one method an architecture, a chart a target; none without epochs."""
     drawn, shown = [], main(methods)
     for target in (*biotac_sp.TARGETS, ALL):
-        curves = {one.name: found for one in shown if (found := _curves(one, target, "val_loss"))}
+        curves = learning.of_methods(shown, functools.partial(losses, target=target, name="val_loss"))
         if curves:
             name = headlines.TARGETS.get(target, "one network for all targets")
             spec = learning.by_epoch(curves, "validation loss", log=True)
@@ -55,13 +55,13 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
     ]
 
 
-def losses(history: Sequence[Tree], target: str, name: str) -> list[float]:
+def losses(result: Result, target: str, name: str) -> list[float]:
     """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none states it.
 
     The mean ends where the first network does. NaN stands where an epoch does not state the loss.
     """
     networks: dict[object, list[float]] = {}
-    for line in history:
+    for line in result.history:
         if line.get("target", ALL) == target:
             described = line.get(name)
             networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
@@ -71,7 +71,7 @@ def losses(history: Sequence[Tree], target: str, name: str) -> list[float]:
 
 
 def _curves(method: Method, target: str, name: str) -> list[list[float]]:
-    return [curve for run in method.details if (curve := losses(run.history, target, name))]
+    return [curve for one in method.details if (curve := losses(one, target, name))]
 
 
 def _unwatched(methods: Sequence[Method]) -> str:

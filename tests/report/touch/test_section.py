@@ -215,7 +215,8 @@ def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
         for network, losses in enumerate(([4.0, 2.0, 1.0], [2.0, 1.0]))
         for epoch, loss in enumerate(losses, 1)
     ]
-    several = [*run.history, *lines]
+    several = Result(run.dataset)
+    several.__dict__["history"] = [*run.history, *lines]
     assert curves.losses(several, "all", "train_loss") == [3.0, 1.5]
     assert curves.losses(several, "all", "val_loss") == []
     assert len(curves.losses(several, "e_th", "train_loss")) == 4
