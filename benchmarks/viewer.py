@@ -1,13 +1,18 @@
 """How long `tacpipe view` takes for 10 minutes of 96 tactile channels and an arm at 1 kHz, and how large its file is.
 
-    python benchmarks/viewer.py [--seconds 600] [--all-rows]
+    python benchmarks/viewer.py [--seconds 600] [--all-rows] [--window]
 
-Needs the extra view. The file stays, so that the viewer can be timed on it: ``rerun FILE``.
+With ``--window``, the viewer opens the file on a virtual screen (Xvfb), drawn in software, as on a computer without a GPU:
+printed are the seconds until the recording is there and the frames that it paints a second while it plays. Needs the extra
+view. The file stays.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import subprocess
 import tempfile
 import time
 from collections.abc import Mapping
@@ -22,6 +27,8 @@ from tacpipe.channels import schema
 from tacpipe.viewer import contents, session
 
 SKIN_HZ, ARM_HZ, ARM = 50, 1000, 22
+SIZE, SCREEN, PORT, FRAMES = "1440x900", ":79", 9957, 4
+PATIENCE_S = 120.0
 
 
 @dataclass
@@ -60,11 +67,52 @@ def stamps(seconds: Any) -> Any:
     return 1_600_000_000_000_000_000 + (seconds * 1e9).astype(np.int64)
 
 
+def in_window(file: Path) -> str:
+    """Return how long the viewer takes to open a file, and how many frames a second it paints while it plays."""
+    graphics = {"DISPLAY": SCREEN, "LIBGL_ALWAYS_SOFTWARE": "1", "WINIT_X11_SCALE_FACTOR": "1"}
+    server = ["Xvfb", SCREEN, "-screen", "0", f"{SIZE}x24"]
+    viewer = [session.program(), str(file), "--port", str(PORT), "--window-size", SIZE]
+    with contextlib.ExitStack() as stack:
+        for command in (server, viewer):
+            environment = {**session.environment(), **graphics}
+            process = stack.enter_context(subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL))
+            stack.callback(process.terminate)
+            begun_s = time.perf_counter()
+        client = opened(begun_s + PATIENCE_S)
+        opened_s = time.perf_counter() - begun_s
+        client.set_time("time", duration=1.0, play_state="playing")
+        trace = file.with_suffix(".puffin")
+        client.capture_profile_trace(str(trace), num_frames=1)
+        drawn_s = time.perf_counter()
+        client.capture_profile_trace(str(trace), num_frames=FRAMES)
+        rate_hz = FRAMES / (time.perf_counter() - drawn_s)
+    return (
+        f"{opened_s:.1f} s to open, {rate_hz:.1f} frames a second in software, "
+        f"on {os.cpu_count()} cores with a load of {os.getloadavg()[0]:.1f}"
+    )
+
+
+def opened(until_s: float) -> Any:
+    """Return a client of the viewer once it has loaded the recording and has views of it."""
+    from rerun.experimental import ViewerClient
+
+    while True:
+        with contextlib.suppress(ConnectionError):
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
+            state = client.get_state()
+            if state.recordings and state.views and not state.loading:
+                return client
+        if time.perf_counter() > until_s:
+            raise SystemExit(f"The viewer has not opened the file within {PATIENCE_S:g} s.")
+        time.sleep(0.1)
+
+
 def main() -> None:
     """Measure once and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=int, default=600)
     parser.add_argument("--all-rows", action="store_true")
+    parser.add_argument("--window", action="store_true")
     options = parser.parse_args()
     made, folder = recording(options.seconds), Path(tempfile.mkdtemp())
     before_s = time.perf_counter()
@@ -75,6 +123,8 @@ def main() -> None:
     print(
         f"{read_s - before_s:.1f} s to compute, {done_s - read_s:.1f} s to write, {file.stat().st_size / 1e6:.0f} MB: {file}"
     )
+    if options.window:
+        print(in_window(file))
 
 
 if __name__ == "__main__":

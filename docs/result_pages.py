@@ -3,6 +3,9 @@
 Runs DVC's chain of each task on the published recordings in ``DATA``, in ``.cache/result-pages``, and copies the pages to
 ``dist/results``, and writes the tables of ``docs/results`` from the same results. An interrupted run resumes: DVC skips
 finished stages, and tacpipe what it has computed within one.
+
+``python docs/result_pages.py DATA --reduced [TASK...]`` runs the same commands with one fold, one epoch and the first method
+of each list, in minutes, to see that they work. Its pages are in ``dist/reduced``; the tables stay as they are.
 """
 
 from __future__ import annotations
@@ -85,6 +88,19 @@ def published(params: dict[str, Any], data: Path) -> dict[str, Any]:
     return {**params, "forward": forward, "material": material, "touch": touch}
 
 
+def reduced(block: Any) -> Any:
+    """Return params with one epoch wherever epochs are given, and with the first entry of each list of runs.
+
+    >>> reduced({"folds": [0, 1], "methods": {"gru": {"epochs": 10}}, "split": {"folds": 5}})
+    {'folds': [0], 'methods': {'gru': {'epochs': 1}}, 'split': {'folds': 5}}
+    """
+    if isinstance(block, list):
+        return block[:1]
+    if not isinstance(block, dict):
+        return block
+    return {name: 1 if name == "epochs" else reduced(value) for name, value in block.items()}
+
+
 def _by_authors(block: Any) -> Any:
     """Return params whose k-fold splits are the authors' own."""
     if not isinstance(block, dict):
@@ -104,19 +120,22 @@ def _estimated(block: Any) -> Any:
     }
 
 
-def main(data: Path, tasks: list[str]) -> None:
-    """Compute the pages of ``tasks``; raises `SystemExit` with a sentence where a set is missing."""
+def main(data: Path, tasks: list[str], *, less: bool = False) -> None:
+    """Compute the pages of ``tasks``, with ``less`` from `reduced` params; raises `SystemExit` where a set is missing."""
     missing = [name for task in tasks for name in SETS[task] if not (data / name).is_dir()]
     if missing:
         raise SystemExit(
             f"{data} has no folder {', '.join(missing)}; data/README.md lists where the sets are published."
         )
-    work, out = ROOT / ".cache" / "result-pages", ROOT / "dist" / "results"
+    work = ROOT / ".cache" / ("reduced-pages" if less else "result-pages")
+    out = ROOT / "dist" / ("reduced" if less else "results")
     (work / "docs" / "tasks").mkdir(parents=True, exist_ok=True)
     out.mkdir(parents=True, exist_ok=True)
     for name in ("dvc.yaml", "docs/tasks/horizons.json"):
         shutil.copy(ROOT / name, work / name)
     params = published(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8")), data.resolve())
+    if less:
+        params = reduced(params)
     (work / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False), encoding="utf-8")
     programs = Path(sys.executable).parent
     dvc, environment = programs / "dvc", {**os.environ, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
@@ -126,8 +145,10 @@ def main(data: Path, tasks: list[str]) -> None:
         subprocess.run([dvc, "repro", task], cwd=work, env=environment, check=True)
         shutil.copy(work / "results" / f"{task}.html", out)
         print(out / f"{task}.html")
-        print(write_table(task, work / "results" / task))
+        if not less:
+            print(write_table(task, work / "results" / task))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:] or list(SETS))
+    given = [one for one in sys.argv[2:] if one != "--reduced"]
+    main(Path(sys.argv[1]), given or list(SETS), less="--reduced" in sys.argv)

@@ -31,10 +31,16 @@ COMMANDS = (
     "split data/grasps -o data/grasps-split --scheme random",
     "train touch data/grasps --split data/grasps-split -o models/touch --preset quick",
     "predict models/touch data/grasps -o data/touched",
+    "simulate material --trials 96 --materials 4 -o data/slid",
+    "segment slides data/slid -o data/slides",
+    "split data/slides -o data/slides-split --stratify sensor,material",
+    "train material data/slides --split data/slides-split -o models/material",
+    "evaluate models/material data/slides -o results/material",
 )
 PICTURES = {  # the recordings of each, and the time at the cursor
     "view-forward": ("view data/slips trial-00[0-4]", 5.1),
     "view-forecast": ("view data/slips trial-000 --predictions data/predictions", 1.4),
+    "view-material": ("view data/slides trial-001 --predictions results/material", 0.9),
     "view-touch": ("view data/pinched trial-000 --predictions data/touched", None),
 }
 

@@ -312,6 +312,17 @@ def test_the_params_of_the_result_pages_are_of_published_recordings(tmp_path: Pa
     assert given["forward"]["recordings"].startswith("simulate")
 
 
+def test_reduced_params_have_one_fold_one_epoch_and_one_method_and_splits_stay() -> None:
+    import yaml
+
+    given = yaml.safe_load((ROOT / "params.yaml").read_text())
+    found = module("result_pages").reduced(given)
+    assert found["touch"]["methods"] == ["tree-ensemble"] and found["forward"]["folds"] == [0]
+    assert found["forward"]["quick"]["methods"]["gru"]["epochs"] == 1
+    assert found["forward"]["split"] == given["forward"]["split"]
+    assert given["forward"]["quick"]["methods"]["gru"]["epochs"] == 10
+
+
 def test_the_tables_of_results_are_made_from_results() -> None:
     from tacpipe.comparison import engine
     from tests.report.touch.touch_fakes import result

@@ -152,8 +152,8 @@ def _predictions(path: Path | None) -> Dataset | None:
     return None if path is None else tacpipe.open(path)
 
 
-def predicted(predictions: Dataset, name: str) -> tuple[Any, dict[str, Any] | None]:
-    """Return the predictions of one recording: the table of its own, or its row in a table that has one for each."""
+def predicted(predictions: Dataset, name: str) -> tuple[Any, Any]:
+    """Return the predictions of one recording: the table of its own, or its row, a table too, where one has a row each."""
     if name in predictions:
         return predictions[name].table(), None
     for one in predictions:
@@ -161,9 +161,9 @@ def predicted(predictions: Dataset, name: str) -> tuple[Any, dict[str, Any] | No
             continue
         table = one.table()
         if "recording" in table.column_names:
-            rows = [row for row in table.to_pylist() if row["recording"] == name]
-            if rows:
-                return None, {key: value for key, value in rows[0].items() if key != "recording"}
+            names = table.column("recording").to_pylist()
+            if name in names:
+                return None, table.slice(names.index(name), 1)
     return None, None
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.comparison.naming import distinct_names
+from tacpipe.metrics import pairing
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
@@ -74,18 +75,40 @@ class Method:
         """Whether it was trained to show what an effect is worth, and does not compete."""
         return self.runs[0].control
 
+    @property
+    def simulated(self) -> bool:
+        """Whether any of its runs was evaluated on simulated recordings."""
+        return any(run.simulated for run in self.runs)
+
+    @property
+    def published(self) -> bool:
+        """Whether all its runs were evaluated on the recordings of the task's paper."""
+        return all(run.published for run in self.runs)
+
+    @property
+    def details(self) -> list[Any]:
+        """What the task's own sections read of its runs."""
+        return [run.details for run in self.runs]
+
+    def key_without(self, *names: str) -> str:
+        """Return what methods share that differ in these settings alone."""
+        return json.dumps(
+            [self.family, {name: value for name, value in self.settings.items() if name not in names}],
+            sort_keys=True,
+            default=str,
+        )
+
     def of(self, question: Question) -> list[Run]:
         """Return its runs that were evaluated on a question."""
         return [one for one in self.runs if question in one.questions]
 
     def sums(self, question: Question, predictor: str = MODEL) -> Sums:
         """Return what a predictor of its runs errs, by seed and recording; of several runs with a seed, added up."""
-        found: dict[tuple[Hashable, str], AnyFloats] = {}
-        for run in self.of(question):
-            for name, one in run.questions[question].sums.get(predictor, {}).items():
-                key = run.seed, name
-                found[key] = found[key] + one if key in found else one
-        return found
+        return pairing.added(
+            ((run.seed, name), one)
+            for run in self.of(question)
+            for name, one in run.questions[question].sums.get(predictor, {}).items()
+        )
 
     def predictors(self, question: Question) -> list[str]:
         """Return the predictors that any of its runs holds, in the order in which they come."""
@@ -103,16 +126,10 @@ def grouped(runs: Sequence[Run], usual: Collection[str | tuple[str, Any]] = ()) 
         found.setdefault(_key(run), []).append(run)
     firsts = [same[0] for same in found.values()]
     names = distinct_names([(one.method, one.settings) for one in firsts], usual)
-    made = []
-    for (name, _), same in zip(names, found.values(), strict=True):
-        first = same[0]
-        alike = [one.settings for one in firsts if (one.task, one.method) == (first.task, first.method)]
-        differing = {
-            key: value
-            for key, value in first.settings.items()
-            if key not in usual and (key, value) not in usual and any(other.get(key) != value for other in alike)
-        }
-        made.append(Method(name, first.family or first.method, first.settings, differing, tuple(same)))
+    made = [
+        Method(name, same[0].family or same[0].method, same[0].settings, differing, tuple(same))
+        for (name, differing), same in zip(names, found.values(), strict=True)
+    ]
     return sorted(made, key=lambda one: one.name)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from tacpipe.metrics.headline import Headline, Row
 
 Sums = Mapping[tuple[Hashable, str], AnyFloats]  # by seed and recording, (part,): what adds up over recordings
 ENUMERATED, SWAPS = 12, 9_999  # clusters that are exchanged in all ways; random ways of more
+Key = TypeVar("Key", bound=Hashable)
 _draws = functools.lru_cache(maxsize=16)(forecast.draws)
 
 
@@ -204,6 +206,18 @@ def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tup
     spot = np.array([seeds[seed] for seed, *_ in rows]), np.array([places[name] for name in held])
     np.add.at(found, spot, np.array([np.concatenate([one, two]) for _, _, one, two in rows]))
     return found, list(places)
+
+
+def added(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
+    """Return sums by key, those of one key added up.
+
+    >>> added([("a", np.array([1.0])), ("b", np.array([2.0])), ("a", np.array([3.0]))])
+    {'a': array([4.]), 'b': array([2.])}
+    """
+    found: dict[Key, AnyFloats] = {}
+    for key, one in parts:
+        found[key] = found[key] + one if key in found else one
+    return found
 
 
 def intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:

@@ -197,6 +197,15 @@ def p_value(p: float) -> Cell:
     return Cell(NONE if math.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}", value=None if math.isnan(p) else p)
 
 
+def form(what: str, text: str, published: bool) -> str:
+    """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
+
+    >>> form("Figure 9", "validation accuracy", True), form("Figure 9", "validation accuracy", False)
+    ("Figure 9 in the paper's form: validation accuracy", 'Validation accuracy')
+    """
+    return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
+
+
 def counted(count: int, plural: str) -> str:
     """Return how many there are of a noun.
 

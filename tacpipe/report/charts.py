@@ -460,7 +460,9 @@ def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
     if not len(means):
         return 0.0, 1.0
     middle = float(np.median(means))
-    far = 6 * max(float(np.median(np.abs(means - middle))), 0.02 * abs(middle), 1e-6)
+    halves = [(one.high - one.low) / 2 for one in dots if not math.isnan(one.high - one.low)]
+    scales = (np.median(np.abs(means - middle)), np.median(halves) if halves else 0.0, 0.02 * abs(middle), 1e-6)
+    far = 6 * float(max(scales))
     bounds = [end for one in dots for end in (one.mean, one.low, one.high) if abs(end - middle) <= far]
     low, high = min(bounds), max(bounds)
     room = 0.04 * ((high - low) or abs(high) or 1.0)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from tacpipe.report import charts
 from tacpipe.report.charts import Line
 
 if TYPE_CHECKING:
+    from tacpipe.comparison.runs import Method
     from tacpipe.report.charts import Spec
 
 
@@ -28,4 +30,20 @@ def by_epoch(
         length = min(map(len, curves))
         mean = np.mean([curve[:length] for curve in curves], axis=0)
         several.append(Line(name, range(1, length + 1), mean))
-    return charts.lines(several, "epoch", quantity, order=order, log=log, points=False)
+    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # of which no line can be seen
+    return charts.lines(several, "epoch", quantity, order=order, log=log, points=single)
+
+
+def stated(values: Sequence[float | None]) -> list[float]:
+    """Return one value an epoch, NaN where an epoch states none; empty where no epoch states any.
+
+    >>> stated([None, 1]), stated([None, None])
+    ([nan, 1.0], [])
+    """
+    return [] if all(one is None for one in values) else [math.nan if one is None else float(one) for one in values]
+
+
+def of_methods(methods: Sequence[Method], read: Callable[[Any], list[float]]) -> dict[str, list[list[float]]]:
+    """Return the curves that ``read`` gives of the results of each method, by its name; methods without any left out."""
+    found = {method.name: [curve for one in method.details if (curve := read(one))] for method in methods}
+    return {name: curves for name, curves in found.items() if curves}

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
+SIMULATED = "These recordings were simulated: nothing here is evidence about a real sensor."
 
 
 def simulated(result: Dataset) -> bool:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Run, grouped
 from tacpipe.comparison.specification import Task
-from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.metrics import pairing
+from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, plain, provenance, screen
 from tacpipe.report.blocks import NONE, Cell, Chart, Fold, Group, Note, Section, Table, counted, fold, number, p_value
 from tacpipe.report.blocks import Row as Line
@@ -31,7 +31,6 @@ KINDS = {
     "control": "Controls",
 }
 PICKED = "The best of several methods was picked on these very recordings, which flatters it a little."
-SIMULATED = "These recordings were simulated: nothing here is evidence about a real sensor."
 
 
 def section(task: Task, results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> Section:
@@ -114,7 +113,8 @@ def _table(context: Context, one: Comparison) -> Table:
             groups.append(Group([_line(one, row, extra, "quiet") for row in rows], title))
     score = [] if _same(one) else [one.measure.scored]
     heads = ["", *one.measure.columns, *score, "interval", "sd over runs", f"{one.measure.name} over the best baseline"]
-    heads += ["best baseline", "p", *(head for head, _ in extra), one.measure.cluster, "recordings", "runs"]
+    counts = dict.fromkeys([one.measure.cluster, "recordings", "runs"])
+    heads += ["best baseline", "p", *(head for head, _ in extra), *counts]
     return Table(one.question.where if len(context.comparisons) > 1 else "", heads, groups)
 
 
@@ -132,7 +132,8 @@ def _line(one: Comparison, row: Row, extra: Sequence[tuple[str, Callable[[Row], 
     cells += [] if _same(one) else [number(score.mean)]
     cells += [ends, number(row.spread, 3), screen.gain(one, row), row.baseline or NONE, p_value(row.p)]
     cells += [make(row) for _, make in extra]
-    cells += [Cell(f"{count:,}", value=count) for count in (row.n, row.recordings, row.runs)]
+    counts = {one.measure.cluster: row.n, "recordings": row.recordings, "runs": row.runs}
+    cells += [Cell(f"{count:,}", value=count) for count in counts.values()]
     return Line(cells, kind)
 
 
@@ -148,14 +149,15 @@ def recordings(context: Context) -> list[Fold]:
         "To see a recording with what was predicted: `tacpipe view DATASET RECORDING --predictions RESULT`, where DATASET "
         "was given to `tacpipe evaluate` and RESULT is its output. A click on a name copies its command."
     )
-    return fold("Recordings", command, *found, about="where the best method fails, and the command to look at it")
+    return [Fold("Recordings", [command, *found], "where the best method fails, and the command to look at it")]
 
 
 def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
     measure, question = one.measure, one.question
     best = next((base for base in one.of("baseline") if base.name == row.baseline), None)
-    mine = _pooled(row.method.sums(question))
-    others = _pooled(best.method.sums(question, best.predictor)) if best else {}
+    mine = pairing.added((name, one) for (_, name), one in row.method.sums(question).items())
+    based_on = best.method.sums(question, best.predictor) if best else {}
+    others = pairing.added((name, one) for (_, name), one in based_on.items())
     names = sorted(mine)
     errors, based = (
         np.array([float(measure.error(held[name][None])[0]) if name in held else np.nan for name in names])
@@ -189,15 +191,9 @@ def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
     right = f"; {len(names) - len(wrong):,} of {len(names):,} are without error" if len(wrong) < len(names) else ""
     other = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
     heads = ["recording", *measure.columns, other, measure.name]
+    if not rows:
+        return [*found, Note(f"{title}: all {len(names):,} are without error.")]
     return [*found, blocks.table(f"{title}, {about}{right}", heads, rows)]
-
-
-def _pooled(sums: Sums) -> dict[str, AnyFloats]:
-    """Return sums by recording, those of several seeds added up."""
-    found: dict[str, AnyFloats] = {}
-    for (_, name), values in sums.items():
-        found[name] = found[name] + values if name in found else values
-    return found
 
 
 def every_run(context: Context) -> list[Fold]:
@@ -231,9 +227,9 @@ def basis(context: Context) -> list[Fold]:
     own = getattr(context.task.module, "caveats", None)
     texts = [] if own is None else list(own(context))
     texts += [PICKED] if len(context.methods) > 1 else []
-    texts += [SIMULATED] if context.simulated else []
+    texts += [provenance.SIMULATED] if context.simulated else []
     texts += ["No recording above is one that its model was trained on."] if context.runs else []
-    return [Fold("What these numbers rest on", [Note(one) for one in texts if one])] if texts else []
+    return [Fold("What these numbers rest on", [Note(one) for one in dict.fromkeys(texts) if one])] if texts else []
 
 
 def source(context: Context) -> list[Fold]:

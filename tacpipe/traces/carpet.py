@@ -10,7 +10,7 @@ from tacpipe.arrays import AnyArray, Floats, Times
 def binned(t_ns: Times, values: Floats, start_ns: int, stop_ns: int, bins: int) -> Floats:
     """Return what a signal (time, channel) has in each of ``bins`` equal times: the value farthest from 0, (bin, channel).
 
-    A bin without rows repeats the one before it; where there is none it is NaN.
+    A bin without rows repeats the one before it. Before the first row, and where a stream has ended, it is NaN.
 
     >>> binned(np.array([0, 1, 2, 9]), np.array([[1.0], [-3.0], [2.0], [5.0]]), 0, 10, 5).ravel().tolist()
     [-3.0, 2.0, 2.0, 2.0, 5.0]
@@ -23,8 +23,11 @@ def binned(t_ns: Times, values: Floats, start_ns: int, stop_ns: int, bins: int) 
     there, starts = np.unique(place, return_index=True)
     high, low = np.fmax.reduceat(values, starts, axis=0), np.fmin.reduceat(values, starts, axis=0)
     found[there] = np.where(np.abs(high) >= np.abs(low), high, low)
+    apart = int(np.median(np.diff(there))) if len(there) > 1 else bins
+    ends = there[-1] + apart
     latest = np.maximum.accumulate(np.where(np.isin(np.arange(bins), there), np.arange(bins), -1))
-    filled: Floats = np.where((latest >= 0)[:, None], found[np.maximum(latest, 0)], np.nan)
+    held = (latest >= 0) & (np.arange(bins) < ends)
+    filled: Floats = np.where(held[:, None], found[np.maximum(latest, 0)], np.nan)
     return filled
 
 

@@ -20,7 +20,11 @@ def text(contents: Contents) -> str:
     lines += [
         f"| {_cell(name or '-')} | {rows} | {rate_hz or ''} |" for name, (rows, rate_hz) in contents.rates.items()
     ]
-    if contents.predicted:
+    if contents.named:
+        lines += ["", "| predictor | " + _cell(contents.named.key) + " |", "| --- | --- |"]
+        lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in contents.named.predicted.items()]
+        lines += [f"| the label | {_cell(contents.named.label)} |"] if contents.named.label else []
+    elif contents.predicted:
         lines += ["", "| predicted | value |", "| --- | --- |"]
         lines += [f"| {_cell(name)} | {_cell(value)} |" for name, value in list(contents.predicted.items())[:MOST]]
     lines += [

@@ -14,9 +14,10 @@ from tacpipe.channels.streams import TRUTH, rate_hz
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.streams import streams_of
 from tacpipe.formats.arrays.frames import encoding
-from tacpipe.traces import curves, forecasts, paths, spans, taxels
-from tacpipe.traces.curves import TIME, Curves
+from tacpipe.traces import curves, forecasts, named, paths, spans, taxels
+from tacpipe.traces.curves import TIME, Curves, described
 from tacpipe.traces.forecasts import Forecast
+from tacpipe.traces.named import Named
 from tacpipe.traces.paths import Path
 from tacpipe.traces.spans import Event, Span
 from tacpipe.traces.taxels import Taxels
@@ -70,6 +71,7 @@ class Contents:
     frames: list[Frames] = field(default_factory=list)
     forecasts: list[Forecast] = field(default_factory=list)
     predicted: Mapping[str, Any] = field(default_factory=dict)  # values that a model predicted for the whole recording
+    named: Named | None = None  # what it named the whole recording
 
     @cached_property
     def ends_ns(self) -> tuple[int, int]:
@@ -108,13 +110,12 @@ class Contents:
         return (stop_ns - start_ns) / 1e9
 
 
-def of(
-    recording: Recording, predictions: pa.Table | None = None, predicted: Mapping[str, Any] | None = None
-) -> Contents:
+def of(recording: Recording, predictions: pa.Table | None = None, row: pa.Table | None = None) -> Contents:
     """Return what is drawn of a recording.
 
-    ``predictions`` is its table in a dataset of predictions or results, ``predicted`` its row where that has one each.
+    ``predictions`` is its table in a dataset of predictions or results, ``row`` its row where that has one each.
     """
+    predicted = {} if row is None else _values(row)
     whole = recording.table() if recording.streams == ("",) else None
     if whole is not None and TIME not in whole.column_names:  # of a split, or one row a recording
         return Contents(recording.name, recording.attributes, {"": (whole.num_rows, None)})
@@ -133,7 +134,7 @@ def of(
     clouds = {stream: table for stream, table in streams.items() if _is_cloud(table)}
     plotted = {stream: table for stream, table in streams.items() if stream not in clouds}
     ahead = [] if predictions is None else forecasts.of_table(predictions, touched)
-    ahead += forecasts.of_values(predicted or {}, touched)
+    ahead += forecasts.of_values(predicted, touched)
     return Contents(
         recording.name,
         recording.attributes,
@@ -148,8 +149,15 @@ def of(
         [points for stream, table in clouds.items() for points in _points(stream, table)],
         [found for stream, table in streams.items() for found in _frames(stream, table)],
         ahead,
-        predicted or {},
+        predicted,
+        None if row is None else named.of_row(row, recording.attributes),
     )
+
+
+def _values(row: pa.Table) -> dict[str, Any]:
+    """Return what a row of predictions holds for a reader: neither the recording's name nor latents."""
+    kept = [field.name for field in row.schema if described(field).get("quantity") != "latent"]
+    return {name: row.column(name)[0].as_py() for name in kept if name != "recording"}
 
 
 def _truth(recording: Recording, whole: pa.Table | None) -> dict[str, pa.Table]:

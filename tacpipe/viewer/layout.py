@@ -28,7 +28,8 @@ def signature(contents: Contents) -> tuple[Any, ...]:
     steps = sorted({(one.measured.name, one.step) for one in contents.forecasts})
     space = (sorted(one.name for one in contents.paths), sorted({one.stream for one in contents.clouds}))
     cameras = sorted(one.stream for one in contents.frames)
-    return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth))
+    named = (contents.named.key, len(contents.named.leading())) if contents.named else ()
+    return (*titles, steps, *space, cameras, bool(contents.events), bool(contents.truth), named)
 
 
 def blueprint(contents: Contents, *, several: bool = False) -> Any:
@@ -171,6 +172,11 @@ def _moments(contents: Contents) -> list[tuple[Any, float]]:
         found.append((grid, 3.0 if len(maps) <= MAPS_A_ROW else 4.0))
     if any(len(one.t_ns) > 1 for one in contents.taxels):
         found.append((_carpet(contents), 1.3))
+    if contents.named is not None:
+        rows = len(contents.named.leading())
+        bounds = rrb.VisualBounds2D(x_range=(-stream.NAMES_WIDTH, stream.BARS_WIDTH + 0.5), y_range=(-1.9, rows - 0.4))
+        title = f"Predicted {contents.named.key}, and the largest scores"
+        found.append((rrb.Spatial2DView(origin=stream.NAMED, name=title, visual_bounds=bounds), 1.8))
     return found
 
 

@@ -15,6 +15,7 @@ from tacpipe.signals.envelope import envelope
 from tacpipe.traces import carpet, palette, taxels
 from tacpipe.traces.curves import Curves
 from tacpipe.traces.forecasts import Forecast
+from tacpipe.traces.named import Named
 from tacpipe.traces.paths import Path
 from tacpipe.traces.spans import Span, merged
 from tacpipe.traces.taxels import Taxels
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 TIMELINE = "time"
 TOUCH, FORECAST, ERROR, SERIES, TRUTH, CHANNELS = "touch", "forecast", "error", "series", "truth", "channels"
 MAPS, SPANS, SPACE, CAMERAS, CARPET, ABOUT, EVENTS = "taxels", "spans", "space", "cameras", "carpet", "about", "events"
+NAMED = "named"
 AXES = "xyz"
 COMPARED = ("predicted", "residual")
 FRAMES_HZ = 60.0  # of maps and paths, at most: what a display shows
@@ -35,6 +37,8 @@ MOST_ROWS = (
 )
 POINTS = 4000  # of a path drawn as a line
 BINS, HEIGHT = 1200, 330  # of the carpet, pixels
+BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # of the chart of scores, in rows of it
+BAR = "#5a6572"
 EVENT_WIDTH = 1 / 200  # of the recording, for which an event is drawn
 RAMP = 24  # steps of a colour scale
 
@@ -64,6 +68,8 @@ class Stream:
         self._clouds(contents.clouds)
         for frames in contents.frames:
             self._frames(frames)
+        if contents.named is not None:
+            self._named(contents.named)
         self._static((ABOUT,), _rerun().TextDocument(about.text(contents), media_type="text/markdown"))
 
     def _at(self, t_ns: AnyArray) -> Any:
@@ -271,6 +277,34 @@ class Stream:
         parts = (CAMERAS, frames.stream)
         self._static(parts, rr.EncodedImage.from_fields(media_type=frames.media_type))
         self._columns(parts, frames.t_ns, rr.EncodedImage.columns(blob=frames.content))
+
+    def _named(self, named: Named) -> None:
+        """Write a bar a name, as long as its score: that of the model's name is bright, that of the label has a mark."""
+        rr = _rerun()
+        chosen = named.leading()
+        scores = np.array(list(chosen.values()))
+        row = np.arange(len(chosen), dtype=np.float64)
+        ends = np.column_stack([bars(scores), row])
+        colours = [palette.rgb(palette.DISTINCT[0] if name == named.of_model else BAR) for name in chosen]
+        strips = [[(0.0, place), tuple(end)] for place, end in zip(row, ends, strict=True)]
+        self._static((NAMED, "bars"), rr.LineStrips2D(strips, radii=0.3, colors=colours))
+        marked = (f"{name} (label)" if name == named.label else name for name in chosen)
+        texts = [f"{name}   {score:.3g}" for name, score in zip(marked, scores, strict=True)]
+        above = NAMES_RISE  # a text is drawn below its place
+        self._static((NAMED, "names"), _labels([(-NAMES_WIDTH / 2, at - above) for at in row], texts))
+        middle = (BARS_WIDTH - NAMES_WIDTH) / 2
+        self._static((NAMED, "sentence"), _labels([(middle, -1.2 - above)], [named.sentence]))
+
+
+def bars(scores: Floats) -> Floats:
+    """Return scores as lengths from 0 to `BARS_WIDTH`, the largest the longest; scores below 0 count from the least.
+
+    >>> bars(np.array([0.0, 1.0, 4.0])).tolist(), bars(np.array([-2.0, 0.0])).tolist()
+    ([0.0, 2.0, 8.0], [0.0, 8.0])
+    """
+    least = min(float(scores.min()), 0.0)
+    reach = float(scores.max()) - least
+    return np.asarray(BARS_WIDTH * (scores - least) / (reach if reach > 0 else 1.0))
 
 
 def map_bounds(one: Taxels) -> tuple[tuple[float, float], tuple[float, float]]:

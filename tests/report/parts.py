@@ -5,14 +5,30 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
+from tacpipe.comparison import engine
+from tacpipe.comparison.runs import Method, grouped
 from tacpipe.comparison.specification import Task
 from tacpipe.report import sections
 from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, Note, Section, Table
+from tacpipe.report.context import Context
 
 
 def section(task: str, *results: Any, others: Sequence[Any] = (), traces: int = 0) -> Section:
     """The section that a page has of results of one task."""
     return sections.section(Task(task), results, others, traces)
+
+
+def methods(task: str, *results: Any) -> list[Method]:
+    """The methods that the page has of results of one task."""
+    return context(task, *results).methods  # type: ignore[return-value]
+
+
+def context(task: str, *results: Any) -> Context:
+    """The results of one task, compared."""
+    of = Task(task)
+    runs = of.read(results)
+    found = grouped(runs, of.usual)
+    return Context(of, found, engine.comparisons(of, found), runs=runs)
 
 
 def blocks(given: Section | Iterable[Block]) -> Iterator[Block]:

@@ -81,3 +81,9 @@ def test_a_confusion_matrix_holds_its_counts() -> None:
     assert [(one["row"], one["column"], one["count"], one["right"]) for one in cells] == [
         ("cork", "cork", 3, True), ("cork", "foam", 1, False), ("foam", "foam", 4, True)
     ]  # fmt: skip
+
+
+def test_intervals_wider_than_the_differences_of_methods_are_drawn_whole() -> None:
+    dots = [charts.Dot(f"m{place}", 0.0144 + 1e-5 * place, -0.03, 0.05) for place in range(5)]
+    rows = charts.ranking(dots, "skill")["data"]["values"]
+    assert {(row["low"], row["high"], row["off"]) for row in rows} == {(-0.03, 0.05, "")}

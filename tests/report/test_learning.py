@@ -12,3 +12,11 @@ def test_runs_are_thin_lines_and_their_mean_a_thick_one_as_long_as_the_shortest(
     thick = [(row["name"], row["x"], row["y"]) for row in rows if not row["thin"]]
     assert thick == [("a", 1.0, 1.0), ("a", 2.0, np.mean([0.5, 0.4])), ("b", 1.0, 1.0)]
     assert sum(row["thin"] for row in rows) == 5
+
+
+def test_a_training_of_one_epoch_is_seen_as_points() -> None:
+    marks = [
+        [layer["mark"]["type"] for layer in learning.by_epoch({"training": [curve]}, "loss")["layer"]]
+        for curve in ([0.5], [0.5, 0.4])
+    ]
+    assert ["circle" in one for one in marks] == [True, False]

@@ -180,6 +180,19 @@ def test_paper_shows_what_is_folded_on_the_screen(chromium: Browser) -> None:
         chromium.media("")
 
 
+def test_charts_drawn_for_a_wide_screen_fit_the_paper(chromium: Browser) -> None:
+    chromium.show(page.render(forward_single()), 1280)
+    chromium.run("showAll().then(() => true)")
+    chromium.media("print")
+    try:
+        chromium.run("document.body.style.width = '700px'")  # of an A4 page within its margins
+        over = """[...document.querySelectorAll('.plot svg')].filter((one) => one.getBoundingClientRect().right
+          > one.closest('figure').getBoundingClientRect().right + 1).length"""
+        assert chromium.run(over) == 0
+    finally:
+        chromium.media("")
+
+
 @pytest.mark.parametrize(
     ("content", "told"),
     [

@@ -149,6 +149,24 @@ def test_forecasts_stand_next_to_what_came_with_their_error(tmp_path: Path) -> N
     assert "/taxels/xela1\\ residual\\ t\\+10/discs" in found and "/forecast/xela1/measured" in found
 
 
+def test_the_names_of_a_recording_are_bars_as_long_as_their_scores(tmp_path: Path) -> None:
+    about = {"model": "prediction", "material": "label", "score_1": "score", "score_2": "score"}
+    fields = [
+        pa.field(name, pa.float32() if "_" in name else pa.int32(), metadata={"quantity": one})
+        for name, one in about.items()
+    ]
+    row = pa.Table.from_pylist([{"model": 2, "material": 1, "score_1": 0.25, "score_2": 1.0}], pa.schema(fields))
+    drawn = contents.of(hand.recording(), row=row)  # type: ignore[arg-type]
+    (file,) = session.write([drawn], tmp_path, "hand")
+    found = read(file)
+
+    strips = static(found["/named/bars"], "LineStrips2D:strips")
+    assert [strip[-1][0] - strip[0][0] for strip in strips] == pytest.approx([8.0, 2.0])
+    assert static(found["/named/names"], "Points2D:labels") == ["2   1", "1 (label)   0.25"]
+    origins = [view.origin for view in views(layout.blueprint(drawn).root_container)]
+    assert "named" in [one.strip("/") for one in origins]
+
+
 def test_every_view_of_the_layout_shows_an_entity_that_is_written(tmp_path: Path) -> None:
     drawn, found = written(tmp_path)
     origins = [view.origin for view in views(layout.blueprint(drawn).root_container)]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
+from tacpipe.report import contents
+from tacpipe.report.contents import Tree
 from tacpipe.report.forward import error_sums
 from tacpipe.report.forward.error_sums import ErrorSums
 
@@ -17,28 +16,53 @@ if TYPE_CHECKING:
     from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
 
-Tree = Mapping[str, Any]
-
 ACTIONS = ("planned", "none", "shuffled")
 _PAPER_WIDTH = {"pca": 20, "autoencoder": 8}  # latents the paper keeps
 _NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are fitted next to the model
 _PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
 
 
-@dataclass(frozen=True)
-class Run:
-    """One result: a model trained once and evaluated once."""
+class Result(contents.Result):
+    """One result of forecasts."""
 
-    dataset: Dataset
-    config: Tree
-    metrics: Tree
-    errors: ErrorSums
+    STAGE = "train.forward"
+    SETS = ("xela-flat",)
 
-    @classmethod
-    def read(cls, dataset: Dataset) -> Run:
-        """Return the run that the files of a result hold."""
-        config, metrics = (json.loads(dataset.files[name]) for name in ("config.json", "metrics.json"))
-        return cls(dataset, config, metrics, error_sums.read(dataset.files[error_sums.FILE]))
+    @cached_property
+    def errors(self) -> ErrorSums:
+        """The error sums of recordings that the model has not seen."""
+        return error_sums.read(self.dataset.files[error_sums.FILE])
+
+    @property
+    def actions(self) -> str:
+        """What the model is informed of the motion to come: one of `ACTIONS`."""
+        return str(self.given.get("actions", "planned"))
+
+    @property
+    def timeline(self) -> str:
+        """What rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
+        return str(self.config.get("timeline", "uniform"))
+
+    @property
+    def rate_hz(self) -> float:
+        """Rows a second; 0 where a row has no fixed duration."""
+        return float(self.config.get("rate_hz") or 0)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All that makes its method, without seed and split."""
+        params = {name: value for name, value in self.params.items() if name not in _NO_METHOD}
+        codec = self.config["codec"]["name"]
+        return {**params, "codec": codec, "actions": self.actions, "timeline": self.timeline}
+
+    def name(self, usual: str) -> str:
+        """Return what its method is called, with a timeline that is not the ``usual`` one."""
+        parts = [str(self.config["architecture"]).replace("_", " "), str(self.config["codec"]["name"])]
+        if self.actions != "planned":
+            parts.append("no actions" if self.actions == "none" else f"{self.actions} actions")
+        if self.timeline != usual:
+            parts.append(self.timeline)
+        return " · ".join(parts)
 
 
 def comparable(dataset: Dataset) -> bool:
@@ -46,9 +70,9 @@ def comparable(dataset: Dataset) -> bool:
     return all(name in dataset.files for name in ("metrics.json", "config.json", error_sums.FILE))
 
 
-def main_timeline(runs: Sequence[Run]) -> str:
+def main_timeline(runs: Sequence[Result]) -> str:
     """Return the timeline of most runs; where two have as many, the last in the alphabet, which puts uniform first."""
-    count = Counter(timeline(run.config) for run in runs)
+    count = Counter(run.timeline for run in runs)
     return max(count, key=lambda name: (count[name], name))
 
 
@@ -65,14 +89,8 @@ def papers(methods: Sequence[Method]) -> Method | None:
 
 def codec(method: Method) -> Tree:
     """Return kind, width and name of a method's representation."""
-    found: Tree = method.runs[0].details.config["codec"]
+    found: Tree = method.details[0].config["codec"]
     return found
-
-
-def key_without(method: Method, what: str) -> str:
-    """Return what methods share that differ in one setting alone."""
-    described = {**method.settings, "architecture": method.family}
-    return json.dumps({name: value for name, value in described.items() if name != what}, sort_keys=True, default=str)
 
 
 def paper_row(codec: Tree) -> str | None:
@@ -97,35 +115,3 @@ def _distance(method: Method) -> tuple[int, int, int, str]:
     kind = found["kind"]
     off = abs(int(found["latents"]) - _PAPER_WIDTH.get(kind, int(found["latents"])))
     return _PREFERRED.index(kind), off, -len(method.runs), method.name
-
-
-def actions(config: Tree) -> str:
-    """Return what a model is informed of the motion to come: one of `ACTIONS`."""
-    return str(config["params"].get("actions", "planned"))
-
-
-def timeline(config: Tree) -> str:
-    """Return what rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
-    return str(config.get("timeline", "uniform"))
-
-
-def _params(config: Tree) -> dict[str, Any]:
-    """Return the params that make a model what it is, those apart that have a word of their own in a method's name."""
-    found = params_of.counting(registry.load("train.forward"), config["params"])
-    return {name: value for name, value in found.items() if name not in _NO_METHOD}
-
-
-def settings(config: Tree) -> dict[str, Any]:
-    """Return all that makes a method, without seed and split."""
-    codec = config["codec"]["name"]
-    return {**_params(config), "codec": codec, "actions": actions(config), "timeline": timeline(config)}
-
-
-def name(config: Tree, usual: str) -> str:
-    """Return what a method is called, with a timeline that is not the ``usual`` one."""
-    parts = [str(config["architecture"]).replace("_", " "), str(config["codec"]["name"])]
-    if actions(config) != "planned":
-        parts.append("no actions" if actions(config) == "none" else f"{actions(config)} actions")
-    if timeline(config) != usual:
-        parts.append(timeline(config))
-    return " · ".join(parts)

@@ -15,7 +15,7 @@ from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.metrics import pairing
 from tacpipe.metrics.forecast import Interval
-from tacpipe.report import blocks, charts, contents
+from tacpipe.report import blocks, charts, learning
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
@@ -33,6 +33,7 @@ Tree = Mapping[str, Any]
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FLOOR = -1.0  # skill at which figures end
 TRACE_STEPS = (1, 5, 10)
+LOSSES = {"training": "train_loss", "validation": "val_loss"}
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
 
 
@@ -113,15 +114,15 @@ def caveats(context: Context) -> list[str]:
         f"In the first run, {effective[0]}." if effective else "",
         both if any(len(one) > 1 for one in known.values()) else "",
         "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it perfectly."
-        if any(by_method.actions(run.config) == "planned" for run in runs)
+        if any(run.actions == "planned" for run in runs)
         else "",
-        "; ".join(f"{name}: {single_run.EXPLAINED[name]}" for name in _predictors(context)) + ".",
+        "; ".join(f"{single_run.spelled(name)}: {single_run.EXPLAINED[name]}" for name in _predictors(context)) + ".",
     ]  # fmt: skip
 
 
 def about_run(run: Run) -> dict[str, Cell | str]:
     """Return more columns of the table of runs."""
-    epochs = len(contents.history(run.dataset))
+    epochs = len(run.details.history)
     return {"epochs": str(epochs) if epochs else NONE}
 
 
@@ -259,7 +260,7 @@ def _anticipation(context: Context) -> list[Fold]:
     source = max(context.methods, key=lambda one: len(one.runs))
     described = [(one.name, anticipation(one, MODEL)) for one in context.methods]
     names = {name for run in source.runs for name in run.details.metrics.get("anticipation", {})} - {MODEL}
-    described += [(name, anticipation(source, name)) for name in sorted(names)]
+    described += [(single_run.spelled(name), anticipation(source, name)) for name in sorted(names)]
     measures = ("median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
     rows: list[Sequence[str | Cell]] = [
         [name, f"{found['events']:,.0f}", number(100 * found["recall"]), *(number(found[key]) for key in measures)]
@@ -355,25 +356,16 @@ def _training(context: Context) -> list[Fold]:
     """Return training and validation loss by epoch of the representative runs."""
     drawn = []
     for method, run in _representatives(context):
-        history = contents.history(run.dataset)
+        history = run.details.history
         if not history:
             continue
         best = min(history, key=lambda line: line["val_loss"])
-        epochs = [float(line["epoch"]) for line in history]
-        several = [
-            Line(name, epochs, [float(line[key]) for line in history])
-            for name, key in (("training", "train_loss"), ("validation", "val_loss"))
-        ]
-        caption = (
+        curves = {name: [[one[key] for one in history]] for name, key in LOSSES.items()}
+        spec = {**learning.by_epoch(curves, "loss (scaled latents)", log=True), "height": 190}
+        kept = (
             f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
         )
-        drawn.append(
-            Chart(
-                f"Loss by epoch: {method.name}",
-                charts.lines(several, "epoch", "loss (scaled latents)", log=True, height=190),
-                caption,
-            )
-        )
+        drawn.append(Chart(f"Loss by epoch: {method.name}", spec, kept))
     return fold("Training", Charts(drawn)) if drawn else []
 
 
@@ -405,12 +397,11 @@ def _sums(row: Row, steps: Sequence[int], known: bool | None, group: str = "both
 
 
 def _of(method: Method, predictor: str, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
-    found: dict[tuple[Any, str], AnyFloats] = {}
-    for run in method.runs:
-        for name, one in reading.sums(run.details, predictor, steps, known, group).items():
-            key = run.seed, name
-            found[key] = found[key] + one if key in found else one
-    return found
+    return pairing.added(
+        ((run.seed, name), one)
+        for run in method.runs
+        for name, one in reading.sums(run.details, predictor, steps, known, group).items()
+    )
 
 
 def _skill_of(steps: int) -> Callable[[AnyFloats], AnyFloats]:
@@ -457,5 +448,5 @@ def _families(methods: Sequence[Method], what: str) -> list[list[Method]]:
     """Return the methods that differ in one setting alone, where there are several such."""
     found: dict[str, list[Method]] = {}
     for method in methods:
-        found.setdefault(by_method.key_without(method, what), []).append(method)
+        found.setdefault(method.key_without(what), []).append(method)
     return [family for family in found.values() if len(family) > 1]

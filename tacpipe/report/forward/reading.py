@@ -5,26 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.runs import Errors, Question
-from tacpipe.comparison.runs import Run as Compared
+from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.comparison.specification import Kind
-from tacpipe.report import provenance
 from tacpipe.report.forward import methods
 from tacpipe.report.forward.error_sums import BASELINE
-from tacpipe.report.forward.methods import Run
+from tacpipe.report.forward.methods import Result
 from tacpipe.tasks.forward import headline, units
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
     from tacpipe.datasets.dataset import Dataset
 
-PAPERS_SETS = ("xela-flat",)  # whose paper's tables and figures stand next to ours
 ORACLES = ("codec", "codec_anchored")  # of what knows the true future
 
 
-def read(results: Sequence[Dataset]) -> list[Compared]:
+def read(results: Sequence[Dataset]) -> list[Run]:
     """Return the runs of results that hold error sums of recordings which the model has not seen."""
-    every = [Run.read(one) for one in results if methods.comparable(one)]
+    every = [Result(one) for one in results if methods.comparable(one)]
     runs = [one for one in every if one.errors.recordings]
     if not runs:
         return []
@@ -47,8 +44,12 @@ def kind(predictor: str) -> Kind:
 
 
 def called(predictor: str) -> str:
-    """Return what tables call a predictor: its name in ``metrics.json``."""
-    return predictor.removeprefix("model_")
+    """Return what tables call a predictor: its name in ``metrics.json`` with spaces.
+
+    >>> called("model_anchored"), called("codec_persistence PCA-20")
+    ('anchored', 'codec persistence PCA-20')
+    """
+    return predictor.removeprefix("model_").replace("_", " ")
 
 
 def through(predictor: str, codec: str) -> str:
@@ -60,13 +61,13 @@ def through(predictor: str, codec: str) -> str:
     return f"{predictor} {codec}" if predictor.startswith("codec") else predictor
 
 
-def shown_steps(runs: Sequence[Run]) -> tuple[int, ...]:
+def shown_steps(runs: Sequence[Result]) -> tuple[int, ...]:
     """Return the steps to report on, those that all runs predict."""
     return headline.shown(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
 
 
 def sums(
-    run: Run, predictor: str, steps: Sequence[int], known: bool | None = None, group: str = "both"
+    run: Result, predictor: str, steps: Sequence[int], known: bool | None = None, group: str = "both"
 ) -> dict[str, AnyFloats]:
     """Return what `headline.sums` adds up, by recording; empty where a predictor has no errors in a group of channels."""
     errors = run.errors
@@ -83,11 +84,11 @@ def sums(
     }  # fmt: skip
 
 
-def _run(run: Run, steps: Sequence[int], usual: str) -> Compared:
+def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
     config = run.config
     measure = headline.measure(steps, units.of_model(config))
-    elsewhere = methods.timeline(config) != usual
-    other = f"{methods.timeline(config)} timeline" if elsewhere else ""
+    elsewhere = run.timeline != usual
+    other = f"{run.timeline} timeline" if elsewhere else ""
     questions = {}
     for known in (True, False) if run.errors.named else (None,):
         by_predictor = {
@@ -98,17 +99,16 @@ def _run(run: Run, steps: Sequence[int], usual: str) -> Compared:
         if by_predictor:
             part = ", ".join(filter(None, (headline.PARTS[known], other)))
             questions[Question(part, place=2 * elsewhere + (known is False))] = Errors(measure, by_predictor)
-    params = config["params"]
-    return Compared(
+    return Run(
         run.dataset,
         headline.TASK,
-        methods.name(config, usual),
-        methods.settings(config),
+        run.name(usual),
+        run.settings,
         questions,
         family=str(config["architecture"]).replace("_", " "),
-        seed=params.get("seed"),
-        simulated=provenance.simulated(run.dataset),
-        published=provenance.published(run.dataset, PAPERS_SETS),
-        control=methods.actions(config) == "shuffled",
+        seed=run.given.get("seed"),
+        simulated=run.simulated,
+        published=run.published,
+        control=run.actions == "shuffled",
         details=run,
     )

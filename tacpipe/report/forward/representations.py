@@ -45,7 +45,7 @@ def folds(context: Context) -> list[Fold]:
     """Return the recurrent model on each representation, and codecs' variance, covariance and loss."""
     codecs = sweep.read([*(run.dataset for run in context.runs), *context.others])
     published = context.published or (
-        not context.runs and all(provenance.published(one, reading.PAPERS_SETS) for one in context.bare)
+        not context.runs and all(provenance.published(one, by_method.Result.SETS) for one in context.bare)
     )
     own = _table(context) if context.runs else None
     note = OWN_SPACE + (

@@ -47,13 +47,18 @@ def folds(method: str, run: Run) -> list[Fold]:
     )
 
 
+def spelled(predictor: str) -> str:
+    """Return a name of ``metrics.json`` as texts have it."""
+    return predictor.replace("_", " ")
+
+
 def _rmse(run: Run, names: Sequence[str], unit: str) -> list[Chart]:
     metrics, rate_hz = run.details.metrics, float(run.details.config.get("rate_hz") or 0)
     steps = sorted(int(name[1:]) for name in _both(metrics[names[0]]["mse_counts"]) if name != "mean")
     x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
     several = [
         Line(
-            name,
+            spelled(name),
             x,
             [float(np.sqrt(_both(metrics[name]["mse_counts"])[f"t{step}"])) for step in steps],
             dashed=name != MODEL,
@@ -81,17 +86,17 @@ def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]
 
     errors = {"mae_counts": f"Mean absolute error ({unit})", "mse_counts": f"Mean squared error ({unit}²)"}
     found = [
-        table(title, heads, [[name, *cells(_both(metrics[name][measure]))] for name in names])
+        table(title, heads, [[spelled(name), *cells(_both(metrics[name][measure]))] for name in names])
         for measure, title in errors.items()
     ]
     rows: list[Sequence[str | Cell]] = [
-        [name, *cells(metrics[name]["mse_feature"])] for name in names if "mse_feature" in metrics[name]
+        [spelled(name), *cells(metrics[name]["mse_feature"])] for name in names if "mse_feature" in metrics[name]
     ]
     found += [table("Mean squared error (latents scaled to ±1)", heads, rows)] if rows else []
     rows = [[measure, *(_stated(skill.get(step, {})) for step in shown)] for measure, skill in metrics["skill"].items()]
     found.append(table("Skill over persistence, with 95 % interval", heads, rows))
     rows = [
-        [f"{name}, {group}", *cells(metrics[name]["mae_counts"][group])]
+        [f"{spelled(name)}, {group}", *cells(metrics[name]["mae_counts"][group])]
         for group in groups
         if group not in ("both", "all")
         for name in names[:2]
@@ -103,7 +108,8 @@ def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]
         if "skill" in part:
             objects = f"{name} objects ({counted(part['counts']['recordings'], 'recordings')})"
             rows += [
-                [f"{objects}, {one} ({unit})", *cells(_both(part[one]["mae_counts"]))] for one in _ordered(part)[:2]
+                [f"{objects}, {spelled(one)} ({unit})", *cells(_both(part[one]["mae_counts"]))]
+                for one in _ordered(part)[:2]
             ]
             rows.append([f"{objects}, skill", *(_stated(part["skill"]["mse_counts"].get(step, {})) for step in shown)])
     return (

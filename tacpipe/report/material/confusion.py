@@ -7,40 +7,44 @@ from collections.abc import Sequence
 import numpy as np
 
 from tacpipe.arrays import Ints
+from tacpipe.comparison.runs import Method
 from tacpipe.report import charts
 from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold, listed
-from tacpipe.report.material import comparison, tables
-from tacpipe.report.material.methods import Method, shown
+from tacpipe.report.context import Context
+from tacpipe.report.material import comparison
+from tacpipe.report.material.methods import of, plain, sensors_of, shown
 from tacpipe.report.material.predictions import MODEL, NOTHING
 
 MOST_PAIRS = 3  # pairs of materials in words
 NOTE = "Unseen slides. Blue: named right; orange: wrong. The stronger, the larger the fraction of a material's slides."
 
 
-def folds(methods: Sequence[Method]) -> list[Fold]:
+def folds(context: Context) -> list[Fold]:
     """Return the confusions of the best method and of the joint one, a chart a sensor."""
     drawn = []
-    for sensor in tables.sensors_of(methods):
-        best = tables.leader(methods, sensor)
-        joint = comparison.main(methods)
-        chosen = [best, *([joint] if joint is not best and joint and joint.of(sensor) else [])]
-        drawn += [_chart(one, sensor) for one in chosen if one]
+    joint = comparison.main(context.methods)
+    for sensor in sensors_of([one for one in context.methods if plain(one.settings)]):
+        compared = next((one for one in context.comparisons if one.question.part == shown(sensor)), None)
+        best = compared.best.method if compared and compared.best else None
+        chosen = dict.fromkeys(one for one in (best, joint) if one and of(one, sensor))
+        drawn += [_chart(one, sensor) for one in chosen]
     return fold("Which materials are confused", Charts(drawn), Note(NOTE)) if drawn else []
 
 
 def counted(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
     """Return how often each material was taken for each, pooled over runs, (material, named), and the materials."""
-    truth, predicted = [], []
-    for run in method.of(sensor):
-        rows = run.predictions.of(sensor)
+    import pandas as pd
+
+    tables = []
+    for run in of(method, sensor):
+        rows = run.details.predictions.of(sensor)
         described = rows.predicted[MODEL] != NOTHING
-        truth.append(rows.named(rows.materials[described]))
-        predicted.append(rows.named(rows.predicted[MODEL][described]))
-    materials, codes = np.unique(np.concatenate([*truth, *predicted]), return_inverse=True)
-    pairs = codes.reshape(2, -1)
-    counts = np.zeros((len(materials), len(materials)), dtype=np.int64)
-    np.add.at(counts, (pairs[0], pairs[1]), 1)
-    return counts, materials.tolist()
+        truth, named = (rows.named(one[described]) for one in (rows.materials, rows.predicted[MODEL]))
+        tables.append(pd.DataFrame({"truth": truth, "named": named}))
+    every = pd.concat(tables)
+    materials = sorted({*every["truth"], *every["named"]})
+    counts = pd.crosstab(every["truth"], every["named"]).reindex(index=materials, columns=materials, fill_value=0)
+    return counts.to_numpy(dtype=np.int64), materials
 
 
 def worst(counts: Ints, materials: Sequence[int | str]) -> str:
@@ -57,8 +61,8 @@ def worst(counts: Ints, materials: Sequence[int | str]) -> str:
 
 def _chart(method: Method, sensor: str) -> Chart:
     counts, materials = counted(method, sensor)
-    runs = len(method.of(sensor))
-    label = method.of(sensor)[0].predictions.naming.key
+    runs = len(of(method, sensor))
+    label = of(method, sensor)[0].details.predictions.naming.key
     names = [str(one) for one in materials]
     spec = {**charts.matrix(counts, names, label, "named"), "usermeta": {"most": 150 + 30 * len(names)}}
     pooled = f", {runs} runs pooled" if runs > 1 else ""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
+from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, charts, learning
 from tacpipe.report.blocks import Chart, Charts, Fold
 from tacpipe.report.charts import Line
-from tacpipe.report.material import comparison, tables, wording
+from tacpipe.report.learning import stated
+from tacpipe.report.material import comparison
 from tacpipe.report.material.accuracy import accuracy
-from tacpipe.report.material.methods import Method, Run, shown
+from tacpipe.report.material.methods import Result, line, of, plain, sensors_of, shown
 
 Points = dict[int, tuple[float, float, float]]  # accuracy and its bounds, by number of training slides
 
@@ -22,15 +25,15 @@ def training(methods: Sequence[Method]) -> list[Fold]:
 
 def convergence(methods: Sequence[Method]) -> list[Chart]:
     """Return validation accuracy by epoch, Figure 9 of the paper, one chart a sensor; none without epochs."""
-    chosen = [one for kind in ("RAEC joint", "RAEC independent") for one in methods if one.plain and one.kind == kind]
+    networks = [one for one in methods if plain(one.settings)]
+    chosen = [one for family in ("RAEC joint", "RAEC independent") for one in networks if one.family == family]
     order = [one.name for one in chosen]
     drawn = []
-    for sensor in tables.sensors_of(chosen):
-        curves = {one.name: [curve for run in one.of(sensor) if (curve := _validation(run, sensor))] for one in chosen}
-        held = {name: found for name, found in curves.items() if found}
+    for sensor in sensors_of(chosen):
+        held = learning.of_methods(chosen, functools.partial(_validation, sensor=sensor))
         if held:
             spec = learning.by_epoch(held, "validation accuracy (%)", order)
-            title = wording.form(
+            title = blocks.form(
                 "Figure 9", f"validation accuracy on {shown(sensor)}", all(one.published for one in chosen)
             )
             drawn.append(Chart(title, spec, "Thick: mean over runs; thin: single runs."))
@@ -39,44 +42,38 @@ def convergence(methods: Sequence[Method]) -> list[Chart]:
 
 def alignment(methods: Sequence[Method]) -> list[Chart]:
     """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; none where none is given."""
-    chosen = [one for one in methods if (one.plain or comparison.control(one)) and one.settings["joint"]]
-    curves = {one.name: [curve for run in one.runs if (curve := aligned(run))] for one in chosen}
-    held = {name: found for name, found in curves.items() if found}
+    chosen = [one for one in methods if (plain(one.settings) or comparison.control(one)) and one.settings["joint"]]
+    held = learning.of_methods(chosen, aligned)
     if not held:
         return []
     spec = learning.by_epoch(held, "mean squared latent difference", log=True)
-    title = wording.form("Figure 10", "latent difference of training pairs", all(one.published for one in chosen))
+    title = blocks.form("Figure 10", "latent difference of training pairs", all(one.published for one in chosen))
     caption = ""
     if any(comparison.control(one) for one in chosen):
         caption = "Pairs of permuted materials fall as real ones do where labels alone drive the alignment."
     return [Chart(title, spec, caption)]
 
 
-def aligned(run: Run) -> list[float]:
+def aligned(run: Result) -> list[float]:
     """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not state it."""
-    described = [line.get("alignment") for line in run.history]
-    return (
-        [float("nan") if one is None else float(one) for one in described]
-        if any(one is not None for one in described)
-        else []
-    )
+    return stated([one.get("alignment") for one in run.history])
 
 
 def few_slides(methods: Sequence[Method]) -> list[Fold]:
     """Return accuracy over the number of training slides, a chart a sensor; none where all have as many."""
-    chosen = [one for one in methods if one.differs_only("few", "subsample_sensor")]
+    chosen = [one for one in methods if plain(one.settings, "few", "subsample_sensor")]
     drawn = []
-    for sensor in tables.sensors_of(chosen):
+    for sensor in sensors_of(chosen):
         points: dict[str, Points] = {}
         for method in chosen:
             fewer = {method.settings["subsample_sensor"], method.settings["few_of"]} - {""}
             if fewer <= {sensor}:
-                _add(points, method.line, method, sensor)
+                _add(points, line(method), method, sensor)
             if fewer == {sensor}:  # such a line ends where all sensors have all slides
                 loose = ("few", "few_of", "subsample_sensor", "subsample_percent")
                 for one in chosen:
-                    if one.plain and one.key_without(*loose) == method.key_without(*loose):
-                        _add(points, method.line, one, sensor)
+                    if plain(one.settings) and one.key_without(*loose) == method.key_without(*loose):
+                        _add(points, line(method), one, sensor)
         held = {name: one for name, one in sorted(points.items()) if len(one) > 1}
         if held:
             several = []
@@ -86,7 +83,7 @@ def few_slides(methods: Sequence[Method]) -> list[Fold]:
                     [100 * value for value in part] for part in zip(*(found[at] for at in slides), strict=True)
                 )
                 several.append(Line(name, slides, mean, low, high))
-            chance = 100 / max(len(chosen[0].runs[0].config.get("classes", ())), 1)
+            chance = 100 / max(len(chosen[0].details[0].config.get("classes", ())), 1)
             spec = charts.lines(several, "training slides", "accuracy (%)", level=("chance", chance))
             caption = "Unseen slides, with 95 % intervals; dashed across: chance."
             if any("other sensor whole" in name for name in held):
@@ -97,21 +94,17 @@ def few_slides(methods: Sequence[Method]) -> list[Fold]:
     return blocks.fold("Few slides", Charts(drawn)) if drawn else []
 
 
-def _add(points: dict[str, Points], line: str, method: Method, sensor: str) -> None:
+def _add(points: dict[str, Points], name: str, method: Method, sensor: str) -> None:
     """Add what a method states to a line."""
-    found = accuracy(method.of(sensor), sensor)
+    found = accuracy(of(method, sensor), sensor)
     if found is None:
         return
-    described = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
+    described = [run.details.learned[sensor] for run in of(method, sensor) if sensor in run.details.learned]
     if described:
-        points.setdefault(line, {})[max(described)] = (found.fraction, found.low, found.high)
+        points.setdefault(name, {})[max(described)] = (found.fraction, found.low, found.high)
 
 
-def _validation(run: Run, sensor: str) -> list[float]:
+def _validation(run: Result, sensor: str) -> list[float]:
     """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is given."""
-    described = [line.get("val", {}).get(sensor, {}).get("accuracy") for line in run.history]
-    return (
-        [float("nan") if one is None else 100 * one for one in described]
-        if any(one is not None for one in described)
-        else []
-    )
+    found = [one.get("val", {}).get(sensor, {}).get("accuracy") for one in run.history]
+    return [100 * value for value in stated(found)]

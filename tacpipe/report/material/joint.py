@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tacpipe.report.blocks import number
+from tacpipe.comparison.runs import Method
+from tacpipe.report.blocks import number, p_value, signed
 from tacpipe.report.material import comparison, curves, wording
 from tacpipe.report.material.accuracy import Accuracy, accuracy
 from tacpipe.report.material.comparison import Difference
-from tacpipe.report.material.methods import Method, shown
+from tacpipe.report.material.methods import of, sensors_of, shown
 from tacpipe.report.material.predictions import SWAPPED
 
 ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
@@ -24,16 +25,16 @@ NO_CONTROL = (
 
 def effects(methods: Sequence[Method]) -> list[str]:
     """Return what joint learning does, and what controls state of it."""
-    main = comparison.main([one for one in methods if one.plain])
-    if main is None:
-        return []
-    alone = [one for one in methods if one.plain and one.kind == "RAEC independent"]
-    return [*_joint(main, alone), control(main, [one for one in methods if comparison.control(one)])]
+    main = comparison.main(methods)
+    return (
+        [*_joint(main, comparison.alone(methods, main)), control(main, comparison.permuted(methods, main))]
+        if main
+        else []
+    )
 
 
-def control(joint: Method, controls: Sequence[Method]) -> str:
+def control(joint: Method, permuted: Method | None) -> str:
     """Return what training on pairs of permuted materials states of the alignment of real ones, as far as there is one."""
-    permuted = comparison.nearest(joint, controls)
     if permuted is None:
         return NO_CONTROL
     apart = [_last_alignment(one) for one in (joint, permuted)]
@@ -44,7 +45,7 @@ def control(joint: Method, controls: Sequence[Method]) -> str:
         {
             name: found.fraction - swaps[at][name].fraction
             for name in swaps[0]
-            if (found := accuracy(one.of(name), name))
+            if (found := accuracy(of(one, name), name))
         }
         for at, one in enumerate((joint, permuted))
     ]
@@ -72,14 +73,13 @@ def control(joint: Method, controls: Sequence[Method]) -> str:
     return f"Pairs of permuted materials {verdict} as real ones ({numbers})."
 
 
-def _joint(joint: Method, others: Sequence[Method]) -> list[str]:
+def _joint(joint: Method, alone: Method | None) -> list[str]:
     """Return what learning jointly changes, a sentence a sensor."""
-    alone = comparison.nearest(joint, others)
     if alone is None:
         return ["No independently trained RAEC is among the results, so what joint learning does was not tested."]
     described = []
-    for sensor in joint.sensors:
-        found = comparison.difference(joint.of(sensor), alone.of(sensor), sensor)
+    for sensor in sensors_of([joint]):
+        found = comparison.difference(joint, alone, sensor)
         if found:
             verb = {
                 "better": f"helps RAEC on {shown(sensor)}",
@@ -91,21 +91,21 @@ def _joint(joint: Method, others: Sequence[Method]) -> list[str]:
 
 
 def _difference(found: Difference) -> str:
-    tests = [f"McNemar p = {wording.p_value(found.mcnemar)}"]
-    if not math.isnan(found.paired):
-        tests.append(f"paired t over {found.units} {found.unit} p = {wording.p_value(found.paired)}")
+    tests = [f"McNemar p = {p_value(found.mcnemar).text}"]
+    if not math.isnan(found.runs.p):
+        tests.append(f"paired t over {found.runs.units} {found.runs.unit} p = {p_value(found.runs.p).text}")
+    mean, low, high = (signed(one, 1) for one in (found.gain.mean, found.gain.low, found.gain.high))
     return (
-        f"{wording.points(found.mean)} points (95 % interval {wording.points(found.low)} to {wording.points(found.high)}) "
-        f"on the same {found.slides} slides, {', '.join(tests)}".replace("= <", "<")
-    )
+        f"{mean} points (95 % interval {low} to {high}) on the same {found.slides} slides, {', '.join(tests)}"
+    ).replace("= <", "<")
 
 
 def _last_alignment(method: Method) -> float:
     """Return the latent difference after the last epoch, the mean over runs."""
-    last = [curve[-1] for run in method.runs if (curve := curves.aligned(run))]
+    last = [curve[-1] for one in method.details if (curve := curves.aligned(one))]
     return float(np.mean(last)) if last else float("nan")
 
 
 def _swapped(method: Method) -> dict[str, Accuracy]:
-    described = {sensor: accuracy(method.of(sensor), sensor, SWAPPED) for sensor in method.sensors}
+    described = {sensor: accuracy(of(method, sensor), sensor, SWAPPED) for sensor in sensors_of([method])}
     return {sensor: found for sensor, found in described.items() if found}

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
+from tacpipe.comparison.runs import Method
 from tacpipe.report import charts
 from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
 from tacpipe.report.material import comparison
-from tacpipe.report.material.methods import Method, Run, ordered, shown
+from tacpipe.report.material.methods import Result, ordered, shown
 from tacpipe.report.material.predictions import Predictions
 
 NOTE = (
@@ -26,9 +27,8 @@ def folds(methods: Sequence[Method]) -> list[Fold]:
     main = comparison.main(methods)
     if main is None:
         return []
-    alone = comparison.nearest(main, [one for one in methods if one.plain and one.kind == "RAEC independent"])
-    permuted = comparison.nearest(main, [one for one in methods if comparison.control(one)])
-    drawn = [found for one in (main, permuted, alone) if one and (found := _chart(one))]
+    chosen = main, comparison.permuted(methods, main), comparison.alone(methods, main)
+    drawn = [found for one in chosen if one and (found := _chart(one))]
     return fold("Latents", Charts(drawn), Note(NOTE)) if drawn else []
 
 
@@ -62,12 +62,12 @@ def together(one: Predictions, other: Predictions, partners: Mapping[int, int]) 
 
 def _chart(method: Method) -> Chart | None:
     """Return the latents of one run of a method, or of one a sensor where each has its own model."""
-    rows = _rows(method.runs)
+    rows = _rows(method.details)
     if rows is None:
         return None
     sensors, parts = rows
     points = projected([_latents(part) for part in parts])
-    partners = {int(one): int(other) for one, other in method.runs[0].config.get("partners", {}).items()}
+    partners = {int(one): int(other) for one, other in method.details[0].config.get("partners", {}).items()}
     same, of = together(parts[0], parts[1], partners)
     dots = [
         {"name": str(name), "x": float(x), "y": float(y), "shape": shown(sensor), "tip": str(recording)}
@@ -99,10 +99,10 @@ def _lines(
     ]
 
 
-def _rows(runs: Sequence[Run]) -> tuple[tuple[str, str], list[Predictions]] | None:
+def _rows(runs: Sequence[Result]) -> tuple[tuple[str, str], list[Predictions]] | None:
     """Return two sensors and the rows of each, of the first run that holds both, or else of the first of each."""
     held = [run for run in runs if run.predictions.latents is not None]
-    sensors = ordered({sensor for run in held for sensor in run.sensors})[:2]
+    sensors = ordered([sensor for run in held for sensor in run.sensors])[:2]
     if len(sensors) < 2:
         return None
     both = next((run for run in held if set(sensors) <= set(run.sensors)), None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import Run as Compared
+from tacpipe.comparison.runs import Method, Run
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, Note
 from tacpipe.report.context import Context
@@ -13,18 +13,19 @@ from tacpipe.report.material import (
     accuracy,
     confusion,
     curves,
-    grouping,
     joint,
     latents,
     printed,
     profiles,
+    reading,
     reduction,
     tables,
     wording,
     zero_shot,
 )
-from tacpipe.report.material.methods import Method, Run, shown
+from tacpipe.report.material.methods import of, sensors_of, shown
 from tacpipe.report.material.predictions import LAST, LEVEL, MODEL
+from tacpipe.tasks.material import headline
 
 PAIRED = (
     "A slide that several runs evaluated counts as the fraction of runs that named it right; the interval is from drawing "
@@ -35,8 +36,7 @@ PAIRED = (
 
 def folds(context: Context) -> list[Fold]:
     """Return what materials have of their own."""
-    methods = grouping.grouped([run.details for run in context.runs])
-    plain = [one for one in methods if one.plain]
+    methods = context.methods
     return [
         *blocks.fold(
             "Joint learning",
@@ -48,7 +48,7 @@ def folds(context: Context) -> list[Fold]:
         *blocks.fold("Fewer slides of one sensor", *reduction.tables(methods)),
         *curves.few_slides(methods),
         *zero_shot.folds(methods),
-        *confusion.folds(plain),
+        *confusion.folds(context),
         *latents.folds(methods),
         *curves.training(methods),
         *profiles.folds(context.others),
@@ -57,14 +57,19 @@ def folds(context: Context) -> list[Fold]:
 
 def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
     """Return more columns of the table of all methods: counts, the last epoch, skill over the mean level, the paper's."""
-    runs = [run.details for run in context.runs if comparison.question in run.questions]
-    sensor = next(one for run in runs for one in run.sensors if comparison.question.part.split(",")[0] == shown(one))
+    runs = [run for run in context.runs if comparison.question in run.questions]
+    asked = (one for run in runs for one in run.details.sensors if reading.question(run, one) == comparison.question)
+    sensor = next(asked)
 
-    def of(row: Row) -> list[Run]:
-        return [run.details for run in row.method.of(comparison.question)]
+    def runs_of(row: Row) -> list[Run]:
+        return row.method.of(comparison.question)
+
+    def named_right(row: Row) -> Cell:
+        counted = row.predictor != headline.CHANCE  # which names none
+        return wording.fraction(accuracy.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
 
     def last(row: Row) -> Cell:
-        found = accuracy.accuracy(of(row), sensor, LAST) if row.predictor == MODEL else None
+        found = accuracy.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
         return Cell(wording.percent(found.fraction), value=found.fraction) if found else Cell(NONE)
 
     def paper(row: Row) -> Cell:
@@ -72,28 +77,26 @@ def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callabl
         return Cell(NONE) if value is None else Cell(f"{value:.2f}", value=value)
 
     found: list[tuple[str, Callable[[Row], Cell]]] = [
-        ("slides named right", lambda row: wording.fraction(accuracy.accuracy(of(row), sensor, row.predictor))),
-        ("skill over the mean level", lambda row: blocks.number(accuracy.skill(of(row), sensor, row.predictor), 3)),
+        ("slides named right", named_right),
+        (
+            "skill over the mean level",
+            lambda row: blocks.number(accuracy.skill(runs_of(row), sensor, row.predictor), 3),
+        ),
     ]
-    if any(LAST in run.predictions.predicted for run in runs):
+    if any(LAST in run.details.predictions.predicted for run in runs):
         found.append(("last epoch (%)", last))
     return [*found, ("paper, Table I (%)", paper)] if context.published else found
 
 
 def caveats(context: Context) -> list[str]:
     """Return what must be known about these numbers."""
-    methods = grouping.grouped([run.details for run in context.runs])
+    methods = context.methods
     return [_basis(methods), _pooled(methods), wording.caution(methods), _not_run(methods)] if methods else []
-
-
-def about_run(run: Compared) -> dict[str, str | Cell]:
-    """Return more columns of the table of runs."""
-    return dict(tables.about_run(run.details))
 
 
 def _pooled(methods: Sequence[Method]) -> str:
     """Return what the table of accuracies of these methods holds."""
-    runs = [run for one in methods for run in one.runs]
+    runs = [run for one in methods for run in one.details]
     published = all(one.published for one in methods)
     predicted = {name for run in runs for name in run.predictions.predicted}
     described = [
@@ -119,14 +122,13 @@ def _pooled(methods: Sequence[Method]) -> str:
 def _basis(methods: Sequence[Method]) -> str:
     """Return what all rests on: slides, training slides, and settings."""
     described = []
-    for sensor in tables.sensors_of(methods):
-        names = {
-            str(name) for one in methods for run in one.of(sensor) for name in run.predictions.of(sensor).recordings
-        }
-        trained = sorted({run.learned[sensor] for one in methods for run in one.runs if sensor in run.learned})
+    for sensor in sensors_of(methods):
+        slides = [run.details.predictions.of(sensor) for one in methods for run in of(one, sensor)]
+        names = {str(name) for one in slides for name in one.recordings}
+        trained = sorted({run.learned[sensor] for one in methods for run in one.details if sensor in run.learned})
         counts = f" after training on {blocks.listed([f'{count:,}' for count in trained])}" if trained else ""
         described.append(f"{len(names):,} slides of {sensor}{counts}")
-    settings, runs = {}, [run for one in methods for run in one.runs]
+    settings, runs = {}, [run for one in methods for run in one.details]
     for name in ("seed", "epochs"):
         values = {run.params[name] for run in runs if name in run.params and (name == "seed" or run.history)}
         if values:
@@ -139,7 +141,7 @@ def _not_run(methods: Sequence[Method]) -> str:
     """Return what the paper printed of methods that were not run, where the slides are the paper's."""
     if not all(one.published for one in methods):
         return ""
-    missing = [name for name in printed.ACCURACIES if all(one.kind != name for one in methods)]
+    missing = [name for name in printed.ACCURACIES if all(one.family != name for one in methods)]
     missed = [
         f"{name}: {', '.join(f'{shown(sensor)} {value:.2f} %' for sensor, value in printed.ACCURACIES[name].items())}"
         for name in missing

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.report import charts, provenance
-from tacpipe.report.blocks import Chart, Charts, Fold, Note, listed
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, counted, form, listed
 from tacpipe.report.charts import Line
-from tacpipe.report.material import wording
-from tacpipe.report.material.methods import PAPERS_SETS, ordered, shown
+from tacpipe.report.material.methods import Result, ordered, shown
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
@@ -30,8 +29,8 @@ def folds(datasets: Sequence[Dataset]) -> list[Fold]:
     shards = [shard for one in datasets for shard in one.recordings.values() if reads(one)]
     if not shards:
         return []
-    published = all(provenance.published(one, PAPERS_SETS) for one in datasets)
-    sensors = ordered({str(shard.attributes.get("sensor", "")) for shard in shards})
+    published = all(provenance.published(one, Result.SETS) for one in datasets)
+    sensors = ordered([str(shard.attributes.get("sensor", "")) for shard in shards])
     parts = [_counts([shard for shard in shards if shard.attributes.get("sensor", "") == one], one) for one in sensors]
     drawn: list[Chart] = []
     for sensor in sensors:
@@ -54,7 +53,7 @@ def typical(shards: Sequence[Recording]) -> Recording:
 def _counts(shards: Sequence[Recording], sensor: str) -> str:
     """Return how many slides there are of a sensor, and how many kept to the protocol."""
     outside = [one for one in shards if one.attributes.get("outside_protocol")]
-    some = f"{len(shards):,} slide{'s' if len(shards) > 1 else ''}"
+    some = counted(len(shards), "slides")
     if not any("outside_protocol" in one.attributes for one in shards):
         return f"{some} of {shown(sensor)}."
     text = f"{some} of {shown(sensor)}, {len(outside):,} of them outside the protocol"
@@ -87,5 +86,5 @@ def _charts(shard: Recording, sensor: str, published: bool) -> list[Chart]:
         if several:
             spec = charts.lines(several, "time (s)", quantity, shade=shade, points=False, height=190)
             caption = f"{shard.name}, the slide of median force. Shaded: the slide."
-            drawn.append(Chart(wording.form(number, what, published), spec, caption))
+            drawn.append(Chart(form(number, what, published), spec, caption))
     return drawn

@@ -1,26 +1,23 @@
-"""Results on materials as runs of the comparison engine."""
+"""Results on materials as runs of the comparison engine: a question is the slides of a sensor."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.comparison.runs import Errors, Question
-from tacpipe.comparison.runs import Run as Compared
+from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.comparison.specification import Kind
-from tacpipe.report.material import grouping
-from tacpipe.report.material.accuracy import named_right
-from tacpipe.report.material.methods import Method, Run, base_name, shown
-from tacpipe.report.material.predictions import LAST, LEVEL, MODEL, SHUFFLED, SWAPPED
+from tacpipe.report.material import methods
+from tacpipe.report.material.methods import Result
+from tacpipe.report.material.predictions import LAST, LEVEL, MODEL, NOTHING, SHUFFLED, SWAPPED
 from tacpipe.tasks.material import headline
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
     from tacpipe.datasets.dataset import Dataset
 
-USUAL = grouping.USUAL
 CALLED = {
     LEVEL: headline.BASELINES[LEVEL],
     SHUFFLED: "trained on shuffled labels",
@@ -30,12 +27,11 @@ CALLED = {
 KINDS: dict[str, Kind] = {MODEL: "model", LEVEL: "baseline", headline.CHANCE: "baseline", SHUFFLED: "control"}
 
 
-def read(results: Sequence[Dataset]) -> list[Compared]:
+def read(results: Sequence[Dataset]) -> list[Run]:
     """Return the runs of results that hold predictions of slides which the model has not seen."""
-    runs = [Run.read(one) for one in results if "predictions" in one.recordings]
-    methods = grouping.grouped([run for run in runs if run.sensors])
-    found = {id(run.dataset): _run(run, method) for method in methods for run in method.runs}
-    return [found[id(one)] for one in results if id(one) in found]
+    every = [Result(one) for one in results if "predictions" in one.recordings]
+    held = [one for one in every if one.sensors]
+    return [_run(*pair) for pair in zip(held, methods.settings(held), strict=True)]
 
 
 def kind(predictor: str) -> Kind:
@@ -48,33 +44,41 @@ def called(predictor: str) -> str:
     return CALLED.get(predictor, predictor.replace("_", " "))
 
 
-def _run(run: Run, method: Method) -> Compared:
-    settings = method.settings
+def question(run: Run, sensor: str) -> Question | None:
+    """Return the question that a run answers on slides of a sensor."""
+    return next((one for one in run.questions if one.part.split(", ")[0] == methods.shown(sensor)), None)
+
+
+def right(result: Result, sensor: str, predictor: str) -> dict[str, AnyFloats]:
+    """Return whether each slide of a sensor was named right, 1 or 0, and 1, by recording."""
+    rows = result.predictions.of(sensor)
+    triples = zip(rows.recordings, rows.predicted[predictor], rows.materials, strict=True)
+    return {str(name): np.array([named == truth, 1.0]) for name, named, truth in triples if named != NOTHING}
+
+
+def _run(result: Result, settings: dict[str, Any]) -> Run:
     other = " · ".join(str(settings[name]) for name in ("split", "layout")) if settings["elsewhere"] else ""
-    classes = len(run.config.get("classes", ()))
+    classes = len(result.config.get("classes", ()))
     questions = {}
-    for sensor in run.sensors:
-        sums: dict[str, dict[str, AnyFloats]] = {
-            predictor: {name: np.array([right, 1.0]) for name, right in named_right(run, sensor, predictor).items()}
-            for predictor in run.predictions.predicted
-        }
+    for sensor in result.sensors:
+        sums = {predictor: right(result, sensor, predictor) for predictor in result.predictions.predicted}
         if classes:
             sums[headline.CHANCE] = dict.fromkeys(sums[MODEL], np.array([1 / classes, 1.0]))
-        part = ", ".join(filter(None, (shown(sensor), other)))
+        part = ", ".join(filter(None, (methods.shown(sensor), other)))
         questions[Question(part, place=int(settings["elsewhere"]))] = Errors(
             headline.MEASURE, {name: one for name, one in sums.items() if one}
         )
-    return Compared(
-        run.dataset,
+    return Run(
+        result.dataset,
         headline.TASK,
-        base_name(settings),
+        methods.base_name(settings),
         settings,
         questions,
-        family=method.kind,
-        seed=run.params.get("seed"),
-        fold=run.config.get("fold"),
-        simulated=run.simulated,
-        published=run.published,
-        control=not (method.plain or method.differs_only("elsewhere")),
-        details=run,
+        family=methods.base_name(settings, variants=False),
+        seed=result.params.get("seed"),
+        fold=result.config.get("fold"),
+        simulated=result.simulated,
+        published=result.published,
+        control=not methods.plain(settings, "elsewhere"),
+        details=result,
     )

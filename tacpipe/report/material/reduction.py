@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Table
 from tacpipe.report.material import printed, wording
 from tacpipe.report.material.accuracy import accuracy
-from tacpipe.report.material.methods import Method, kept, shown
+from tacpipe.report.material.methods import kept, of, plain, shown
 
 NUMBERS = {"biotac": "III", "roboskin": "IV"}
 SAME = 0.92  # numbers of slides in this ratio are as many
@@ -22,18 +23,18 @@ def tables(methods: Sequence[Method]) -> list[Table]:
     A sensor is reduced where it learns from a fraction of the batches, as in the paper, or where a split gave it fewer
     slides than the other. Where both were run, the paper's way counts.
     """
-    chosen = [one for one in methods if one.differs_only("subsample_sensor", "few")]
+    chosen = [one for one in methods if plain(one.settings, "subsample_sensor", "few")]
     if not all(one.published for one in chosen):
         return []
     described = {
-        str(one.settings[name]) for one in chosen if one.kind == JOINT for name in ("subsample_sensor", "few_of")
+        str(one.settings[name]) for one in chosen if one.family == JOINT for name in ("subsample_sensor", "few_of")
     }
     return [_table(chosen, sensor) for sensor in NUMBERS if sensor in described]
 
 
 def _table(methods: Sequence[Method], reduced: str) -> Table:
     columns = [(JOINT, "biotac"), (JOINT, "roboskin"), (ALONE, reduced)]
-    whole = max(run.trained.get(reduced, 0) for one in methods for run in one.runs)
+    whole = max(run.trained.get(reduced, 0) for one in methods for run in one.details)
     rows = []
     for ratio in printed.RATIOS:
         slides = kept(whole, BATCH, ratio)
@@ -45,11 +46,11 @@ def _table(methods: Sequence[Method], reduced: str) -> Table:
         fewer = [one for one in methods if one.settings["few"] and _as_many(one, slides, reduced)]
         row: list[str | Cell] = [f"{ratio} %", str(slides)]
         for (kind, sensor), paper in zip(columns, printed.REDUCED[reduced][ratio], strict=True):
-            found = [one for one in same if one.kind == kind] or [
-                one for one in fewer if one.kind == kind and (kind != JOINT or one.settings["few_of"] == reduced)
+            found = [one for one in same if one.family == kind] or [
+                one for one in fewer if one.family == kind and (kind != JOINT or one.settings["few_of"] == reduced)
             ]
             row += [_cell(found, sensor), f"{paper:.2f}"]
-        rows.append([*row, _cell([one for one in fewer if one.kind == OURS], reduced)])
+        rows.append([*row, _cell([one for one in fewer if one.family == OURS], reduced)])
     heads = ["share kept", "slides"]
     for kind, sensor in columns:
         heads += [f"{kind.removeprefix('RAEC ')}, {shown(sensor)}", "paper"]
@@ -61,12 +62,11 @@ def _table(methods: Sequence[Method], reduced: str) -> Table:
 
 def _cell(methods: Sequence[Method], sensor: str) -> str | Cell:
     """Return the accuracy of that of some methods that has most runs."""
-    held = [one for one in methods if one.of(sensor)]
-    chosen = max(held, key=lambda one: len(one.of(sensor)), default=None)
-    return wording.fraction(accuracy(chosen.of(sensor), sensor)) if chosen else NONE
+    chosen = max(methods, key=lambda one: len(of(one, sensor)), default=None)
+    return wording.fraction(accuracy(of(chosen, sensor), sensor)) if chosen else NONE
 
 
 def _as_many(method: Method, slides: int, sensor: str) -> bool:
     """Return whether a method learned from about so many slides of a sensor."""
-    described = [run.learned[sensor] for run in method.of(sensor) if sensor in run.learned]
+    described = [run.details.learned[sensor] for run in of(method, sensor) if sensor in run.details.learned]
     return bool(described) and SAME < max(described) / slides < 1 / SAME

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tacpipe.comparison.runs import Method
 from tacpipe.metrics.proportions import wilson
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, Note
+from tacpipe.report.contents import Tree
 from tacpipe.report.material import wording
-from tacpipe.report.material.methods import Method, Tree, shown
+from tacpipe.report.material.methods import plain, shown
 
 ALL, AMONG = "zero_shot", "among_held_out"
 NOTE = (
@@ -72,19 +74,19 @@ def untold(methods: Sequence[Method]) -> list[Untold]:
     """Return the runs that held materials out, those together that differ in which, by sensor."""
     alike: dict[str, list[Method]] = {}
     for method in methods:
-        if any(ALL in run.metrics for run in method.runs):
+        if any(ALL in one.metrics for one in method.details):
             alike.setdefault(method.key_without("hold_out"), []).append(method)
     found = []
     for same in alike.values():
-        runs = [(run.metrics[ALL], method) for method in same for run in method.runs if ALL in run.metrics]
+        runs = [(one.metrics[ALL], method) for method in same for one in method.details if ALL in one.metrics]
         for sensor in dict.fromkeys(name for tree, _ in runs for name in tree["accuracy"]):
             held = [(tree, method) for tree, method in runs if sensor in tree["accuracy"]]
             first = held[0][1]
             sets = {str(method.settings["hold_out"]) for _, method in held}
-            name = first.name if len(sets) == 1 else f"{first.kind} · {len(sets)} sets of materials in turn"
+            name = first.name if len(sets) == 1 else f"{first.family} · {len(sets)} sets of materials in turn"
             trees = tuple(tree for tree, _ in held)
-            main = first.differs_only("hold_out")
-            found.append(Untold(name, first.kind, main, sensor, trees, _held_out(first, sensor)))
+            main = plain(first.settings, "hold_out")
+            found.append(Untold(name, first.family, main, sensor, trees, _held_out(first, sensor)))
     return found
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
 from tacpipe.channels import biotac_sp
-from tacpipe.report import learning
+from tacpipe.comparison.runs import Method
+from tacpipe.report import blocks, learning
 from tacpipe.report.blocks import Chart
 from tacpipe.report.touch import forms, wording
-from tacpipe.report.touch.methods import PAPERS, Group, Method, Run
+from tacpipe.report.touch.methods import PAPERS, Result, main
+from tacpipe.tasks.touch import headline as headlines
 
 ALL = "all"  # stands where one network predicts all targets
 UNWATCHED = (
@@ -17,16 +20,16 @@ UNWATCHED = (
 )
 
 
-def charts_of(group: Group) -> list[Chart]:
+def charts_of(methods: Sequence[Method]) -> list[Chart]:
     """Return validation losses of one method an architecture, a chart a target; none without epochs."""
-    drawn = []
+    drawn, shown = [], main(methods)
     for target in (*biotac_sp.TARGETS, ALL):
-        curves = {one.name: found for one in group.main if (found := _curves(one, target, "val_loss"))}
+        curves = learning.of_methods(shown, functools.partial(losses, target=target, name="val_loss"))
         if curves:
-            name = wording.TARGETS.get(target, "one network for all targets")
+            name = headlines.TARGETS.get(target, "one network for all targets")
             spec = learning.by_epoch(curves, "validation loss", log=True)
             caption = "Each method's own loss. Thick: mean over runs; thin: single runs."
-            drawn.append(Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched(group.main)}"))
+            drawn.append(Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched(shown)}"))
     return drawn
 
 
@@ -36,7 +39,7 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
         (method, target)
         for method in methods
         for target in (forms.TARGET, ALL)
-        if method.architecture == PAPERS and _curves(method, target, "train_loss")
+        if method.settings["architecture"] == PAPERS and _curves(method, target, "train_loss")
     ]
     if not found:
         return []
@@ -44,21 +47,21 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
     named = {"training": "train_loss", "validation": "val_loss"}
     curves = {name: described for name, loss in named.items() if (described := _curves(method, target, loss))}
     quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
-    text = f"training and validation loss by epoch, {method.name}, {wording.TARGETS.get(target, 'all targets')}"
+    text = f"training and validation loss by epoch, {method.name}, {headlines.TARGETS.get(target, 'all targets')}"
     printed = " The paper's figure has 1,000 epochs." if method.published else ""
     caption = f"{wording.basis([method])}{printed}{_unwatched([method])}{' Simulated.' if method.simulated else ''}"
     return [
-        Chart(wording.form("Figure 8", text, method.published), learning.by_epoch(curves, quantity, log=True), caption)
+        Chart(blocks.form("Figure 8", text, method.published), learning.by_epoch(curves, quantity, log=True), caption)
     ]
 
 
-def losses(run: Run, target: str, name: str) -> list[float]:
+def losses(result: Result, target: str, name: str) -> list[float]:
     """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none states it.
 
     The mean ends where the first network does. NaN stands where an epoch does not state the loss.
     """
     networks: dict[object, list[float]] = {}
-    for line in run.history:
+    for line in result.history:
         if line.get("target", ALL) == target:
             described = line.get(name)
             networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
@@ -68,10 +71,10 @@ def losses(run: Run, target: str, name: str) -> list[float]:
 
 
 def _curves(method: Method, target: str, name: str) -> list[list[float]]:
-    return [curve for run in method.runs if (curve := losses(run, target, name))]
+    return [curve for one in method.details if (curve := losses(one, target, name))]
 
 
 def _unwatched(methods: Sequence[Method]) -> str:
     """Return what must be stated where some runs had no validation grasps."""
-    runs = [run for one in methods for run in one.runs if run.history]
+    runs = [run for one in methods for run in one.details if run.history]
     return UNWATCHED if any(run.config.get("counts", {}).get("val") == 0 for run in runs) else ""

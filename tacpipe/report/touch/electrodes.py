@@ -9,12 +9,14 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
+from tacpipe.comparison.runs import Method
 from tacpipe.metrics import regression
 from tacpipe.report import charts
 from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
-from tacpipe.report.touch import scores, wording
-from tacpipe.report.touch.methods import Method, Run
+from tacpipe.report.touch import scores, tables, wording
+from tacpipe.report.touch.methods import targets
 from tacpipe.report.touch.predictions import Predictions
+from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 FINGERS = ("e_th", "e_mf")
@@ -39,20 +41,20 @@ class Chosen:
 
 def folds(method: Method) -> list[Fold]:
     """Return the electrodes' R² and some grasps; nothing where the method predicts no electrodes."""
-    fingers = [target for target in FINGERS if target in method.targets]
+    fingers = [target for target in FINGERS if target in targets(method)]
     if not fingers:
         return []
     drawn = [part for known in (True, False) if (part := _explained(method, fingers, known))]
-    pairs = [_pair(method.runs[0].predictions, one, fingers) for one in chosen(method.runs)]
+    rows = method.details[0].predictions
+    pairs = [_pair(rows, one, fingers) for one in chosen(rows)]
     return fold("Electrodes", Charts(drawn), Note(EXPLAINED), *pairs, Note(LOW) if pairs else None, about=method.name)
 
 
-def chosen(runs: Sequence[Run]) -> list[Chosen]:
-    """Return the grasps of the first run at the median, the best and the worst decile by the electrodes' error.
+def chosen(rows: Predictions) -> list[Chosen]:
+    """Return the grasps of a run at the median, the best and the worst decile by the electrodes' error.
 
     Of grasps that err alike the first by name comes first, so the same results choose the same grasps.
     """
-    rows = runs[0].predictions
     fingers = [target for target in FINGERS if target in rows.targets]
     if not fingers or not len(rows.recordings):
         return []
@@ -70,13 +72,13 @@ def _explained(method: Method, fingers: Sequence[str], known: bool) -> Chart | N
     """Return the R² of each electrode on known or on novel objects; None where there are none."""
     rows: list[dict[str, object]] = []
     for target in fingers:
-        found = scores.by_electrode(method.runs, target, known)
+        found = scores.by_electrode(tables.predictions(method), target, known)
         if found is not None:
             strength = np.nan_to_num(np.clip(found, -1, 1))
             rows += _tip(wording.FINGERS[target], strength, [wording.signed_short(value) for value in found], "R²")
     if not rows:
         return None
-    return Chart(f"R² of each electrode, {wording.OBJECTS[known]}", _plane(rows))
+    return Chart(f"R² of each electrode, {headlines.PARTS[known]}", _plane(rows))
 
 
 def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
@@ -94,7 +96,7 @@ def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
                 f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts"
             )
         errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
-    known = wording.OBJECTS[bool(rows.known[one.row])].removesuffix("s")
+    known = headlines.PARTS[bool(rows.known[one.row])].removesuffix("s")
     caption = f"{rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of the range; {', '.join(errors)}."
     return Chart(f"True next to predicted: {one.place} by error, {one.recording}", _plane(tips), caption, wide=True)
 

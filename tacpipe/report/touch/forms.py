@@ -6,12 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Note
 from tacpipe.report.charts import Dot
 from tacpipe.report.touch import printed, scores, tables, wording
-from tacpipe.report.touch.methods import PAPERS, Method
+from tacpipe.report.touch.methods import PAPERS
 from tacpipe.report.touch.scores import Score
+from tacpipe.tasks.touch import headline as headlines
 
 TARGET = "pdc_th"  # on which the paper compares settings
 
@@ -108,7 +110,7 @@ def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
     alike: dict[str, dict[object, Method]] = {}
     for method in methods:
         value = method.settings.get(form.setting)
-        if method.architecture == PAPERS and value in form.names and scores.score(method.runs, TARGET, True):
+        if method.settings["architecture"] == PAPERS and value in form.names and of(method):
             alike.setdefault(method.key_without(form.setting, *form.also), {}).setdefault(value, method)
 
     def place(one: Mapping[object, Method]) -> tuple[int, int]:
@@ -117,14 +119,17 @@ def family(methods: Sequence[Method], form: Form) -> dict[object, Method]:
     return max(alike.values(), key=place, default={})
 
 
+def of(method: Method) -> Score | None:
+    """Return how a method does on what the paper compares settings on."""
+    return scores.score(tables.predictions(method), TARGET, True)
+
+
 def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
     found = family(methods, form)
     if len(found) < 2:
         return []
     published = all(one.published for one in found.values())
-    described = {
-        value: scores.score(found[value].runs, TARGET, True) if value in found else None for value in form.names
-    }
+    described = {value: of(found[value]) if value in found else None for value in form.names}
     least = min((one.each.mean, name) for value, name in form.names.items() if (one := described[value]))[1]
     shown = {value: name for value, name in form.names.items() if published or described[value]}
     rows: list[list[str | Cell]] = [
@@ -138,7 +143,7 @@ def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
     rows += [[name, *tables.cells(one), *blank] for name, one in baselines]
     heads = ["", *tables.ROWS, *(["paper: RMSE"] if form.printed and published else [])]
     simulated = any(one.simulated for one in found.values())
-    title = f"{wording.form(form.number, form.title, published)}{' (simulated)' if simulated else ''}"
+    title = f"{blocks.form(form.number, form.title, published)}{' (simulated)' if simulated else ''}"
     notes = [
         wording.basis(list(found.values())),
         wording.caution(list(found.values())),
@@ -146,7 +151,7 @@ def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
     ]
     notes += [ESTIMATED] if any(one.settings.get("wrist") == "estimated" for one in found.values()) else []
     drawn = [_chart(form, described, dict(baselines))] if form.drawn else []
-    table = blocks.table(f"{title}; {wording.TARGETS[TARGET]}, known objects", heads, rows, kinds)
+    table = blocks.table(f"{title}; {headlines.TARGETS[TARGET]}, known objects", heads, rows, kinds)
     return [table, *drawn, Note(" ".join(one for one in notes if one))]
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Block, Cell, Note
 from tacpipe.report.touch import printed, scores, tables, wording
-from tacpipe.report.touch.methods import DEFAULT, PAPERS, Method
+from tacpipe.report.touch.methods import DEFAULT, PAPERS, targets
 from tacpipe.report.touch.scores import Score
+from tacpipe.tasks.touch import headline as headlines
 
 TITLE = "Figures 10 and 11", "known objects (test) next to novel ones"
 PARTS = ("RMSE over runs", "R²", "skill")
@@ -18,7 +20,7 @@ def parts(methods: Sequence[Method]) -> list[Block]:
     """Return the table of the paper's network and that of the default method, where they predicted two targets or more."""
     described = []
     for architecture in (PAPERS, DEFAULT):
-        pairs = _pairs([one for one in methods if one.architecture == architecture])
+        pairs = _pairs([one for one in methods if one.settings["architecture"] == architecture])
         described.append(max(pairs, key=_weight, default=None))
     return [one for pair in described if pair for one in _table(*pair)]
 
@@ -40,7 +42,7 @@ def _weight(pair: tuple[Method, Method]) -> tuple[int, int, bool]:
 
 
 def _targets(method: Method, known: bool) -> list[str]:
-    return [target for target in method.targets if scores.score(method.runs, target, known)]
+    return [target for target in targets(method) if scores.score(tables.predictions(method), target, known)]
 
 
 def _table(known: Method, novel: Method) -> list[Block]:
@@ -48,8 +50,8 @@ def _table(known: Method, novel: Method) -> list[Block]:
     rows: list[list[str | Cell]] = []
     pairs: list[tuple[Score | None, Score | None]] = []
     kinds: dict[int, str] = {}
-    for target, name in wording.TARGETS.items():
-        test, other = (scores.score(one.runs, target, of) for one, of in ((known, True), (novel, False)))
+    for target, name in headlines.TARGETS.items():
+        test, other = (scores.score(tables.predictions(one), target, of) for one, of in ((known, True), (novel, False)))
         if test is None and other is None:
             continue
         pairs.append((test, other))
@@ -67,7 +69,7 @@ def _table(known: Method, novel: Method) -> list[Block]:
     counted = [max(one.grasps for one in described if one) for described in zip(*pairs, strict=True)]
     evaluated = f"Evaluated on {counted[0]:,} grasps of known and {counted[1]:,} of novel objects."
     note = f"{wording.basis(chosen)} {evaluated} {printed.FOUND_ON if published else ''} {wording.caution(chosen)}"
-    title = f"{wording.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known.name}"
+    title = f"{blocks.form(*TITLE, published)}{' (simulated)' if simulated else ''}; {known.name}"
     return [blocks.table(title, heads, rows, kinds), Note(note)]
 
 

@@ -7,14 +7,13 @@ import math
 from collections.abc import Callable
 
 from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import Run as Compared
+from tacpipe.comparison.runs import Run
 from tacpipe.metrics import headline
 from tacpipe.report import blocks, screen
 from tacpipe.report.blocks import NONE, Cell, Charts, Fold
 from tacpipe.report.context import Context
 from tacpipe.report.touch import clouds, curves, electrodes, forms, generalisation, pressure, scores, tables, wording
 from tacpipe.report.touch import methods as by_method
-from tacpipe.report.touch.methods import Method
 from tacpipe.report.touch.scores import Score
 from tacpipe.tasks.touch import headline as headlines
 
@@ -40,15 +39,16 @@ def sentence(context: Context) -> tuple[str, str]:
 
 def folds(context: Context) -> list[Fold]:
     """Return what touch has of its own."""
-    methods = _methods(context)
+    methods = context.methods
     if not methods:
         return clouds.folds(context.others, {})
     parted = by_method.groups(methods)
-    first = _shown(context, methods) or parted[0].default
-    chosen = {one.recording: f"{one.place} by error" for one in electrodes.chosen(first.runs)}
+    first = (context.winner(next(iter(context.parts))) if context.parts else None) or by_method.default(parted[0])
+    chosen = {one.recording: f"{one.place} by error" for one in electrodes.chosen(first.details[0].predictions)}
     found: list[Fold] = []
     for group in parted:
-        where = f": {wording.place(group.split, group.simulated)}" if len(parted) > 1 else ""
+        result = group[0].details[0]
+        where = f": {wording.place(result.split, result.simulated)}" if len(parted) > 1 else ""
         found += blocks.fold(f"By object{where}", *tables.by_object(group))
         drawn = curves.charts_of(group)
         found += blocks.fold(f"Training{where}", Charts(drawn)) if drawn else []
@@ -65,45 +65,44 @@ def folds(context: Context) -> list[Fold]:
 
 def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
     """Return more columns of the table of all methods: R², skill over the constant, mean absolute error and batch means."""
-    target = next(name for name, title in wording.TARGETS.items() if title == comparison.question.target)
+    target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
     known = comparison.question.part.startswith(headlines.PARTS[True])
 
     @functools.cache
     def score(row: Row) -> Score | None:
-        runs = [run.details for run in row.method.of(comparison.question)]
+        runs = [run.details.predictions for run in row.method.of(comparison.question)]
         return scores.score(runs, target, known, row.predictor)
 
     def cell(value: Callable[[Score], Cell]) -> Callable[[Row], Cell]:
         return lambda row: value(found) if (found := score(row)) else Cell(NONE)
 
     return [
-        ("R²", cell(lambda one: Cell(wording.signed(one.r2), value=None if math.isnan(one.r2) else one.r2))),
-        ("skill over the constant", cell(wording.skill)),
+        ("R²", cell(lambda one: Cell(blocks.fixed(one.r2, 2), value=None if math.isnan(one.r2) else one.r2))),
+        ("skill over the constant", cell(lambda one: blocks.interval(*one.skill))),
         ("RMSE over runs", cell(lambda one: blocks.with_sd(one.each.mean, one.each.sd))),
-        ("batch mean", cell(lambda one: Cell(wording.percentage(one.batch_mean), value=one.batch_mean))),
+        ("batch mean", cell(lambda one: Cell(blocks.fixed(one.batch_mean, 4), value=one.batch_mean))),
         ("MAE (counts)", cell(lambda one: blocks.number(scores.in_counts(one.target, one.mae), 3))),
     ]
 
 
 def caveats(context: Context) -> list[str]:
     """Return what must be known about these numbers."""
-    methods = _methods(context)
+    methods = context.methods
     if not methods:
         return []
-    parted = by_method.groups(methods)
     mixed = MIXED if len({one.simulated for one in methods}) > 1 else ""
-    return [POOLED, *(wording.basis(group.methods) for group in parted), wording.caution(methods), mixed]
+    return [POOLED, *map(wording.basis, by_method.groups(methods)), wording.caution(methods), mixed]
 
 
-def about_run(run: Compared) -> dict[str, str | Cell]:
+def about_run(run: Run) -> dict[str, str | Cell]:
     """Return more columns of the table of runs."""
     trained = run.details.trained
     rsquared = []
     for known in (True, False):
         for target in run.details.predictions.targets:
-            found = scores.score([run.details], target, known)
+            found = scores.score([run.details.predictions], target, known)
             rsquared += (
-                [f"{wording.TARGETS[target]}, {wording.OBJECTS[known]}: {wording.signed(found.r2)}"] if found else []
+                [f"{headlines.TARGETS[target]}, {headlines.PARTS[known]}: {blocks.fixed(found.r2, 2)}"] if found else []
             )
     return {
         "split": wording.split(run.details.split),
@@ -111,13 +110,3 @@ def about_run(run: Compared) -> dict[str, str | Cell]:
         "epochs": str(len(run.details.history) or NONE),
         "R²": Cell("; ".join(rsquared) or NONE),
     }
-
-
-def _methods(context: Context) -> list[Method]:
-    return by_method.grouped([run.details for run in context.runs])
-
-
-def _shown(context: Context, methods: list[Method]) -> Method | None:
-    """Return the best method of the first part, whose grasps are drawn."""
-    best = context.winner(next(iter(context.parts))) if context.parts else None
-    return next((one for one in methods if best and one.runs[0] is best.runs[0].details), None)

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.channels import biotac_sp
-from tacpipe.comparison.runs import Errors, Question
-from tacpipe.comparison.runs import Run as Compared
+from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.metrics import regression
 from tacpipe.report.touch import methods, wording
-from tacpipe.report.touch.methods import Method, Run
+from tacpipe.report.touch.methods import Result
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.result_names import PREDICTIONS
 
@@ -20,16 +19,13 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Floats
     from tacpipe.datasets.dataset import Dataset
 
-USUAL = ("split", "simulated")  # parts of questions
 
-
-def read(results: Sequence[Dataset]) -> list[Compared]:
+def read(results: Sequence[Dataset]) -> list[Run]:
     """Return the runs of results that hold predictions of grasps which the model has not seen."""
-    every = [Run.read(one) for one in results if PREDICTIONS in one.recordings]
-    named = methods.grouped([one for one in every if len(one.predictions.recordings)])
-    splits = [(one.split, one.simulated) for one in methods.groups(named)]
-    found = {id(run.dataset): _run(run, method, splits) for method in named for run in method.runs}
-    return [found[id(one)] for one in results if id(one) in found]
+    every = [Result(one) for one in results if PREDICTIONS in one.recordings]
+    held = [one for one in every if len(one.predictions.recordings)]
+    splits = methods.splits(held)
+    return [_run(*pair, splits) for pair in zip(held, methods.names(held), strict=True)]
 
 
 def called(predictor: str) -> str:
@@ -41,11 +37,11 @@ def called(predictor: str) -> str:
     return headline.BASELINES.get(predictor, predictor.replace("_", " "))
 
 
-def _run(run: Run, method: Method, splits: Sequence[tuple[str, bool]]) -> Compared:
+def _run(run: Result, name: str, splits: Sequence[tuple[str, bool]]) -> Run:
     questions = {}
     for known in (True, False):
         rows = run.predictions.of(known)
-        place = 2 * splits.index((method.split, method.simulated)) + (not known)
+        place = 2 * splits.index((run.split, run.simulated)) + (not known)
         if not len(rows.recordings):
             continue
         objects = dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
@@ -59,17 +55,17 @@ def _run(run: Run, method: Method, splits: Sequence[tuple[str, bool]]) -> Compar
             measure = headline.measure(high - low, "grasps" if known else "objects")
             part = headline.PARTS[known]
             if len(splits) > 1:
-                part += f", {wording.place(method.split, method.simulated)}"
+                part += f", {wording.place(run.split, run.simulated)}"
             questions[Question(part, headline.TARGETS[target], place)] = Errors(
                 measure, sums, None if known else objects
             )
-    return Compared(
+    return Run(
         run.dataset,
         headline.TASK,
-        method.name,
-        method.settings,
+        name,
+        run.settings,
         questions,
-        family=methods.NAMES.get(method.architecture, method.architecture),
+        family=methods.NAMES.get(run.architecture, run.architecture),
         seed=run.params.get("seed"),
         simulated=run.simulated,
         published=run.published,

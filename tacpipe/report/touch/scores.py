@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.comparison.spread import Spread, spread
 from tacpipe.metrics import regression
 from tacpipe.metrics.regression import Interval
-from tacpipe.report.touch.methods import Method, Run
+from tacpipe.report.touch.predictions import Predictions
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 
@@ -59,8 +59,8 @@ class _Rows(NamedTuple):
     objects: NDArray[np.str_]  # (grasp,)
 
 
-def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str = MODEL) -> Score | None:
-    """Return how a predictor of some runs does on known or on novel objects, or on all; None where it states nothing.
+def score(runs: Sequence[Predictions], target: str, known: bool | None, predictor: str = MODEL) -> Score | None:
+    """Return how a predictor does, from the predictions of runs on known or on novel objects, or on all; None without any.
 
     Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs stated of each,
     where objects are known, and else from drawing objects: what is asked then is how the next object would fare.
@@ -83,33 +83,16 @@ def score(runs: Sequence[Run], target: str, known: bool | None, predictor: str =
     )
 
 
-def reference(methods: Sequence[Method], target: str, predictor: str) -> Method | None:
-    """Return the method whose runs report on a baseline: that with most runs which hold it; None where none does."""
-    held = [one for one in methods if any(target in run.predictions.predicted.get(predictor, ()) for run in one.runs)]
-    return max(held, key=lambda one: len(one.runs), default=None)
-
-
-def baselines(methods: Sequence[Method]) -> list[str]:
-    """Return the predictors that are not a model's own, in the order of their names."""
-    return sorted({name for one in methods for run in one.runs for name in run.predictions.predicted if name != MODEL})
-
-
-def by_electrode(runs: Sequence[Run], target: str, known: bool | None) -> AnyFloats | None:
+def by_electrode(runs: Sequence[Predictions], target: str, known: bool | None) -> AnyFloats | None:
     """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
     parts = _rows(runs, target, known, MODEL)
     return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
 
 
-def of_object(runs: Sequence[Run], name: str) -> list[Run]:
-    """Return runs as if they had been evaluated on the grasps of one object alone."""
-    described = [(run, run.predictions) for run in runs]
-    return [replace(run, predictions=rows.rows(rows.objects == name)) for run, rows in described]
-
-
-def _rows(runs: Sequence[Run], target: str, known: bool | None, predictor: str) -> list[_Rows]:
+def _rows(runs: Sequence[Predictions], target: str, known: bool | None, predictor: str) -> list[_Rows]:
     """Return what each run states that holds the target, the predictor and such objects."""
     found = []
-    for rows in (run.predictions.of(known) for run in runs):
+    for rows in (run.of(known) for run in runs):
         predicted = rows.predicted.get(predictor, {})
         if target not in predicted or target not in rows.true or not len(rows.recordings):
             continue

@@ -6,27 +6,18 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from tacpipe.report import blocks
-from tacpipe.report.blocks import NONE, Cell
+from tacpipe.comparison.runs import Method
+from tacpipe.report import blocks, provenance
 from tacpipe.report.touch import printed
-from tacpipe.report.touch.methods import PAPERS, Method, Run
-from tacpipe.report.touch.scores import Score
+from tacpipe.report.touch.methods import PAPERS, Result
 from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN
 
-TARGETS = {
-    "pdc_th": "PDC thumb",
-    "pdc_mf": "PDC middle finger",
-    "e_th": "electrodes thumb",
-    "e_mf": "electrodes middle finger",
-}
 FINGERS = {"e_th": "thumb", "e_mf": "middle finger"}
 BASELINES = {  # rows that every table has
     CONSTANT: "constant: the mean of training",
     OBJECT_MEAN: "mean of the object",
     NEAREST_IN_TIME: "mean of the nearest in time",
 }
-OBJECTS = {True: "known objects", False: "novel objects", None: "all objects"}
-SIMULATED = "These grasps were simulated: nothing here is evidence about a real sensor."
 RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
     "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
@@ -37,19 +28,10 @@ IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by
 def caution(methods: Sequence[Method]) -> str:
     """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
     if methods and all(one.simulated for one in methods):
-        return SIMULATED
-    found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.runs]
+        return provenance.SIMULATED
+    found = [run.predictions.in_a_row for one in methods if not one.simulated for run in one.details]
     same, every = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
     return RECORDED.format(same=f"{same:,}", all=f"{every:,}") if every and same / every >= IN_A_ROW else ""
-
-
-def form(what: str, text: str, published: bool) -> str:
-    """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
-
-    >>> form("Table II", "number of points", True), form("Table II", "number of points", False)
-    ("Table II in the paper's form: number of points", 'Number of points')
-    """
-    return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
 
 
 def baseline(predictor: str) -> str:
@@ -61,29 +43,6 @@ def baseline(predictor: str) -> str:
     return BASELINES.get(predictor, predictor.replace("_", " "))
 
 
-def skill(found: Score) -> Cell:
-    """Return a skill over the constant above its interval."""
-    return blocks.interval(*found.skill)
-
-
-def percentage(value: float) -> str:
-    """Return an error as a fraction of a range.
-
-    >>> percentage(0.05496), percentage(float("nan"))
-    ('0.0550', '–')
-    """
-    return NONE if math.isnan(value) else f"{value:.4f}"
-
-
-def signed(value: float) -> str:
-    """Return R², which may lie below 0.
-
-    >>> signed(0.4567), signed(-0.02), signed(-0.001), signed(float("nan"))
-    ('0.46', '−0.02', '0.00', '–')
-    """
-    return NONE if math.isnan(value) else f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
-
-
 def signed_short(value: float) -> str:
     """Return R² where there is little room.
 
@@ -91,7 +50,7 @@ def signed_short(value: float) -> str:
     ['0.46', '−0.02', '−3.0', '< −9']
     """
     if value >= -1 or math.isnan(value):
-        return signed(value)
+        return blocks.fixed(value, 2)
     return f"−{-value:.1f}" if value > -9 else "< −9"
 
 
@@ -110,7 +69,7 @@ def place(described: str, simulated: bool) -> str:
     return f"{name}, simulated" if simulated and "simulated" not in name else name
 
 
-def schedule(run: Run) -> str:
+def schedule(run: Result) -> str:
     """Return how a run was trained, and whether that is the paper's way."""
     if not run.history:
         return "fitted without epochs"
@@ -126,7 +85,7 @@ def schedule(run: Run) -> str:
 
 def basis(methods: Sequence[Method]) -> str:
     """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
-    runs = [run for one in methods for run in one.runs]
+    runs = [run for one in methods for run in one.details]
     described = [
         f"{count} run{'s' if count > 1 else ''}: {one}"
         for one, count in Counter(schedule(run) for run in runs).most_common()

@@ -12,6 +12,7 @@ import pyarrow as pa
 from tacpipe.arrays import Float32s, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
+from tacpipe.io import progress
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, tracks, units
@@ -42,14 +43,16 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
-    for name, shard in sorted(recordings.recordings.items()):
-        track = tracks.track(shard, forecaster.codec, forecaster.pose)
-        check_rate(track, forecaster)
-        trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
-        attributes = {**shard.attributes, "seen": trial.seen}
-        kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads), attributes)
-        trials.append(trial)
-        del track
+    with progress.bar("evaluate", len(recordings.recordings)) as advance:
+        for name, shard in sorted(recordings.recordings.items()):
+            track = tracks.track(shard, forecaster.codec, forecaster.pose)
+            check_rate(track, forecaster)
+            trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
+            attributes = {**shard.attributes, "seen": trial.seen}
+            kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads), attributes)
+            trials.append(trial)
+            del track
+            advance(note=name)
     groups = metrics.channel_groups(forecaster.codec.layout)
     tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self, cast
 
@@ -209,16 +209,21 @@ class Classifier:
             )
         return self.layouts[sensor]
 
-    def read(self, recordings: Dataset, *, labelled: bool = False) -> dict[str, Slides]:
+    def read(
+        self, recordings: Dataset, *, labelled: bool = False, advance: Callable[..., None] | None = None
+    ) -> dict[str, Slides]:
         """Return the slides of a dataset by sensor, as this model reads them.
 
         Those of other sensors are left out where the model was trained for named ones, and refused where it was trained
-        for all that there were. Raises `TacpipeError` for what `tacpipe.tasks.material.slides.read` refuses.
+        for all that there were. ``advance`` is called after each. Raises `TacpipeError` for what
+        `tacpipe.tasks.material.slides.read` refuses.
         """
         only = tuple(self.layouts) if self.params.sensors else ()
         there = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
         only = tuple(name for name in only if name in there) or only
-        found = slides_of.read(recordings, only=only, quantities=self.quantities, naming=self.naming, labelled=labelled)
+        found = slides_of.read(
+            recordings, only=only, quantities=self.quantities, naming=self.naming, labelled=labelled, advance=advance
+        )
         for one in found.values():
             self.check(one)
         return found

@@ -13,6 +13,7 @@ import pyarrow as pa
 from tacpipe.arrays import Bools, Float32s, Int64s
 from tacpipe.datasets import origin
 from tacpipe.errors import TacpipeError
+from tacpipe.io import progress
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.printable import listed
@@ -56,10 +57,11 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     """
     classifier = Classifier.load(model)
     known = set(classifier.config["trained_on"].values())
-    evaluated = {
-        sensor: _evaluated(classifier, slides, known)
-        for sensor, slides in classifier.read(recordings, labelled=True).items()
-    }
+    evaluated = {}
+    with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
+        for sensor, slides in classifier.read(recordings, labelled=True, advance=advance).items():
+            evaluated[sensor] = _evaluated(classifier, slides, known)
+            advance(len(slides), sensor)
     if not evaluated:
         raise TacpipeError(
             "There is no slide to evaluate the model on. Give a dataset that `tacpipe segment slides` made."

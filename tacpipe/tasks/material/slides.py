@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -86,12 +86,14 @@ def read(
     quantities: Sequence[str] = (TACTILE,),
     naming: Naming = NUMBERS,
     labelled: bool = False,
+    advance: Callable[..., None] | None = None,
 ) -> dict[str, Slides]:
     """Return the slides of each sensor, by name; ``only`` names the sensors to read, none being all.
 
     ``naming`` gives the number of each label.
 
-    Columns of the ``quantities`` are read, as far as a sensor has them. ``labelled`` refuses slides without a material.
+    Columns of the ``quantities`` are read, as far as a sensor has them. ``labelled`` refuses slides without a material;
+    ``advance`` is called after each recording.
     Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
     slides of one sensor differ in channels, frames or rate.
     """
@@ -105,9 +107,10 @@ def read(
                 f"--set sensor=biotac`, or what it is."
             )
         there.add(sensor)
-        if only and sensor not in only:
-            continue
-        found.setdefault(sensor, []).append((shard, *_frames(shard, sensor, quantities)))
+        if not only or sensor in only:
+            found.setdefault(sensor, []).append((shard, *_frames(shard, sensor, quantities)))
+        if advance is not None:
+            advance(note=name)
     missing = sorted(set(only) - set(found))
     if missing:
         known = ", ".join(sorted(there)) or "none"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from tacpipe.arrays import AnyArray, Bools
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import origin
 from tacpipe.errors import TacpipeError
+from tacpipe.io import progress
 from tacpipe.metrics import headline, regression
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.touch import grasps as grasps_of
@@ -37,7 +38,14 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     apart, under ``seen``. Raises `TacpipeError` where grasps have no reading, or are not what the model reads.
     """
     predictor = Predictor.load(model)
-    grasps = grasps_of.read(recordings)
+    with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each grasp is read, then predicted
+        return _evaluated(model, predictor, grasps_of.read(recordings, advance=advance), recordings, advance)
+
+
+def _evaluated(
+    model: Mapping[str, bytes], predictor: Predictor, grasps: Grasps, recordings: Dataset, advance: Callable[..., None]
+) -> Result:
+    """Return the result of a model on grasps; ``advance`` moves the bar when they are predicted."""
     if not len(grasps):
         raise TacpipeError(
             "There is no grasp to evaluate the model on. Give a dataset with recordings of the role asked for."
@@ -48,6 +56,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         )
     predicted = {TRUE: grasps.readings, MODEL: predictor.predict_grasps(grasps), **predictor.baselines.predict(grasps)}
     predicted = {name: {target: one[target] for target in predictor.targets} for name, one in predicted.items()}
+    advance(len(grasps))
     streams = {name: readings_table(one) for name, one in predicted.items()}
     del predicted[TRUE]
     trained = set(predictor.config["trained_on"].values())

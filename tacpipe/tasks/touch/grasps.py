@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -55,8 +55,10 @@ class Grasps:
         )
 
 
-def read(recordings: Dataset, *, with_readings: bool = True) -> Grasps:
+def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[..., None] | None = None) -> Grasps:
     """Return the grasps of a dataset in the order of names; with ``with_readings`` each must have a reading.
+
+    ``advance`` is called after each.
 
     Raises `TacpipeError` where a recording lacks a stream or a column, where a value is not finite, where a cloud has
     next to no points, and where a grasp lies far from it.
@@ -73,6 +75,8 @@ def read(recordings: Dataset, *, with_readings: bool = True) -> Grasps:
         if with_readings:
             for target, values in _reading(shard).items():
                 readings[target].append(values)
+        if advance is not None:
+            advance(note=shard.name)
     return Grasps(
         tuple(names),
         tuple(str(shard.attributes.get("object") or "") for shard in shards),

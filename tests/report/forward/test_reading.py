@@ -77,7 +77,7 @@ def test_rows_are_all_methods_and_baselines_with_the_best_first() -> None:
         "ridge": ("baseline", pytest.approx(0.25)),
         "persistence": ("baseline", pytest.approx(0.0)),
         "recurrent · PCA-20": ("model", pytest.approx(-1.0)),
-        "train_mean": ("baseline", pytest.approx(-8.0)),
+        "train mean": ("baseline", pytest.approx(-8.0)),
     }
     scores = [row.score.mean for row in found.rows]
     assert scores == sorted(scores, reverse=True)
@@ -131,7 +131,7 @@ def test_only_steps_that_all_runs_predict_are_shown() -> None:
     one, other = result(), result(seed=1)
     files = {**other.files, "errors.parquet": errors({"model": dict.fromkeys(WINDOWS, 0.5)}, steps=range(1, 11))}
     given: list[Any] = [one, FakeDataset(other.recordings, files, other.manifest)]
-    runs = [methods.Run.read(each) for each in given]
+    runs = [methods.Result(each) for each in given]
     assert reading.shown_steps(runs[1:]) == (1, 3, 5, 10)
     assert reading.shown_steps(runs) == (1, 3)
 
@@ -174,7 +174,7 @@ def test_a_name_states_only_in_what_methods_differ() -> None:
         "tcn · PCA-20",
     ]
     planned, none, fresh = (found[f"recurrent · PCA-20{end}"] for end in ("", " · no actions", " · fresh"))
-    keys = {one: [methods.key_without(each, one) for each in (planned, none, fresh)] for one in ("actions", "timeline")}
+    keys = {one: [each.key_without(one) for each in (planned, none, fresh)] for one in ("actions", "timeline")}
     assert keys["actions"][0] == keys["actions"][1] != keys["actions"][2]
     assert keys["timeline"][0] == keys["timeline"][2] != keys["timeline"][1]
 
@@ -189,6 +189,6 @@ def test_the_papers_method_is_the_recurrent_one_of_twenty_components() -> None:
 
 
 def test_most_runs_decide_which_timeline_is_the_main_one() -> None:
-    fresh, uniform, logged = (methods.Run.read(result(timeline=name)) for name in ("fresh", "uniform", "logged"))
+    fresh, uniform, logged = (methods.Result(result(timeline=name)) for name in ("fresh", "uniform", "logged"))
     assert methods.main_timeline([fresh, uniform, fresh]) == "fresh"
     assert methods.main_timeline([fresh, uniform, logged]) == "uniform"

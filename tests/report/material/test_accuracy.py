@@ -7,21 +7,21 @@ from typing import Any
 
 import pytest
 
+from tacpipe.comparison.runs import Run
 from tacpipe.metrics.proportions import wilson
-from tacpipe.report.material import accuracy
-from tacpipe.report.material.methods import Run
+from tacpipe.report.material import accuracy, reading
 from tests.report.material.material_fakes import result
 
 
 def runs(*results: Any) -> list[Run]:
-    return [Run.read(one) for one in results]
+    return reading.read(results)
 
 
 def test_runs_on_the_same_slides_are_pooled_but_claim_no_more_slides() -> None:
     found = accuracy.accuracy(runs(*(result(wrong={"biotac": wrong}, fold=wrong) for wrong in (2, 6))), "biotac")
     assert found is not None
     assert (found.correct, found.evaluated, found.slides, found.runs) == (32, 40, 20, 2)
-    assert (found.fraction, found.mean) == (0.8, 0.8)
+    assert found.fraction == 0.8
     assert found.sd == pytest.approx(0.2 / math.sqrt(2))  # of 0.9 and 0.7
     assert (found.low, found.high) == wilson(16, 20)
 
@@ -42,9 +42,10 @@ def test_a_single_run_has_no_spread_and_another_sensor_no_accuracy() -> None:
 
 
 def test_each_slide_has_the_share_of_runs_that_named_it_right() -> None:
-    found = accuracy.verdicts(runs(*(result(wrong={"biotac": wrong}) for wrong in (0, 1))), "biotac")
-    assert dict(zip(found.recordings, found.fraction.tolist(), strict=True))["biotac-m01-t001"] == 0.5
-    assert found.fraction.sum() == 19.5
+    found = accuracy.right(runs(*(result(wrong={"biotac": wrong}) for wrong in (0, 1))), "biotac")
+    by_slide = found.groupby("recording").mean()
+    assert by_slide["biotac-m01-t001"] == 0.5
+    assert by_slide.sum() == 19.5
 
 
 def test_skill_is_the_share_of_the_mean_levels_mistakes_that_is_avoided() -> None:

@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
-from tacpipe.report.material import grouping, joint, zero_shot
-from tacpipe.report.material.methods import Method, Run
+from tacpipe.comparison.runs import Method
+from tacpipe.report.material import joint, zero_shot
+from tests.report import parts
 from tests.report.material.material_fakes import result
 
 BOTH = {"biotac": 1, "roboskin": 2}
@@ -15,7 +16,7 @@ PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
 
 
 def grouped(*results: Any) -> list[Method]:
-    return grouping.grouped([Run.read(one) for one in results])
+    return parts.methods("material", *results)
 
 
 def trained(swapped: dict[str, int], alignment: float, **params: Any) -> Any:

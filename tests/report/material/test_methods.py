@@ -7,15 +7,17 @@ from typing import Any
 
 import pytest
 
-from tacpipe.report.material import grouping
-from tacpipe.report.material.methods import Method, Run
+from tacpipe.comparison.runs import Method
+from tacpipe.report.material import methods
+from tacpipe.report.material.methods import Result
+from tests.report import parts
 from tests.report.material.material_fakes import result
 
 BOTH = {"biotac": 1, "roboskin": 2}
 
 
 def grouped(*results: Any) -> dict[str, Method]:
-    return {one.name: one for one in grouping.grouped([Run.read(each) for each in results])}
+    return {one.name: one for one in parts.methods("material", *results)}
 
 
 def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> None:
@@ -28,8 +30,8 @@ def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> No
         )
     )
     assert {name: len(one.runs) for name, one in found.items()} == {"RAEC independent": 8}
-    assert found["RAEC independent"].sensors == ("biotac", "roboskin")
-    assert len(found["RAEC independent"].of("biotac")) == 4
+    assert methods.sensors_of([found["RAEC independent"]]) == ("biotac", "roboskin")
+    assert len(methods.of(found["RAEC independent"], "biotac")) == 4
 
 
 def test_names_say_what_keeps_a_method_from_being_plain() -> None:
@@ -45,7 +47,7 @@ def test_names_say_what_keeps_a_method_from_being_plain() -> None:
         result("minirocket", wrong=BOTH, train={"biotac": 64, "roboskin": 64}),
         result(wrong=BOTH, known="biotac"),
     )
-    assert {name: one.plain for name, one in found.items()} == {
+    assert {name: methods.plain(one.settings) for name, one in found.items()} == {
         "MiniRocket": True,
         "X-LSTM": True,
         "RAEC independent": True,
@@ -87,11 +89,11 @@ def test_results_of_another_split_stand_apart_from_what_most_have() -> None:
         return made
 
     found = grouped(placed("", 0), placed("", 1), placed("last to first", 2))
-    assert {name: one.plain for name, one in found.items()} == {
+    assert {name: methods.plain(one.settings) for name, one in found.items()} == {
         "MiniRocket": True,
         "MiniRocket · split last to first": False,
     }
-    assert found["MiniRocket · split last to first"].differs_only("elsewhere")
+    assert methods.plain(found["MiniRocket · split last to first"].settings, "elsewhere")
 
 
 def test_folds_of_nearly_one_size_pool_and_fewer_slides_do_not() -> None:
@@ -119,8 +121,8 @@ def test_one_sensor_with_fewer_slides_than_the_other_is_a_method_of_its_own() ->
         result(wrong=BOTH, joint=True, train={"biotac": 64, "roboskin": 64}),
     )
     assert list(found) == ["RAEC joint", "RAEC joint · 64 slides", "RAEC joint · RoboSkin 64 slides"]
-    assert found["RAEC joint · RoboSkin 64 slides"].line == "RAEC joint · other sensor whole"
-    assert found["RAEC joint · 64 slides"].line == "RAEC joint"
+    assert methods.line(found["RAEC joint · RoboSkin 64 slides"]) == "RAEC joint · other sensor whole"
+    assert methods.line(found["RAEC joint · 64 slides"]) == "RAEC joint"
 
 
 def test_simulated_slides_and_scrambled_ones_are_kept_apart() -> None:
@@ -131,16 +133,16 @@ def test_simulated_slides_and_scrambled_ones_are_kept_apart() -> None:
 def test_a_mapped_method_tells_of_the_sensor_that_was_mapped() -> None:
     found = grouped(result(wrong=BOTH, known="biotac"), result(wrong=BOTH, known="roboskin"))
     (method,) = found.values()
-    assert [run.sensors for run in method.of("roboskin")] == [("roboskin",)]
-    assert [run.sensors for run in method.of("biotac")] == [("biotac",)]
+    assert [run.details.sensors for run in methods.of(method, "roboskin")] == [("roboskin",)]
+    assert [run.details.sensors for run in methods.of(method, "biotac")] == [("biotac",)]
 
 
 @pytest.mark.parametrize(("params", "slides"), [({"reduce": "biotac", "ratio": 25, "batch": 32}, 160), ({}, 576)])
 def test_a_reduced_sensor_learns_from_its_share_of_the_batches(params: dict[str, Any], slides: int) -> None:
-    run = Run.read(result(wrong=BOTH, joint=True, **params))
+    run = Result(result(wrong=BOTH, joint=True, **params))
     assert run.learned == {"biotac": slides, "roboskin": 576}
 
 
 def test_a_readout_learns_from_validation_slides_too_where_it_says_so() -> None:
     given = result("minirocket", wrong=BOTH, use_validation=True, validation_slides=200)
-    assert Run.read(given).learned == {"biotac": 776, "roboskin": 776}
+    assert Result(given).learned == {"biotac": 776, "roboskin": 776}

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tacpipe.comparison.runs import Method
+from tacpipe.report import provenance
 from tacpipe.report.blocks import Section
-from tacpipe.report.material import confusion, curves, grouping, latents, profiles, wording
-from tacpipe.report.material.methods import Method, Run
+from tacpipe.report.material import confusion, curves, latents, profiles, wording
+from tacpipe.report.material.methods import Result
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.material import material_fakes
@@ -20,7 +22,7 @@ PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
 
 
 def grouped(*results: Any) -> list[Method]:
-    return grouping.grouped([Run.read(one) for one in results])
+    return parts.methods("material", *results)
 
 
 def everything(**kind: Any) -> list[Any]:
@@ -90,7 +92,7 @@ def test_a_labs_own_slides_get_nothing_that_the_paper_states_of_its_own(simulate
     text = parts.words(found)
     for told in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure"):
         assert told not in text, told
-    assert (found.simulated, wording.SIMULATED in text) == (simulated, simulated)
+    assert (found.simulated, text.count(provenance.SIMULATED)) == (simulated, int(simulated))
 
 
 @pytest.mark.parametrize(("sessions", "told"), [(1, True), (2, False)])
@@ -129,7 +131,9 @@ def test_confusions_are_counted_over_runs_and_stated_in_words() -> None:
 
 def test_confusion_matrices_hold_every_count_of_the_best_method_and_of_the_joint_one() -> None:
     drawn = parts.charts(
-        confusion.folds(grouped(result("minirocket", wrong={"biotac": 1}), result(wrong=BOTH, joint=True)))
+        confusion.folds(
+            parts.context("material", result("minirocket", wrong={"biotac": 1}), result(wrong=BOTH, joint=True))
+        )
     )
     assert [one.title for one in drawn] == ["BioTac: MiniRocket", "BioTac: RAEC joint", "RoboSkin: RAEC joint"]
     cells = {(row["row"], row["column"]): (row["count"], row["right"]) for row in parts.values(drawn[0])}
@@ -155,7 +159,7 @@ def test_a_projection_does_not_depend_on_the_sign_that_a_decomposition_takes() -
 
 def test_materials_lie_together_with_those_that_they_were_paired_with() -> None:
     same, other = (
-        Run.read(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
+        Result(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
         for partners in (None, PARTNERS)
     )
     assert latents.together(same.of("biotac"), same.of("roboskin"), {}) == (4, 4)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from tacpipe.comparison import engine
+from tacpipe.comparison.runs import Method
 from tacpipe.metrics.proportions import wilson
-from tacpipe.report.material import grouping, reduction, tables, zero_shot
-from tacpipe.report.material.methods import Method, Run
+from tacpipe.report.material import reduction, tables, zero_shot
 from tests.report import parts
 from tests.report.material.material_fakes import result
 
@@ -16,7 +16,7 @@ LEVEL = {"mean_level": {"biotac": 4, "roboskin": 8}, "permuted_labels": {"biotac
 
 
 def grouped(*results: Any) -> list[Method]:
-    return grouping.grouped([Run.read(one) for one in results])
+    return parts.methods("material", *results)
 
 
 def test_accuracies_have_counts_the_last_epoch_skill_and_the_papers_numbers() -> None:

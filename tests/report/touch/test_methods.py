@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from tacpipe.report.touch.methods import Method, Run, grouped, groups
+from tacpipe.comparison.runs import Method
+from tacpipe.report.touch.methods import default, groups, main
+from tests.report import parts
 from tests.report.touch.touch_fakes import result
 
 
 def methods(*results: Any) -> list[Method]:
-    return grouped([Run.read(one) for one in results])
+    return parts.methods("touch", *results)
 
 
 def test_runs_that_differ_in_seed_words_or_other_networks_targets_are_one_method() -> None:
@@ -90,9 +92,13 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
             result(simulated=True),
         )
     )
-    assert [(one.split, one.simulated) for one in found] == [("random", False), ("folds", False), ("random", True)]
-    assert [one.name for one in found[0].methods] == ["tree-ensemble", "trees on geometry and colour"]
-    assert {one.name for group in found for one in group.methods} == {
+    assert [(one[0].settings["split"], one[0].settings["simulated"]) for one in found] == [
+        ("random", False),
+        ("folds", False),
+        ("random", True),
+    ]
+    assert [one.name for one in found[0]] == ["tree-ensemble", "trees on geometry and colour"]
+    assert {one.name for group in found for one in group} == {
         "tree-ensemble",
         "PointNet",
         "trees on geometry and colour",
@@ -101,13 +107,13 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
 
 def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
     (both,) = groups(methods(result(), result("trees", seed=0), result("trees", seed=1)))
-    assert both.default.name == "tree-ensemble"
+    assert default(both).name == "tree-ensemble"
     (others,) = groups(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
-    assert others.default.name == "trees on geometry and colour"
+    assert default(others).name == "trees on geometry and colour"
 
 
 def test_one_method_an_architecture_is_told_in_detail() -> None:
     (group,) = groups(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
-    assert [one.name for one in group.main] == ["PointNet", "tree-ensemble"]
+    assert [one.name for one in main(group)] == ["PointNet", "tree-ensemble"]
     (both,) = groups(methods(result("trees", inputs="xyzcont"), result("trees")))
-    assert [one.name for one in both.main] == ["trees on geometry and colour"]
+    assert [one.name for one in main(both)] == ["trees on geometry and colour"]

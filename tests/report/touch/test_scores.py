@@ -8,13 +8,15 @@ from typing import Any
 import pytest
 
 from tacpipe.channels import biotac_sp
-from tacpipe.report.touch import scores
-from tacpipe.report.touch.methods import Run, grouped
+from tacpipe.report.touch import scores, tables, wording
+from tacpipe.report.touch.methods import Result
+from tacpipe.report.touch.predictions import Predictions
+from tests.report import parts
 from tests.report.touch.touch_fakes import KNOWN, NOVEL, result
 
 
-def runs(*results: Any) -> list[Run]:
-    return [Run.read(one) for one in results]
+def runs(*results: Any) -> list[Predictions]:
+    return [Result(one).predictions for one in results]
 
 
 @pytest.mark.parametrize("target", biotac_sp.TARGETS)
@@ -82,14 +84,15 @@ def test_without_a_constant_there_is_no_skill() -> None:
     assert found.rmse == pytest.approx(0.05, abs=1e-6)
 
 
-def test_baselines_come_from_most_runs() -> None:
-    methods = grouped(
-        runs(
-            result(off=0.05),
-            result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=0),
-            result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=1),
-        )
+def test_baselines_come_from_the_method_of_most_runs() -> None:
+    methods = parts.methods(
+        "touch",
+        result(off=0.05, baselines={"object_mean": 0.07}),
+        result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=0),
+        result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=1),
     )
-    source = scores.reference(methods, "pdc_th", "object_mean")
-    assert source is not None and len(source.runs) == 2
-    assert scores.baselines(methods) == ["constant", "object_mean"]
+    found = dict(tables.baseline_rows(methods, "pdc_th", True))
+    assert list(found) == [wording.baseline(one) for one in ("constant", "object_mean", "nearest_in_time")]
+    mean = found[wording.baseline("object_mean")]
+    assert mean is not None and mean.runs == 2 and mean.rmse == pytest.approx(0.08, abs=1e-6)
+    assert found[wording.baseline("nearest_in_time")] is None

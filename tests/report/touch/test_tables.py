@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from tacpipe.comparison.runs import Method
 from tacpipe.report.blocks import Section, Table
 from tacpipe.report.touch import forms, generalisation, tables
-from tacpipe.report.touch.methods import Method, Run, grouped, groups
 from tests.report import parts
 from tests.report.touch.touch_fakes import NOVEL, result
 
@@ -15,7 +15,7 @@ PDC: dict[str, Any] = {"targets": ("pdc_th",), "baselines": BASELINES}
 
 
 def methods(*results: Any) -> list[Method]:
-    return grouped([Run.read(one) for one in results])
+    return parts.methods("touch", *results)
 
 
 def table_of(given: Section, title: str) -> Table:
@@ -60,7 +60,7 @@ def test_baselines_have_their_group_and_other_ones_rows_of_their_own() -> None:
 
 def test_each_object_is_told_beside_its_mean_and_novel_ones_have_none() -> None:
     off = {"bleach": 0.02, "coffee": 0.05, "spam": 0.2, "drill": 0.11, "shoe": 0.05}
-    (found,) = tables.by_object(groups(methods(result(off=off, novel=NOVEL, **PDC)))[0])
+    (found,) = tables.by_object(methods(result(off=off, novel=NOVEL, **PDC)))
     assert parts.cells(found, "bleach") == ["8", "0.0200 | 0.0800", "+0.800"]
     assert parts.cells(found, "spam") == ["8", "0.2000 | 0.0800", "−1.000"]
     assert parts.cells(found, "drill (novel)") == ["8", "0.1100", "−0.100"]

@@ -10,11 +10,11 @@ import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.report.material import confusion, predictions
-from tacpipe.report.material.methods import Run
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
-from tests.fake_recordings import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeShard
+from tests.report import parts
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
 WORDS = {1: "cork", 2: "felt", 3: "foam, soft", 4: "über-rubber"}  # in the order of their numbers, as sorted
@@ -101,19 +101,11 @@ def test_networks_and_held_out_classes_go_by_their_words(tmp_path: Path) -> None
 def test_a_report_has_the_words(tmp_path: Path) -> None:
     files = trained(tmp_path, worded(0, 4), worded(4, 1), architecture="minirocket")
     _, result = evaluated(files, worded(5, 3))
-    shards = {"predictions": _Shard(result.recordings["predictions"].streams[""])}
-    run = Run.read(FakeDataset(shards, result.files, {}))  # type: ignore[arg-type]
-    method: Any = type("M", (), {"of": lambda self, sensor: [run]})()
+    shards = {"predictions": FakeShard("predictions", result.recordings["predictions"].streams[""])}
+    given: Any = FakeDataset(shards, result.files, {})
+    (method,) = parts.methods("material", given)
     counts, named = confusion.counted(method, "biotac")
     assert named == sorted(WORDS.values()) and counts.sum() == 3 * len(MATERIALS)
-
-
-class _Shard:
-    def __init__(self, content: Any) -> None:
-        self.content = content
-
-    def table(self) -> Any:
-        return self.content
 
 
 def _skin(first: int, count: int) -> list[Any]:

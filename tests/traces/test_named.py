@@ -1,0 +1,42 @@
+"""What a model named a recording, from the rows that `tacpipe evaluate` and `tacpipe predict` write."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from tacpipe.traces.named import of_row
+
+
+def row(**columns: tuple[Any, str]) -> pa.Table:
+    """A row of columns, each a value and its quantity."""
+    fields = [
+        pa.field(name, pa.array([value]).type, metadata={"quantity": quantity} if quantity else None)
+        for name, (value, quantity) in columns.items()
+    ]
+    return pa.Table.from_arrays([pa.array([value]) for value, _ in columns.values()], schema=pa.schema(fields))
+
+
+SCORES = {"score_03": (0.25, "score"), "score_10": (0.75, "score")}
+EVALUATED = {"material": (3, "label"), "mean_level": (3, "prediction"), "model": (10, "prediction")}
+
+
+def test_an_evaluation_has_its_label_the_model_first_and_other_predictors() -> None:
+    found = of_row(row(recording=("trial-0", ""), **EVALUATED, **SCORES, z01=(1.0, "latent")), {"material": 99})
+    assert found is not None
+    assert (found.key, found.label, found.of_model) == ("material", "3", "10")
+    assert list(found.predicted.items()) == [("model", "10"), ("mean level", "3")]
+    assert found.leading() == {"10": 0.75, "3": 0.25}
+
+
+@pytest.mark.parametrize(("attributes", "label"), [({"material": 10}, "10"), ({}, "")])
+def test_a_prediction_is_next_to_the_recordings_own_label(attributes: dict[str, Any], label: str) -> None:
+    found = of_row(row(material=(10, "prediction"), **SCORES), attributes)
+    assert found is not None
+    assert (found.of_model, found.label) == ("10", label)
+
+
+def test_values_without_names_are_no_names() -> None:
+    assert of_row(row(pdc_th=(1.0, "prediction")), {}) is None
