@@ -196,7 +196,7 @@ class _Reading:
         if found.name == own.KEY:
             self.attributes |= own.attributes(found.values)
             return
-        from tacpipe.formats.table.labels import plain_value
+        from tacpipe.formats.table.label_texts import plain_value
 
         for name, value in found.values.items():
             self.attributes.setdefault(plain(name), plain_value(value))

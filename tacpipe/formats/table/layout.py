@@ -132,7 +132,7 @@ def extension(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Labels:
-    """A source of labels: a table with a row a recording, or a YAML or JSON file a recording."""
+    """A source of labels: a table with a row a recording, or YAML or JSON, one file a recording or one of all."""
 
     file: str
     key: str = ""  # the table's column that names the recording
@@ -316,7 +316,8 @@ def _labels(value: Any, where: str) -> Labels:
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
     made: Labels = fields.filled(Labels, values, where, "entry")
-    if not pattern.placeholders(made.file) and not made.key:
+    is_tree = made.file.lower().endswith((".json", ".yaml", ".yml"))  # whose names are those of recordings
+    if not pattern.placeholders(made.file) and not made.key and not is_tree:
         raise UsageError(
             f"{where}: {plain(made.file)} is one file for all recordings. Set key to the column that names them."
         )
