@@ -1,4 +1,4 @@
-"""Looking after a store: what is in it, whether it is sound, and mending it."""
+"""A store as a whole: what is in it, whether it is sound, and its repair."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ class _Shares:
         except TacpipeError as error:
             if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
                 raise
-            return None  # reading it says what is wrong, of this recording alone
+            return None  # reading it shows what is wrong, of this recording alone
 
 
 def recording(

@@ -32,7 +32,7 @@ def batches(
 
     With ``shared`` the file is then cut into its recordings once, and not read for each.
 
-    Raises `TacpipeError`, naming file, row and column, for what is not as the layout says, for stamps that run backwards,
+    Raises `TacpipeError`, naming file, row and column, for what is not as the layout states, for stamps that run backwards,
     and for a file without rows; also as batches are taken. One block is in memory; of a table in long form one run.
     """
     return _batches(file, stream, recording, columns.NOTHING, {}, shared)

@@ -100,7 +100,7 @@ def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
 def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     """Return the recordings in a container, [None] where it is one, and whether these names need no container's before them.
 
-    A container that cannot be read is one: reading it says what is wrong, and others are not kept from being read.
+    A container that cannot be read is one: reading it shows what is wrong, and others are not kept from being read.
     """
     try:
         container = kinds.opened(kind, path)

@@ -17,7 +17,7 @@ _CLOSED = {  # all that has an effect on what is fitted in closed form
 }
 _RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
 _PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # of no effect where sensors learn alone
-USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be said
+USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # that need not be stated
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
