@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import timing
 
-from tacpipe.formats.table import layout, reading
+from tacpipe.formats.table import layout, reading, rows
 
 COLUMNS, ROWS = 16, 1_000_000  # at 1 kHz, 0.17 GB
 LAYOUT = """
@@ -49,7 +49,7 @@ def _pyarrow(path: Path) -> None:
 
 def _batches(path: Path) -> None:
     (stream,) = layout.parse(LAYOUT).streams
-    for _ in reading.batches(reading.opened(path, stream), stream):
+    for _ in reading.batches(rows.opened(path, stream), stream):
         pass
 
 

@@ -72,6 +72,14 @@ def test_of_two_positions_the_stream_named_is_taken_and_else_the_robot() -> None
         pose.pose(both, "wrist")
 
 
+def test_a_height_alone_is_no_arm_unless_an_arm_is_needed_or_named() -> None:
+    height = pa.schema([field("tcp_z_m", "position", "arm", "m")])
+    assert pose.pose(height, needed=False) == pose.Pose()
+    for named, needed in (("", True), ("arm", False)):
+        with pytest.raises(TacpipeError, match=r"--actions none"):
+            pose.pose(height, named, needed=needed)
+
+
 def test_ground_truth_is_no_pose() -> None:
     assert pose.pose(pa.schema([field(f"gt_{part}", "position", unit="m") for part in "xyz"])) == pose.Pose()
 

@@ -32,6 +32,8 @@ class Pose:
         return self.position + self.orientation
 
 
+WITHOUT_ARM = "Without an arm, give --actions none."
+
 # the columns of recordings that do not declare quantities, as the first versions wrote them
 NAMED = Pose(
     tuple(f"{USUAL}_position_{axis}_m" for axis in "xyz"), tuple(f"{USUAL}_orientation_{part}" for part in "xyzw")
@@ -42,9 +44,9 @@ def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
     """Return the columns of the arm's pose; of no arm where no column's quantity is position.
 
     ``arm`` names the stream of the arm; without it that is the only one with a position, or else the one named robot.
-    An arm without a quaternion has no orientation. Where none is ``needed`` and several streams hold a position, as markers
-    do, none of them is the arm. Raises `TacpipeError` for several positions, for components that are
-    not x, y and z, and `UsageError` where ``arm`` has no position.
+    An arm without a quaternion has no orientation. Where none is ``needed`` nor named, several streams with a position, as
+    markers have, and a position that is not x, y and z are not an arm. Else raises `TacpipeError` for these, and
+    `UsageError` where ``arm`` has no position.
     """
     found = _vectors(schema, POSITION)
     if not found and set(NAMED.columns) <= set(schema.names):
@@ -64,7 +66,12 @@ def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
             f"There are {len(found)} positions ({several}), and the motion of one arm is read. Name its stream with "
             f"--arm, or give what is not an arm another quantity in {entry(stream if here else '')} of the layout file."
         )
-    position = _ordered(here[0], "xyz", POSITION, stream)
+    if not needed and not arm and sorted(map(components.component, here[0])) != list("xyz"):
+        return Pose()
+    try:
+        position = _ordered(here[0], "xyz", POSITION, stream)
+    except TacpipeError as error:
+        raise TacpipeError(f"{error} {WITHOUT_ARM}") from error
     turned = [fields for (owner, _), fields in _vectors(schema, ORIENTATION).items() if owner == stream]
     if len(turned) > 1:
         several = listed(field.name for fields in turned for field in fields)
@@ -96,7 +103,7 @@ def metres(field: pa.Field) -> float:
 def no_arm(recording: str, schema: pa.Schema) -> TacpipeError:
     """Return the error of a recording whose arm is not found although its motion is to be read."""
     missing = absent(recording, POSITION, schema, unit="m")
-    return TacpipeError(f"{missing} Without an arm, give --actions none.")
+    return TacpipeError(f"{missing} {WITHOUT_ARM}")
 
 
 def _vectors(schema: pa.Schema, quantity: str) -> dict[tuple[str, str], list[pa.Field]]:

@@ -93,7 +93,9 @@ def _show(program: typer.Typer) -> None:
             Path | None, typer.Option("--plot", help="Draw one recording over time: .png, .svg or .pdf.")
         ] = None,
         as_json: AsJson = False,
-        full: Annotated[bool, typer.Option("--full", help="All recordings, not the first 20, and all labels.")] = False,
+        full: Annotated[
+            bool, typer.Option("--full", help="All recordings, labels and files, not the first ones.")
+        ] = False,
     ) -> None:
         from tacpipe.cli import show as overview
 

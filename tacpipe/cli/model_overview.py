@@ -20,6 +20,7 @@ from tacpipe.store.store import Store
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
 WEIGHTS = ".safetensors"
+FILES = 5  # of a result that has many, before the rest is counted
 SHOWN = 8  # entries of a list, or of a nested mapping: longer ones are counted
 _APART = ("task", "architecture", "params", "counts", "validation", "trained_on", "parameters", "seconds")
 _ROLES = ("train", "val", "test")
@@ -257,13 +258,20 @@ def _wrapped(text: str, width: int) -> list[str]:
     return [line.replace("\0", " ") for line in lines]
 
 
-def files_text(files: Mapping[str, int]) -> list[str]:
-    """Return names and sizes of files.
+def files_text(files: Mapping[str, int], *, full: bool = False) -> list[str]:
+    """Return names and sizes of files; of many how many there are with the first ones, unless all are wanted (``full``).
 
     >>> files_text({"config.json": 15696, "history.jsonl": 188})
     ['files  config.json 15.7 kB, history.jsonl 188 bytes']
+    >>> files_text(dict.fromkeys("abcdefgh", 1000))
+    ['files  8, together 8.0 kB: a 1.0 kB, b 1.0 kB, c 1.0 kB, d 1.0 kB, e 1.0 kB and 3 more (--full)']
     """
-    return _aligned([("files", ", ".join(f"{name} {_size(size)}" for name, size in files.items()))])
+    names = [f"{name} {_size(size)}" for name, size in files.items()]
+    if full or len(names) <= FILES + 1:
+        return _aligned([("files", ", ".join(names))])
+    total = _size(sum(files.values()))
+    text = f"{len(names)}, together {total}: {', '.join(names[:FILES])} and {len(names) - FILES} more"
+    return _aligned([("files", f"{text} (--full)")])
 
 
 def _size(count: int) -> str:

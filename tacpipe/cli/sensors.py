@@ -146,7 +146,7 @@ def _text(report: Report) -> str:
 
 
 def _stanza(report: Report) -> list[str]:
-    """Return what to write into a rig file for the likeliest sensor, with what is a guess said to be one."""
+    """Return what to write into a rig file for the likeliest sensor, with a comment on what is a guess."""
     candidate = report.findings[0].candidate
     options = dict(candidate.options)
     if report.baud and report.baud != type(candidate.sensor).__dict__.get("baud"):

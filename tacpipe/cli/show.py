@@ -6,6 +6,7 @@ What is shown follows from what the dataset holds, whichever stage made it.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,11 @@ _SPLIT = ("recording", "fold", "role")  # columns of a split
 
 
 def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
-    """Return what is in the dataset at ``path``: its ``kind`` (recordings, split, model, result), files, and the rest by it.
+    """Return what is in the dataset at ``path``: its ``kind``, files, and the rest by kind.
 
-    Of recordings, labels, and numbers a stream of the first ``most`` by name (None: of all), whose shards alone are read; of
-    a split, recordings by fold and role; of a model and of a result, what
-    `tacpipe.cli.model_overview` finds.
+    The kind is recordings, split, model, result or export. Of recordings, labels, and numbers a stream of the first ``most``
+    by name (None: of all), whose shards alone are read; of a split, recordings by fold and role; of a model and of a result,
+    what `tacpipe.cli.model_overview` finds.
     """
     found = manifest_of.find(path)
     store = locate(found.directory)
@@ -42,6 +43,8 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
         return {"kind": "result", **about, **model_overview.of_result(opened, found, store)}
     if model_overview.is_model(opened):
         return {"kind": "model", **about, **model_overview.of_model(opened, store)}
+    if opened.source.exported:
+        return {"kind": "export", **about}
     folds = _folds(opened)
     if folds:
         return {
@@ -122,10 +125,16 @@ def _stream(shard: Recording, stream: str) -> dict[str, Any]:
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
     """Return the overview as lines: one a stream of each recording that was read, then labels; then files and totals."""
-    texts = {"model": model_overview.model_text, "result": model_overview.result_text, "split": _split_text}
+    texts: dict[str, Callable[[dict[str, Any]], list[str]]] = {
+        "model": model_overview.model_text,
+        "result": model_overview.result_text,
+        "split": _split_text,
+        "export": lambda _: [],
+    }
     if value["kind"] in texts:
         made = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-        return printable.lines([*texts[value["kind"]](value), *model_overview.files_text(value["files"]), made])
+        files = model_overview.files_text(value["files"], full=full)
+        return printable.lines([*texts[value["kind"]](value), *files, made])
     return printable.lines(_recordings_text(value, full))
 
 
@@ -149,7 +158,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
     lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
     lines += ending.lines(value["attributes"], value["recordings"])
     lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
-    lines += _files(value)
+    lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
     lines.append(
         f"{counted(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
         f"made by {value['stage']} [{value['digest'][:12]}]"
@@ -168,10 +177,6 @@ def _split_text(value: dict[str, Any]) -> list[str]:
 
 def _role_order(role: str) -> tuple[int, str]:
     return (ROLES.index(role) if role in ROLES else len(ROLES)), role
-
-
-def _files(value: dict[str, Any]) -> list[str]:
-    return [f"file: {name}, {size} bytes" for name, size in value["files"].items()]
 
 
 def _labels(attributes: dict[str, dict[str, Any]], full: bool) -> list[str]:

@@ -372,7 +372,7 @@ def _about(stage: AnyStage, name: str, comment: str) -> str:
 
 
 def _metavar(wanted: Any) -> str:
-    """Return what stands for an option's value in its help: the choices, or the type."""
+    """Return what represents an option's value in its help: the choices, or the type."""
     kind = fields_of.bare(wanted)
     if get_origin(kind) is tuple:
         return f"{_metavar(get_args(kind)[0])}..."

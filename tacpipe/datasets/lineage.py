@@ -56,6 +56,7 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
         "recordings": len(manifest.recordings),
         "rows": manifest.rows,
         "files": {file: value["digest"] for file, value in manifest.files.items()},
+        "files_bytes": sum(value["bytes"] for value in manifest.files.values()),
         "labels": {recording: dict(labels) for recording, labels in manifest.labels.items()},
         "skipped": dict(manifest.skipped),
         "sources": {recording: dict(files) for recording, files in manifest.sources.items()},
@@ -154,6 +155,14 @@ def to_text(tree: dict[str, Any]) -> str:
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
+def _files(node: dict[str, Any]) -> str:
+    """Return the names of a few files, or how many there are with the first of them."""
+    names = list(node["files"])
+    if len(names) <= _SHOWN:
+        return ", ".join(names)
+    return f"{len(names)} files, {node['files_bytes'] / 1e6:.1f} MB: {listed(names, _SHOWN)}"
+
+
 def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str = "") -> list[str]:
     """Return the lines of a node and what it descends from; one that was ``described`` already is only named."""
     pad = "  " * depth
@@ -164,7 +173,7 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
     if node["manifest"] in described:
         return [f"{place}  as above"]
     described.add(node["manifest"])
-    what = f"{node['recordings']} recordings, {node['rows']} rows" if node["recordings"] else ", ".join(node["files"])
+    what = f"{node['recordings']} recordings, {node['rows']} rows" if node["recordings"] else _files(node)
     params = ", ".join(f"{name}={value}" for name, value in node["params"].items())
     lines = [
         f"{place}  {what}",

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import mmap
 import struct
+import tempfile
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -24,8 +25,9 @@ from tacpipe.channels import lsl
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import xdf_chunks
 from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Contents, SourceStream, Time
+from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, Damage
+from tacpipe.io.spill import Piece, Spill
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.signals import clock_offsets, clocks
@@ -35,6 +37,9 @@ RAW = "t_device_ns"
 OFFSETS = " clock offsets"  # what the name of a stream's offsets ends with
 UNDESCRIBED = "the file does not describe it"
 CLOCK = "LSL's, of the computer that recorded"
+ASIDE_ROWS = 1 << 16  # samples of a stream, before they are put aside
+PASSED_BYTES = 1 << 26  # of a file that was read, before memory lets go of them
+COMPRESSED_BYTES = 1 << 20  # that are decompressed at once
 
 
 @dataclass
@@ -42,8 +47,11 @@ class _Stream:
     """What was read of a stream so far."""
 
     about: lsl.Description
+    aside: Spill
     stamps: list[Floats] = field(default_factory=list)
-    values: list[AnyArray] = field(default_factory=list)
+    values: list[AnyArray] = field(default_factory=list)  # (sample, channel), of samples that are not put aside
+    pieces: list[Piece] = field(default_factory=list)
+    waiting: int = 0  # samples of ``values``
     offsets: list[tuple[float, float]] = field(default_factory=list)  # reading of the sender's clock, and what to add
     rows_before: list[int] = field(default_factory=list)  # (offset,), samples that stand before it in the file
     rows: int = 0
@@ -68,12 +76,38 @@ class _Stream:
             self.stamps.append(xdf_chunks.deduced(found.stamps, last, period_s))
             self.values.append(found.values)
             self.rows += len(found.stamps)
+            self.waiting += len(found.stamps)
+            if self.waiting >= ASIDE_ROWS:
+                self.pieces.append(self.aside.add(pa.table(self._columns(), pa.schema(self.fields))))
+                self.values, self.waiting = [], 0
+
+    @property
+    def fields(self) -> list[pa.Field]:
+        """The fields of the channels."""
+        taken = [STAMP, RAW, "t_ns"]
+        kind = pa.string() if self.about.is_text else pa.from_numpy_dtype(self.about.dtype)
+        return [
+            pa.field(one.name if one.name not in taken else f"{one.name}_channel", kind, metadata=one.metadata)
+            for one in self.about.channels
+        ]
+
+    def channels(self) -> Iterator[list[pa.ChunkedArray]]:
+        """Yield the values of the channels, some samples at a time."""
+        for piece in self.pieces:
+            yield self.aside.read(piece).columns
+        if self.waiting:
+            yield self._columns()
+
+    def _columns(self) -> list[pa.ChunkedArray]:
+        values = np.concatenate(self.values)
+        return [pa.chunked_array([pa.array(values[:, at], one.type)]) for at, one in enumerate(self.fields)]
 
 
 @dataclass
 class _Read:
     """What was read of a file."""
 
+    aside: Spill = field(default_factory=Spill)
     streams: dict[int, _Stream] = field(default_factory=dict)
     unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
     header: bytes = b""
@@ -137,8 +171,7 @@ class XdfFile:
             t_ns, facts, described = made
             notes += [f"{self.path}: {plain(source)} {one}" for one in [*described, *_losses(stream)]]
             attributes |= {f"{names[source]}_{name}": value for name, value in facts.items()}
-            table = _table(stream, t_ns)
-            found.append(SourceStream(source, names[source], Time(STAMP, "ns"), table, stream.rows))
+            found.append(SourceStream(source, names[source], Time(STAMP, "ns"), _content_of(stream, t_ns), stream.rows))
             if stream.offsets:
                 source += OFFSETS
                 offsets = _offsets_table(stream)
@@ -149,8 +182,15 @@ class XdfFile:
     def _read(self) -> _Read:
         read = _Read()
         try:
-            for chunk in xdf_chunks.chunks(_content(self.path)):
+            content = _content(self.path)
+            passed = 0  # bytes
+            for chunk in xdf_chunks.chunks(content):
                 _take(read, chunk)
+                if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
+                    content.madvise(
+                        mmap.MADV_DONTNEED, passed, PASSED_BYTES
+                    )  # else the whole file stays mapped in memory
+                    passed += PASSED_BYTES
         except (OSError, zlib.error) as error:
             raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
         except TacpipeError as error:
@@ -160,23 +200,27 @@ class XdfFile:
 
 def _content(path: Path) -> xdf_chunks.Content:
     """Return the bytes of a file, decompressed; of a compressed one that was cut off those that are there."""
-    with path.open("rb") as file:
+    with path.open("rb") as file, tempfile.TemporaryFile() as unpacked:
         head = file.read(2)
         if head == b"\x1f\x8b":
-            return _decompressed(path)
+            file.seek(0)
+            _decompress(file, unpacked)
+            head = b"" if not unpacked.tell() else head
         if not head:
             return b""
-        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        return mmap.mmap((unpacked if head == b"\x1f\x8b" else file).fileno(), 0, access=mmap.ACCESS_READ)
 
 
-def _decompressed(path: Path) -> bytes:
-    unpacked = bytearray()
-    data = path.read_bytes()
-    while data:
-        stream = zlib.decompressobj(wbits=31)  # of gzip, of which several may follow one another
-        unpacked += stream.decompress(data)
-        data = stream.unused_data
-    return bytes(unpacked)
+def _decompress(file: BinaryIO, unpacked: BinaryIO) -> None:
+    stream = zlib.decompressobj(wbits=31)  # of gzip, of which several may follow one another
+    while data := file.read(COMPRESSED_BYTES):
+        while data:
+            if stream.eof:
+                stream = zlib.decompressobj(wbits=31)
+            unpacked.write(stream.decompress(data))
+            data = stream.unused_data
+    unpacked.write(stream.flush())
+    unpacked.flush()
 
 
 def _take(read: _Read, chunk: Chunk | Damage) -> None:
@@ -192,7 +236,7 @@ def _take(read: _Read, chunk: Chunk | Damage) -> None:
         return
     elif chunk.tag == xdf_chunks.STREAM_HEADER:
         try:
-            read.streams[chunk.stream] = _Stream(lsl.parse(chunk.content))
+            read.streams[chunk.stream] = _Stream(lsl.parse(chunk.content), read.aside)
         except TacpipeError as error:
             read.unknown[chunk.stream] = str(error)
     elif chunk.stream not in read.streams:
@@ -302,17 +346,19 @@ def _reset_row(stream: _Stream, raw_ns: Times, measured: Int64s, first: int) -> 
     return max(low - 1, 0) + jump + 1
 
 
-def _table(stream: _Stream, t_ns: Times) -> pa.Table:
-    values = np.concatenate(stream.values)
-    fields: list[pa.Field] = [_time_field(STAMP), _time_field(RAW)]
-    columns: list[Any] = [pa.array(t_ns), pa.array(lsl.nanoseconds(np.concatenate(stream.stamps)))]
-    taken = [STAMP, RAW, "t_ns"]
-    for place, channel in enumerate(stream.about.channels):
-        name = channel.name if channel.name not in taken else f"{channel.name}_channel"
-        kind = pa.string() if stream.about.is_text else pa.from_numpy_dtype(stream.about.dtype)
-        fields.append(pa.field(name, kind, metadata=channel.metadata))
-        columns.append(pa.array(values[:, place], kind))
-    return pa.Table.from_arrays(columns, schema=pa.schema(fields))
+def _content_of(stream: _Stream, t_ns: Times) -> pa.Table | Batched:
+    """Return the samples with their stamps: a table of few, else as they were put aside. The stamps are in memory."""
+    schema = pa.schema([_time_field(STAMP), _time_field(RAW), *stream.fields])
+    raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))
+
+    def read() -> Iterator[pa.Table]:
+        begin = 0
+        for columns in stream.channels():
+            end = begin + len(columns[0])
+            yield pa.table([pa.array(t_ns[begin:end]), pa.array(raw_ns[begin:end]), *columns], schema)
+            begin = end
+
+    return Batched(schema, stream.rows, read) if stream.pieces else next(read())
 
 
 def _time_field(name: str) -> pa.Field:

@@ -19,7 +19,7 @@ from tacpipe.io.parquet_claims import claimed
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
-HELD_SHARE = 0.25  # above this share of repeated rows zstd beats delta packing; measured, docs/format.md
+HELD_SHARE = 0.25  # above this fraction of repeated rows zstd beats delta packing; measured, docs/format.md
 LARGE_BYTES = 1 << 25  # in memory
 BATCH_ROWS = 1024  # Arrow's own
 PAGE_BYTES = 1 << 20  # of encoded frames; a batch of 1024 of them could be beyond the 2 GiB that a page may have
@@ -152,7 +152,7 @@ class _Rows:
 def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
     """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
 
-    Raises `DamagedError` when the bytes are no Parquet file, and where what they claim to hold is not there, and
+    Raises `DamagedError` when the bytes are no Parquet file, and where what they declare is not there, and
     `ShortageError` where it is more than the memory that is left, which a sound file may hold too.
     """
     return ParquetTable(content).read(columns)
@@ -176,7 +176,7 @@ class ParquetTable:
 
     @property
     def num_rows(self) -> int:
-        """How many rows the file claims."""
+        """How many rows the file declares."""
         return int(self._file.metadata.num_rows)
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
@@ -247,7 +247,7 @@ def _compressed_already(column: pa.ChunkedArray) -> bool:
 
 
 def _held_share(table: pa.Table) -> float:
-    """Return the share of rows whose integer channels all equal those of the row before."""
+    """Return the fraction of rows whose integer channels all equal those of the row before."""
     channels = [
         column.to_numpy()
         for name, column in zip(table.column_names, table.columns, strict=True)

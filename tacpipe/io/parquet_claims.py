@@ -1,8 +1,8 @@
-"""What the columns of a Parquet file claim to hold, counted page by page before anything is unpacked.
+"""What the columns of a Parquet file declare, counted page by page before anything is unpacked.
 
-A file of some hundred bytes can claim any number of rows, and a page any size: pyarrow believes both, and takes the memory.
-Every page has a header (https://parquet.apache.org/docs/file-format/, Thrift's compact protocol) that tells its size once
-unpacked and how many values it holds; these must be what the columns' own totals say. Values that are stored as
+A file of some hundred bytes can declare any number of rows, and a page any size: pyarrow checks neither, and takes the
+memory. Every page has a header (https://parquet.apache.org/docs/file-format/, Thrift's compact protocol) that states its
+size once unpacked and how many values it holds; these must be the columns' own totals. Values that are stored as
 differences or runs may be as many as one likes, so what they would take is compared with the memory that is left.
 """
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pyarrow.parquet import ParquetSchema
 
 DATA, DICTIONARY = 0, 2  # kinds of pages
-PLAIN, DELTA_LENGTH = 0, 6  # encodings of texts that are as long as what stands for them
+PLAIN, DELTA_LENGTH = 0, 6  # encodings of texts that are as long as what represents them
 WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}  # bytes of a value in memory
 OFFSET = 8  # bytes that a text takes beside its own
 _VARINT = rb"([\x80-\xff]*[\x00-\x7f])"
@@ -28,7 +28,7 @@ DEEPEST = 8  # structures within one another in a page's header
 
 
 class Page(NamedTuple):
-    """What a page's header says."""
+    """What a page's header states."""
 
     kind: int
     unpacked: int  # bytes
@@ -38,10 +38,10 @@ class Page(NamedTuple):
 
 
 def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None) -> int:
-    """Return how many bytes the ``columns`` of a file (None: all) are in memory by what they claim, at least.
+    """Return how many bytes the ``columns`` of a file (None: all) are in memory by what they declare, at least.
 
     The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
-    Raises `ValueError` where a column tells of another number of values than its pages, or of pages that are not there.
+    Raises `ValueError` where a column states another number of values than its pages, or of pages that are not there.
     """
     length = int.from_bytes(content[-8:-4], "little")
     told, _ = _struct(content, len(content) - 8 - length, len(content) - 8, 0)

@@ -1,4 +1,4 @@
-"""Looking after a store: what is in it, whether it is sound, and mending it."""
+"""A store as a whole: what is in it, whether it is sound, and its repair."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def link(path: Path) -> int:
                 stale.append((name, digest))
         directory_of.refuse_links(directory, [name for name, _ in stale])
         with directory_of.writing(directory):
-            directory_of.sweep(directory)
+            directory_of.sweep(directory, deep=manifest.exported)
             for name, digest in stale:
                 directory_of.place(store, digest, directory / name, copy=manifest.recorded)
         store.put(found.content)

@@ -77,7 +77,7 @@ class Headline:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the headline as JSON holds it: what is not defined is null; best baseline and verdict stand beside."""
+        """Return the headline as JSON holds it: what is not defined is null; best baseline and verdict are next to it."""
         told = asdict(self)
         best = self.best
         return {**_json(told), "best_baseline": best.name if best else None, "verdict": self.verdict}

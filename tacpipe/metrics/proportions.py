@@ -1,4 +1,4 @@
-"""How sure a share of correct answers is, and whether two classifiers differ by more than chance.
+"""How certain a fraction of correct answers is, and whether two classifiers differ by more than chance.
 
 - ``wilson``: the 95 % interval of a share (Wilson, Probable inference, the law of succession, and statistical inference,
   1927): all true shares whose own chance would make the one seen no rarer than 1 in 20.
@@ -22,7 +22,7 @@ COVERAGE = 0.95
 
 
 class Difference(NamedTuple):
-    """What a paired test says of second less first."""
+    """What a paired test gives for second less first."""
 
     difference: float  # mean over pairs, in the unit of what was given
     t: float  # infinite where all pairs differ alike; NaN where none does

@@ -70,7 +70,7 @@ def mae(true: AnyFloats, predicted: AnyFloats) -> float:
 
 
 def r2(true: AnyFloats, predicted: AnyFloats) -> float:
-    """Return the share of variance that is explained, each value's about its own mean; NaN where nothing varies.
+    """Return the fraction of variance that is explained, each value's about its own mean; NaN where nothing varies.
 
     1 is perfect; 0 is as good as the mean of these very grasps, which nobody knows beforehand: a constant that was fitted
     elsewhere falls below it.

@@ -27,10 +27,11 @@ from tacpipe.arrays import AnyArray, Bools, Bytes, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, options, taxels
 from tacpipe.sensors.byte_framer import ByteFramer
+from tacpipe.sensors.described import Board, DescribedSensor, device_ns
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.layout import Clock, Length, Number, Order, Place, Sequence, Sum
 from tacpipe.sensors.packet_framer import PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Samples
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -39,7 +40,7 @@ MOST = 4096  # bytes of a frame
 
 
 @dataclass(frozen=True, kw_only=True)
-class Generic(Sensor):
+class Generic(DescribedSensor):
     """A board that the rig file describes."""
 
     summary: ClassVar[str] = "A lab's own board: binary frames as the rig file describes them."
@@ -133,22 +134,8 @@ class Generic(Sensor):
             if name not in taken and not place.number.skip and place.number.equals is None
         ]
 
-    @property
-    def counter_modulus(self) -> int:
-        """At which the sequence begins anew; 0 where there is none."""
-        if self.sequence is None:
-            return 0
-        return self.sequence.modulus or self._places[self.sequence.number].range
-
-    @property
-    def counter(self) -> int | None:  # type: ignore[override]
-        """The modulus of ``seq``, or None where nothing counts."""
-        return self.counter_modulus or None
-
-    @property
-    def step(self) -> int:  # type: ignore[override]
-        """By which ``seq`` grows from a frame to the next."""
-        return 1 if self.sequence is None else self.sequence.step
+    def _counting(self) -> tuple[Sequence, int] | None:
+        return None if self.sequence is None else (self.sequence, self._places[self.sequence.number].range)
 
     def fields(self) -> list[pa.Field]:
         """Return a field a channel, in the order of the numbers, with unit, quantity, taxel and axis."""
@@ -227,11 +214,7 @@ class Generic(Sensor):
             seq = self._places[self.sequence.number].take(frames)[:, 0].astype(np.int64)
         if self.clock is not None:
             ticks = self._places[self.clock.number].take(frames)[:, 0]
-            unit_ns = layout.UNITS_NS[self.clock.unit]
-            whole = ticks.dtype.kind != "f"
-            t_device_ns = (
-                ticks.astype(np.int64) * unit_ns if whole else np.rint(ticks * float(unit_ns)).astype(np.int64)
-            )
+            t_device_ns = device_ns(ticks, self.clock.unit)
         return Samples(values, seq=seq, t_device_ns=t_device_ns, rows=rows)
 
     @functools.cached_property
@@ -292,24 +275,6 @@ class Generic(Sensor):
         """Return a board that streams from the start, or from when it hears ``start`` until it hears ``stop``."""
         start, stop = _bytes("start", self.start), _bytes("stop", self.stop)
         return Board(streaming=not start, start=start, stop=stop)
-
-
-@dataclass
-class Board(Device):
-    """The board's side: streams after ``start`` and not after ``stop``, whichever was heard last."""
-
-    start: bytes = b""
-    stop: bytes = b""
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Take what the host wrote; nothing is replied."""
-        self.heard += data
-        started = self.heard.rfind(self.start) if self.start else -1
-        stopped = self.heard.rfind(self.stop) if self.stop else -1
-        if started != stopped:
-            self.streaming = started > stopped
-            del self.heard[: max(started + len(self.start), stopped + len(self.stop))]
-        return []
 
 
 def _names(number: Number) -> list[tuple[str, dict[str, str]]]:

@@ -28,11 +28,12 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, line_layout, options
+from tacpipe.sensors.described import Board, DescribedSensor, device_ns
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.line_layout import Cell, Clock, Column, Sum
 from tacpipe.sensors.line_layout import Sequence as Counter
 from tacpipe.sensors.line_parser import Parser, Table, sums
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, Samples
 from tacpipe.sensors.text_framer import LineFramer, TextFramer
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ KEPT = 4  # batches of lines that are read once for the framer and the decoder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lines(Sensor):
+class Lines(DescribedSensor):
     """A board whose lines the rig file describes."""
 
     summary: ClassVar[str] = "A lab's own board: lines of text as the rig file describes them."
@@ -164,22 +165,8 @@ class Lines(Sensor):
             self.sum,
         )
 
-    @property
-    def counter_modulus(self) -> int:
-        """At which the sequence begins anew; 0 where there is none."""
-        if self.sequence is None:
-            return 0
-        return self.sequence.modulus or _range(self._places[self.sequence.column][1])
-
-    @property
-    def counter(self) -> int | None:  # type: ignore[override]
-        """The modulus of ``seq``, or None where nothing counts."""
-        return self.counter_modulus or None
-
-    @property
-    def step(self) -> int:  # type: ignore[override]
-        """By which ``seq`` grows from a line to the next."""
-        return 1 if self.sequence is None else self.sequence.step
+    def _counting(self) -> tuple[Counter, int] | None:
+        return None if self.sequence is None else (self.sequence, _range(self._places[self.sequence.column][1]))
 
     def fields(self) -> list[pa.Field]:
         """Return a field a channel, in the order of the columns, with unit, quantity, taxel and axis."""
@@ -214,11 +201,8 @@ class Lines(Sensor):
         if self.sequence is not None:
             seq = table.block([self._places[self.sequence.column][0]])[:, 0].astype(np.int64)
         if self.clock is not None:
-            ticks, unit_ns = table.block([self._places[self.clock.column][0]])[:, 0], layout.UNITS_NS[self.clock.unit]
-            exact = ticks.dtype.kind != "f"
-            t_device_ns = (
-                ticks.astype(np.int64) * unit_ns if exact else np.rint(ticks * float(unit_ns)).astype(np.int64)
-            )
+            ticks = table.block([self._places[self.clock.column][0]])[:, 0]
+            t_device_ns = device_ns(ticks, self.clock.unit)
         return Samples(values, seq=seq, t_device_ns=t_device_ns, rows=rows)
 
     def encode(self, samples: Samples) -> list[bytes]:
@@ -264,8 +248,6 @@ class Lines(Sensor):
 
     def device(self) -> Device:
         """Return a board that sends from the start, or from when it hears ``start`` until it hears ``stop``."""
-        from tacpipe.sensors.generic import Board
-
         start, stop = self.start.encode(), self.stop.encode()
         return Board(streaming=not start, start=start, stop=stop)
 

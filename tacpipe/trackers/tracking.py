@@ -57,7 +57,7 @@ def files(made: Manifest, store: Store) -> dict[str, bytes]:
 class Tracking:
     """Several trackers as one, which follows trainings; what one of them raises ends it alone."""
 
-    trackers: dict[str, Tracker]  # by what ``--track`` said
+    trackers: dict[str, Tracker]  # by what ``--track`` gave
     name: str  # of the run
     params: Mapping[str, Scalar]
     failures: list[str] = field(default_factory=list)

@@ -1,7 +1,7 @@
 """What an interrupted training resumes from: one file, replaced as a whole after every epoch.
 
 Its first line is the digest of the rest, a safetensors file with the state as JSON in its header: two files could be torn
-apart by a crash between them, and training must not go on from a weight that a disk has changed.
+apart by a crash between them, and training must not resume from a weight that a disk has changed.
 """
 
 from __future__ import annotations

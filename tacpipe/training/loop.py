@@ -1,7 +1,7 @@
 """The training loop: Adam, clipped gradients, early stopping, and a checkpoint after every epoch.
 
 What is learned comes as `Work`: its batches, its loss, and what is watched after each epoch. Batches are rows of tensors
-picked by index, so no loader stands between the data and the step. All randomness (first weights, dropout, shuffles)
+picked by index, so no loader stands between the data and the step. All randomness (initial weights, dropout, shuffles)
 comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and resumed
 gives the same bits as one that was not, on a CPU; a GPU adds in another order each time. Several
 processes may share each batch (`tacpipe.training.ranks`): all run this loop, draw alike and take the same steps.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import logging
+import mmap
 import os
 import tomllib
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ import pytest
 import pyxdf
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import xdf_streams
 from tacpipe.formats.table.contained import Params
 from tacpipe.formats.xdf import COMMAND, xdf
 from tacpipe.plugins.stage import RecordingOutput
@@ -290,3 +292,13 @@ def test_a_published_file_reads_as_pyxdf_does() -> None:
         assert np.allclose(stamps(table) / 1e9, synced[name]["time_stamps"], atol=1e-8)
         channels = [table.column(column).to_pylist() for column in table.column_names[2:]]
         assert np.column_stack(channels).tolist() == np.asarray(one["time_series"]).tolist()
+
+
+def test_samples_that_were_put_aside_are_those_that_were_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    force(tmp_path / "run.xdf", rows=1000)
+    expected = read(tmp_path / "run.xdf").streams["force"]
+    monkeypatch.setattr(xdf_streams, "ASIDE_ROWS", 64)
+    monkeypatch.setattr(xdf_streams, "PASSED_BYTES", mmap.PAGESIZE)
+    made = read(tmp_path / "run.xdf").streams["force"]
+    assert isinstance(made, pa.RecordBatchReader)
+    assert made.read_all().equals(expected, check_metadata=True)

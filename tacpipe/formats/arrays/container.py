@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -17,13 +18,16 @@ from tacpipe.formats.arrays.episodes import Episode
 from tacpipe.formats.arrays.parts import Part
 from tacpipe.formats.arrays.tree import LONGEST_TEXT, Tree, is_text, plain_attributes
 from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Contents, Share, SourceStream
+from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
 ROWS = 3  # that a look reads
+BLOCK_BYTES = 1 << 25  # that are read at once, or a chunk of the file where that is more
+OBJECT_BYTES = 200  # that a text may take in memory
 MASK = "mask"  # the group of robomimic's lists
 DEPTH = 4  # of texts of JSON in attributes
+RowsOf = Callable[[Tree, Episode, Part], "pa.Table | Batched"]
 
 
 @dataclass(frozen=True)
@@ -47,12 +51,29 @@ class ArrayContainer:
     def look(self, episode: str | None) -> Contents:
         """Return the streams of a recording with their first rows."""
         with self.open_tree() as tree:
-            return _contents(tree, episodes.named(tree, episode), None, ROWS)
+            return _contents(tree, episodes.named(tree, episode), None, _first_rows)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
-        """Return the streams of a recording, all or those of some sources."""
+        """Return the streams of a recording, all or those of some sources; of long ones the rows stay in the file."""
         with self.open_tree() as tree:
-            return _contents(tree, episodes.named(tree, episode), sources, None)
+            return _contents(tree, episodes.named(tree, episode), sources, self._rows)
+
+    def _rows(self, tree: Tree, episode: Episode, part: Part) -> pa.Table | Batched:
+        """Return the rows of a stream, block by block from the file where they are more than one block."""
+        start, count = episode.start, times.rows(episode, part)
+        step = _block_rows(tree, episode, part)
+        edges = [start, *range((start // step + 1) * step, start + count, step), start + count]
+        first = _table(tree, episode, part, edges[0], edges[1])
+        if len(edges) == 2:
+            return first
+        schema = first.schema
+
+        def read() -> Iterator[pa.Table]:
+            with self.open_tree() as again:
+                for begin, end in itertools.pairwise(edges):
+                    yield pa.table(_table(again, episode, part, begin, end).columns, schema)
+
+        return Batched(schema, count, read)
 
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
         """Return the chunks that a recording is read from, and what metadata state of it; None of a single file."""
@@ -77,7 +98,7 @@ class ArrayContainer:
             )
 
 
-def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, most: int | None) -> Contents:
+def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, rows: RowsOf) -> Contents:
     found = parts.of(tree, episode)
     skipped = dict(found.skipped)
     attributes, long = _attributes(tree, episode)
@@ -106,7 +127,7 @@ def _contents(tree: Tree, episode: Episode, sources: Collection[str] | None, mos
             part.source,
             names[part.source],
             time,
-            _table(tree, episode, part, most),
+            rows(tree, episode, part),
             times.rows(episode, part),
         )
         for part, time in chosen
@@ -137,9 +158,21 @@ def _names(found: Sequence[Part]) -> dict[str, str]:
     return {source: names[name] for source, name in called.items()}
 
 
-def _table(tree: Tree, episode: Episode, part: Part, most: int | None) -> pa.Table:
-    start, stop = episode.start, episode.start + times.rows(episode, part)
-    stop = stop if most is None else min(stop, start + most)
+def _first_rows(tree: Tree, episode: Episode, part: Part) -> pa.Table:
+    return _table(tree, episode, part, episode.start, episode.start + min(times.rows(episode, part), ROWS))
+
+
+def _block_rows(tree: Tree, episode: Episode, part: Part) -> int:
+    """Return how many rows of a stream are read at once: whole chunks, since a file gives no less."""
+    row_bytes = sum(array.row_bytes + (OBJECT_BYTES if array.dtype.hasobject else 0) for array in part.all)
+    if part.frames and times.rows(episode, part):
+        row_bytes += frames.size(tree, part.arrays[0], episode.start)
+    rows = max(1, BLOCK_BYTES // row_bytes)
+    chunk_rows = max(array.chunk_rows for array in part.all)
+    return -(-rows // chunk_rows) * chunk_rows if chunk_rows else rows
+
+
+def _table(tree: Tree, episode: Episode, part: Part, start: int, stop: int) -> pa.Table:
     fields: list[pa.Field] = []
     values: list[pa.Array] = []
     is_aloha = tree.is_group(f"{episode.group}/observations".strip("/"))

@@ -25,6 +25,11 @@ def encoded(tree: Tree, array: Array, row: int) -> bool:
     return bool(encoding(_bytes(tree.read(array, row, row + 1))[0]))
 
 
+def size(tree: Tree, array: Array, row: int) -> int:
+    """Return how many bytes a row of an array of pictures has."""
+    return len(_bytes(tree.read(array, row, row + 1))[0])
+
+
 def of(array: Array, values: AnyArray) -> tuple[pa.Field, pa.Array]:
     """Return field and values of the column of pictures: bytes as they were written, without the zeros behind them."""
     found = binary(array, values)

@@ -19,6 +19,7 @@ from tacpipe.formats.bags.topics import Decoder, Topic, TopicError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream
 from tacpipe.io import regular, yaml_text
+from tacpipe.io.spill import Spill
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
@@ -138,6 +139,7 @@ class _Reading:
     attributes: dict[str, Attribute] = field(default_factory=dict)
     own: dict[str, Own] = field(default_factory=dict)  # topics that tacpipe itself exported
     notes: list[str] = field(default_factory=list)
+    aside: Spill = field(default_factory=Spill)  # decoded messages
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
 
     def take(self, records: Iterator[Record], file: int, most: int | None) -> None:
@@ -171,7 +173,7 @@ class _Reading:
                 self._skip(topic, f"it has messages of two types, {plain(self.types[topic])} and {plain(channel.type)}")
             return
         try:
-            self.topics[topic] = Topic(_decoder(channel))
+            self.topics[topic] = Topic(_decoder(channel), self.aside)
             self.types[topic] = channel.type
         except TopicError as error:
             self._skip(topic, str(error))
@@ -194,7 +196,7 @@ class _Reading:
         if found.name == own.KEY:
             self.attributes |= own.attributes(found.values)
             return
-        from tacpipe.formats.table.labels import plain_value
+        from tacpipe.formats.table.label_texts import plain_value
 
         for name, value in found.values.items():
             self.attributes.setdefault(plain(name), plain_value(value))
@@ -220,10 +222,10 @@ class _Reading:
                 source = f"{topic}{OF}{one.suffix}" if one.suffix else topic
                 if self.sources is not None and source not in self.sources:
                     continue
-                rows = None if self.ended_early else one.table.num_rows
+                rows = None if self.ended_early else one.content.rows
                 before = self.own.get(topic)
                 name = before.stream if before is not None and before.stream else source
-                found.append((before, SourceStream(source, name, one.time, one.table, rows)))
+                found.append((before, SourceStream(source, name, one.time, one.content, rows)))
                 if one.note:
                     self.notes.append(f"{plain(source)}: {one.note}; its log times are used.")
         if self.ended_early:

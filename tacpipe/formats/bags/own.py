@@ -13,8 +13,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from tacpipe.formats.bags.topics import HEADER, LOG
-from tacpipe.formats.containers.container import SourceStream, Time
+from tacpipe.formats.bags.topic_rows import HEADER, LOG
+from tacpipe.formats.containers.container import Batched, SourceStream, Time
 from tacpipe.plugins.stage import Attribute
 
 KEY = "tacpipe"  # of a channel's metadata, and the name of the record
@@ -50,20 +50,22 @@ def attributes(values: Mapping[str, str]) -> dict[str, Attribute]:
 
 def restored(found: SourceStream, own: Own) -> SourceStream:
     """Return a stream with the names and the metadata that its columns had."""
-    table = found.table
-    fields, columns = [], []
-    for field in table.schema:
+    fields: dict[str, pa.Field] = {}  # by the column's name so far
+    for field in found.schema:
         if field.name in own.columns:
             name, about = own.columns[field.name]
-            fields.append(pa.field(name, field.type, metadata=dict(about)))
+            fields[field.name] = pa.field(name, field.type, metadata=dict(about))
         elif field.name == found.time.column:
-            fields.append(pa.field(HEADER, field.type, metadata=dict(own.time)))
-        elif field.name == LOG:  # the same as the header's
-            continue
-        else:
-            fields.append(field)
-        columns.append(table.column(field.name))
-    return SourceStream(found.source, found.name, Time(HEADER, "ns"), pa.table(columns, pa.schema(fields)), found.rows)
+            fields[field.name] = pa.field(HEADER, field.type, metadata=dict(own.time))
+        elif field.name != LOG:  # that is the same as the header's
+            fields[field.name] = field
+    schema = pa.schema(list(fields.values()))
+
+    def renamed(table: pa.Table) -> pa.Table:
+        return pa.table([table.column(name) for name in fields], schema)
+
+    content = found.content.mapped(schema, renamed) if isinstance(found.content, Batched) else renamed(found.content)
+    return SourceStream(found.source, found.name, Time(HEADER, "ns"), content, found.rows)
 
 
 def _json(text: str) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.formats.bags.topics import HEADER, Block, TopicError
+from tacpipe.formats.bags.topic_rows import HEADER
+from tacpipe.formats.bags.topics import Block, TopicError
 
 MOST_COLUMNS = 4096  # of a message
 _STAMPS = ("header.stamp", "timestamp", "stamp")  # in nanoseconds, where they are whole numbers

@@ -12,7 +12,8 @@ import pyarrow as pa
 
 from tacpipe.formats.bags import meanings, wire
 from tacpipe.formats.bags.meanings import Column
-from tacpipe.formats.bags.topics import FRAME, HEADER, Block, TopicError
+from tacpipe.formats.bags.topic_rows import FRAME, HEADER
+from tacpipe.formats.bags.topics import Block, TopicError
 from tacpipe.formats.bags.wire import ROS1, TEXT, Encoding, Leaf, Matrix, Shape, Types
 from tacpipe.printable import plain
 
@@ -93,7 +94,8 @@ class Ros:
                 single: dict[Any, _Single] = {}
                 for shape, rows, matrix in wire.shapes(own, self.types, self.name, encoding, known):
                     if len(rows) == 1:
-                        self._take(shape, int(chosen[rows[0]]), meaning, single)
+                        alone = replace(shape, first=matrix[0].tobytes())  # the shape may be one of earlier messages
+                        self._take(alone, int(chosen[rows[0]]), meaning, single)
                         continue
                     for same, one in _by_keys(shape, matrix, meaning):
                         yield from _blocks(one, chosen[rows[same]], matrix[same], meaning)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
@@ -34,10 +34,23 @@ class Time:
 
 
 @dataclass(frozen=True)
+class Batched:
+    """Rows that memory need not hold: ``read`` yields them as tables of the schema, from the first each time."""
+
+    schema: pa.Schema
+    rows: int
+    read: Callable[[], Iterator[pa.Table]]
+
+    def mapped(self, schema: pa.Schema, change: Callable[[pa.Table], pa.Table]) -> Batched:
+        """Return the same rows with each table changed to one of ``schema``."""
+        return Batched(schema, self.rows, lambda: map(change, self.read()))
+
+
+@dataclass(frozen=True)
 class SourceStream:
     """A stream inside a container.
 
-    Columns of the table are 1-D and of the types that a layout has (``tacpipe.formats.table.columns.TYPES``); those of one
+    Columns of the rows are 1-D and of the types that a layout has (``tacpipe.formats.table.columns.TYPES``); those of one
     array are a column each. Metadata of the fields are ``quantity``, ``unit``, ``component``, and what places a channel in
     its sensor: ``taxel``, ``axis``, ``joint``, …. Metadata of the field with the stamps goes to ``t_ns``.
     """
@@ -45,8 +58,29 @@ class SourceStream:
     source: str  # its name inside the file: a topic, a group, a dataset
     name: str  # of the stream: an identifier
     time: Time
-    table: pa.Table  # all rows, or the first few where it was looked at
+    content: pa.Table | Batched  # all rows, or the first few where it was looked at
     rows: int | None = None  # how many there are, where a look shows it
+
+    @property
+    def schema(self) -> pa.Schema:
+        """The columns."""
+        return self.content.schema
+
+    @property
+    def table(self) -> pa.Table:
+        """The rows as one table, in memory."""
+        import pyarrow as pa
+
+        if not isinstance(self.content, Batched):
+            return self.content
+        return pa.concat_tables([self.schema.empty_table(), *self.content.read()])
+
+    def blocks(self) -> Iterator[pa.Table]:
+        """Yield the rows, some at a time where memory need not hold all."""
+        if isinstance(self.content, Batched):
+            yield from self.content.read()
+        else:
+            yield self.content
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ NOTHING: Declared = {}
 
 @dataclass(frozen=True)
 class Chosen:
-    """A column that is read: its name in the file, what it becomes, and the rule that says so."""
+    """A column that is read: its name in the file, what it becomes, and the rule that states it."""
 
     name: str
     field: pa.Field
@@ -56,8 +56,8 @@ class CellError(ValueError):
 def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared = NOTHING) -> list[Chosen]:
     """Return the columns to read among those that ``path`` has, in the file's order.
 
-    ``declared`` are the columns that the file itself describes: where no rule matches they are read as it says, and a rule
-    replaces only what it states. Raises `TacpipeError` for a column that neither describes, a rule that matches none, and
+    ``declared`` are the columns that the file itself describes: where no rule matches they are read so, and a rule replaces
+    only what it states. Raises `TacpipeError` for a column that neither describes, a rule that matches none, and
     two columns of one name.
     """
     found: list[Chosen] = []
@@ -109,7 +109,7 @@ def converted(
     """Return a parsed column as its declared type, scaled; a missing value is NaN in floats and empty in text.
 
     Raises `CellError` for a value that is missing where there is no NaN, infinite, or beyond the type; and for NaN unless
-    ``nan_allowed``, since a cell that says so may stand for a sensor that failed.
+    ``nan_allowed``, since such a cell may be a sensor that failed.
     """
     kind = one.field.type
     if column.type == kind and pa.types.is_binary(kind):  # of chunks, since an array of bytes has 2 GiB at most

@@ -137,7 +137,7 @@ class _Shares:
         except TacpipeError as error:
             if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
                 raise
-            return None  # reading it says what is wrong, of this recording alone
+            return None  # reading it shows what is wrong, of this recording alone
 
 
 def recording(
@@ -147,14 +147,14 @@ def recording(
 
     With ``shared`` a table of many recordings is cut into these once.
     """
-    from tacpipe.formats.table import reading
+    from tacpipe.formats.table import recorded
     from tacpipe.formats.table.recordings import CONTAINER
 
     paths = containers(files)
     if layout.streams:
-        made = reading.recorded(layout.streams, paths, values.get(WITHIN), shared)
+        made = recorded.of(layout.streams, paths, values.get(WITHIN), shared)
     else:
-        made = reading.all_of(str(kind), paths[CONTAINER], values.get(WITHIN))
+        made = recorded.all_of(str(kind), paths[CONTAINER], values.get(WITHIN))
     return RecordingOutput(made.streams, {**made.attributes, **values[LABELS]}, made.notes)
 
 

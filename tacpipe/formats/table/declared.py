@@ -47,7 +47,7 @@ def _stream(one: SourceStream) -> str:
     lines = [f"[streams.{one.name}]", f"source = {_quoted(one.source)}{rows}"]
     declared = f"# time = {_time(one.time)}, if nothing else is written here"
     lines.append(declared if one.time.given else 'time = { rate_hz = "?" }  # not in the file')
-    fields = [field for field in one.table.schema if field.name != one.time.column and not _is_time(field)]
+    fields = [field for field in one.schema if field.name != one.time.column and not _is_time(field)]
     rules = [f"    {rule}" for rule in _rules(fields)]
     return "\n".join([*lines, *(["columns = [", *rules, "]"] if rules else [])])
 

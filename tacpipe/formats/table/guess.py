@@ -53,7 +53,7 @@ _MEANINGS = (  # how a name ends, and the quantity; the first that matches
     (r"press\w*", "static_pressure"),
 )
 _UNITS = {"orientation": "1"}  # of quantities that have but one
-_SUFFIXES = (  # how a name ends that says its unit, and the quantities that it is a unit of
+_SUFFIXES = (  # how a name ends that states its unit, and the quantities that it is a unit of
     (r"_(m)", "m", ("position",)),
     (r"_(mm)", "mm", ("position",)),
     (r"_(rad)", "rad", ("joint_position",)),

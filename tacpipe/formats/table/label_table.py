@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
-from tacpipe.formats.table import labels
+from tacpipe.formats.table import label_texts
 from tacpipe.formats.table.guess import RECORDING
 from tacpipe.io import yaml_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-EXTENSIONS = (".csv", ".tsv", ".parquet", ".json", ".yaml", ".yml")
+TREES = (".json", ".yaml", ".yml")
+EXTENSIONS = (".csv", ".tsv", ".parquet", *TREES)
 NAME = "recording"  # what the names of a YAML or JSON mapping are
 
 
@@ -113,7 +114,7 @@ def _row(path: Path, place: str, key: str, row: Mapping[str, Any], texts: bool) 
         raise TacpipeError(f"{path}, {place} has no {plain(key)}. Write the name of its recording, or remove the row.")
     values = {label: value for label, value in row.items() if label != key}
     if texts:
-        values = {label: labels.plain_value(value) for label, value in values.items() if value}
+        values = {label: label_texts.plain_value(value) for label, value in values.items() if value}
     return Row(place, name, {label: _value(path, place, label, value) for label, value in values.items()})
 
 
@@ -130,7 +131,7 @@ def _value(path: Path, place: str, label: str, value: Any) -> Attribute:
 
 def _cells(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the cells of each row of a text table by the names of its header."""
-    numbered = labels.read_rows(path)
+    numbered = label_texts.read_rows(path)
     header = next(numbered, (0, []))[1]
     for line, cells in numbered:
         yield f"line {line}", dict(zip(header, cells, strict=True))
@@ -140,7 +141,7 @@ def _parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     from tacpipe.io import parquet, regular
 
     with regular.failing(path):
-        content = regular.content(path, labels.MOST_BYTES)
+        content = regular.content(path, label_texts.MOST_BYTES)
     try:
         table = parquet.from_parquet(content)
     except DamagedError as error:
@@ -151,7 +152,7 @@ def _parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def _tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a mapping of names to labels, or of a list of labels."""
-    text = labels.read_text(path)
+    text = label_texts.read_text(path)
     try:
         found = json.loads(text) if path.suffix.lower() == ".json" else yaml_text.load(text)
     except (ValueError, RecursionError) as error:

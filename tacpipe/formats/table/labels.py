@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
-import io
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table import pattern
+from tacpipe.formats.table import label_table, pattern
+from tacpipe.formats.table.label_texts import plain_value, read_rows, read_text
 from tacpipe.formats.table.layout import Labels, Layout
 from tacpipe.formats.table.recordings import Source
-from tacpipe.io import regular, yaml_text
+from tacpipe.io import yaml_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-MOST_BYTES = 1 << 26  # of a file of labels
+TREES = label_table.TREES  # of files that hold a mapping of recordings to labels, or a list
 RECORDING = "recording"  # the placeholder of a recording's name
 
 
@@ -35,7 +35,8 @@ def found(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, 
         shared = not pattern.placeholders(labels.file)
         rows = _table(folder / labels.file, labels) if shared else {}
         for one in sources:
-            values = _row(rows, one, folder / labels.file) if shared else _file(folder, labels, one)
+            called = _called(layout, one)
+            values = _row(rows, one, called, folder / labels.file) if shared else _file(folder, labels, one)
             made[one.name] |= _picked(values, labels, one.name)
     return made
 
@@ -45,47 +46,6 @@ def _named(source: Source) -> Iterator[tuple[str, str]]:
     for name, value in source.values.items():
         if (name, value) != (RECORDING, source.name):
             yield name, value
-
-
-def plain_value(text: str) -> Attribute:
-    """Return what a cell's text means: true, false, a number where it is written as one, else text.
-
-    A number with leading zeros is text, as it is most often a name.
-
-    >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan")]
-    [3, 0.5, '007', True, 'cork', None, 'nan']
-    """
-    text = text.strip()
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    if not text:
-        return None
-    digits = text.lstrip("-")
-    if digits.isascii() and digits.isdigit() and (digits == "0" or not digits.startswith("0")):
-        return int(text) if len(digits) < 19 else text
-    try:
-        number = float(text)
-    except ValueError:
-        return text
-    finite = number == number and abs(number) != float("inf")
-    return number if finite and not digits.startswith("00") and "_" not in text and not digits.isdigit() else text
-
-
-def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells of each line that holds some, the header first; all are as wide as it."""
-    text = read_text(path)
-    separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-    header: list[str] = []
-    for cells in reader:
-        if not any(cell.strip() for cell in cells):
-            continue
-        header = header or cells
-        if len(cells) != len(header):
-            raise TacpipeError(
-                f"{path}, line {reader.line_num} has {len(cells)} cells under a header of {len(header)}."
-            )
-        yield reader.line_num, [cell.strip() for cell in cells]
 
 
 def _only_row(path: Path) -> dict[str, Attribute]:
@@ -99,7 +59,13 @@ def _only_row(path: Path) -> dict[str, Attribute]:
 
 
 def _table(path: Path, labels: Labels) -> dict[str, dict[str, Attribute]]:
-    """Return the rows of a table of labels by the value of its key."""
+    """Return the rows of a table of labels by the value of its key; a mapping of YAML or JSON has its names for keys."""
+    if path.suffix.lower() in TREES:
+        found = label_table.read(path, labels.key)
+        doubled = [name for name, count in Counter(row.recording for row in found.rows).items() if count > 1]
+        if doubled:
+            raise TacpipeError(f"{path}: {plain(doubled[0])} has an entry already. Keep one of them.")
+        return {row.recording: dict(row.labels) for row in found.rows}
     numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
     if labels.key not in header:
@@ -114,8 +80,24 @@ def _table(path: Path, labels: Labels) -> dict[str, dict[str, Attribute]]:
     return rows
 
 
-def _row(rows: Mapping[str, dict[str, Attribute]], source: Source, path: Path) -> dict[str, Attribute]:
-    names = [name for name in (source.within, source.name, *source.values.values()) if name is not None]
+def _called(layout: Layout, source: Source) -> list[str]:
+    """Return what else a table may call a recording: the folders and files that its placeholders are part of.
+
+    ``run_07/skin.csv`` of the pattern ``run_{trial}/skin.csv`` is run_07 too, whose trial is 07.
+    """
+    segments = {segment for stream in layout.streams for segment in stream.files.split("/")}
+    return sorted(
+        pattern.filled(one, source.values).partition(".")[0]
+        for one in segments
+        if (names := pattern.placeholders(one)) and "*" not in one and set(names) <= set(source.values)
+    )
+
+
+def _row(
+    rows: Mapping[str, dict[str, Attribute]], source: Source, called: list[str], path: Path
+) -> dict[str, Attribute]:
+    given = (source.within, source.name, *source.values.values(), *called)
+    names = list(dict.fromkeys(name for name in given if name is not None))
     for name in names:
         if name in rows:
             return rows[name]
@@ -165,15 +147,3 @@ def _picked(values: dict[str, Attribute], labels: Labels, recording: str) -> dic
             f"{listed(values, 6)}."
         )
     return {name: values[name] for name in labels.columns}
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file of labels. Raises `TacpipeError` for one that is too large or not UTF-8."""
-    with regular.failing(path):
-        content = regular.content(path, MOST_BYTES)
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise TacpipeError(
-            f"{path} is not UTF-8: byte {error.start} is {excerpt(content[error.start : error.end])}."
-        ) from error

@@ -105,7 +105,7 @@ class Stream:
         return self.format in kinds.KINDS
 
     def format_of(self, path: Path) -> Format:
-        """Return the format of a file: the layout's, or that of its extension. Raises `UsageError` where neither says."""
+        """Return the format of a file: the layout's, or that of its extension. Raises `UsageError` without both."""
         if self.format is not None:
             return self.format
         last = extension(path)
@@ -132,7 +132,7 @@ def extension(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Labels:
-    """A source of labels: a table with a row a recording, or a YAML or JSON file a recording."""
+    """A source of labels: a table with a row a recording, or YAML or JSON, one file a recording or one of all."""
 
     file: str
     key: str = ""  # the table's column that names the recording
@@ -141,7 +141,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything that a layout file says."""
+    """Everything that a layout file states."""
 
     streams: tuple[Stream, ...]
     name: str = ""  # pattern of a recording's name; empty: all placeholders with dashes between
@@ -230,7 +230,7 @@ def _refuse_unknown(value: Any, where: str) -> None:
 
 
 def _unknown(value: Any, where: str) -> Iterator[str]:
-    """Yield each entry that still holds what a guess could not know, with what stands beside it."""
+    """Yield each entry that still holds what a guess could not know, with what is next to it."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         for one in inner if isinstance(inner, list) else [inner]:
             if one == UNKNOWN:
@@ -316,7 +316,8 @@ def _labels(value: Any, where: str) -> Labels:
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
     made: Labels = fields.filled(Labels, values, where, "entry")
-    if not pattern.placeholders(made.file) and not made.key:
+    is_tree = made.file.lower().endswith((".json", ".yaml", ".yml"))  # whose names are those of recordings
+    if not pattern.placeholders(made.file) and not made.key and not is_tree:
         raise UsageError(
             f"{where}: {plain(made.file)} is one file for all recordings. Set key to the column that names them."
         )

@@ -1,4 +1,4 @@
-"""Patterns with placeholders: ``{trial}/skin_{hand}.csv`` matches paths and says what stood in the braces.
+"""Patterns with placeholders: ``{trial}/skin_{hand}.csv`` matches paths and gives what was in the place of the braces.
 
 ``{name}`` is any text without a slash, at least one character; ``*`` is any text without a slash, ``**`` any folders. A
 placeholder that comes twice has the same text both times.

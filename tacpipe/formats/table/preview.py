@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tacpipe.formats.table import labels, reading
+from tacpipe.formats.table import labels, recorded
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
 from tacpipe.formats.table.recordings import CONTAINER, Source
@@ -98,9 +98,9 @@ def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | No
     first = sources[0]
     lines.append(f"\n{first.name}, the first:")
     if layout.streams:
-        found = reading.recorded(layout.streams, first.files, first.within)
+        found = recorded.of(layout.streams, first.files, first.within)
     else:
-        found = reading.all_of(str(kind), first.files[CONTAINER], first.within)
+        found = recorded.all_of(str(kind), first.files[CONTAINER], first.within)
     for name in [one.name for one in layout.streams] or found.streams:
         if name not in found.streams:
             lines.append(f"  {name}: not there")

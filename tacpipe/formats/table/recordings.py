@@ -11,7 +11,7 @@ from tacpipe.datasets import recording_names
 from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError, UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Naming
-from tacpipe.formats.table import pattern, reading
+from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.layout import FILE, Format, Layout, Stream
 from tacpipe.io import files as file_system
 from tacpipe.printable import listed, plain
@@ -100,7 +100,7 @@ def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
 def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     """Return the recordings in a container, [None] where it is one, and whether these names need no container's before them.
 
-    A container that cannot be read is one: reading it says what is wrong, and others are not kept from being read.
+    A container that cannot be read is one: reading it shows what is wrong, and others are not kept from being read.
     """
     try:
         container = kinds.opened(kind, path)
@@ -169,7 +169,7 @@ def _within(path: Path, stream: Stream) -> set[str] | None:
 
     if stream.contained:
         return {one for one in _episodes(str(stream.format), path)[0] if one is not None} or None
-    file = reading.opened(path, stream)
+    file = rows.opened(path, stream)
     if stream.recording not in file.names():
         raise TacpipeError(
             f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."

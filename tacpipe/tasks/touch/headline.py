@@ -39,7 +39,7 @@ def headline(
 ) -> Headline | None:
     """Return how a method compares with its baselines on one target.
 
-    Errors are, by seed and grasp, the sum of squares in shares of the target's range, which is ``range_counts`` wide, and
+    Errors are, by seed and grasp, the sum of squares as fractions of the target's range, which is ``range_counts`` wide, and
     the number of values that were summed. Grasps are drawn anew where objects are known, else ``objects`` (by grasp).
     """
     drawn = None if known else objects

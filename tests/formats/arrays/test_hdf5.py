@@ -13,6 +13,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import hdf5
+from tacpipe.formats.arrays import container
 from tacpipe.formats.table import layout, reading
 from tacpipe.formats.table.contained import Params
 from tacpipe.io.parquet import to_parquet
@@ -296,3 +297,26 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
     text = reading.table(tmp_path / "run.csv", layout.parse(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0])
     (found,) = read(tmp_path, given(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
     assert to_parquet(found.streams["skin"].select(text.column_names)) == to_parquet(text)
+
+
+@pytest.mark.parametrize("chunks", [None, 5, 16])
+def test_a_stream_of_many_blocks_is_the_one_that_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunks: int | None
+) -> None:
+    monkeypatch.setattr(container, "BLOCK_BYTES", 400)
+    values, pictures = files.values(100, 4), files.pictures(100)
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file.create_dataset("skin/force", data=values, chunks=chunks and (chunks, 4))
+        file["skin/label"] = [f"row {row}" for row in range(100)]
+        file["skin/t_ns"] = files.START_NS + np.arange(100) * 10**6
+        frames = file.create_dataset("camera/frames", (100,), h5py.vlen_dtype(np.uint8))
+        for row, picture in enumerate(pictures):
+            frames[row] = np.frombuffer(picture, np.uint8)
+        file["camera/t_ns"] = files.START_NS + np.arange(100) * 10**6
+    (found,) = read(tmp_path).values()
+    made = {name: rows.read_all() for name, rows in found.streams.items() if isinstance(rows, pa.RecordBatchReader)}
+    assert sorted(made) == ["frames", "skin"]
+    assert [made["skin"].column(f"force_{at}").to_pylist() for at in range(4)] == values.T.tolist()
+    assert made["skin"].column("label").to_pylist()[99] == "row 99"
+    assert made["frames"].column("data").to_pylist() == pictures
+    assert about(made["frames"], "data") == {"quantity": "image", "encoding": "jpeg"}

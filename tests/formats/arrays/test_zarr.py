@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from zarr import open_group
 
 import tacpipe
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import zarr
+from tacpipe.formats.arrays import container
 from tacpipe.plugins.stage import RecordingOutput
 from tests.conftest import Lab
 from tests.conftest import tacpipe as in_a_process
@@ -192,3 +194,13 @@ def test_a_missing_chunk_ends_with_one_and_the_others_are_read_with_skip_bad(sto
     refused = stores.call(INGEST)
     assert refused.code == 1 and "data/robot0_eef_pos/0.0" in refused.err and "replay-episode_000000" in refused.err
     assert counts(stores, "--skip-bad") == (0, 2)
+
+
+def test_an_episode_of_many_blocks_has_the_rows_of_one_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files.replay(tmp_path / "replay.zarr")
+    expected = {name: one.streams["hand"] for name, one in read(tmp_path).items()}
+    monkeypatch.setattr(container, "BLOCK_BYTES", 200)
+    for name, one in read(tmp_path).items():
+        made = one.streams["hand"]
+        assert isinstance(made, pa.RecordBatchReader)
+        assert made.read_all().equals(expected[name], check_metadata=True)

@@ -14,6 +14,7 @@ import yaml
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.bags import topics
 from tacpipe.formats.bags.container import opened
 from tacpipe.formats.containers.container import Contents, SourceStream
 from tests.conftest import Lab, sample_data
@@ -553,3 +554,38 @@ def test_messages_with_texts_of_any_length_are_read_in_their_order(tmp_path: Pat
     assert table.column("line").to_pylist() == list(range(400))
     assert table.column("line").type == pa.uint32()
     assert [[row["msg"], row["name"], row["file"], row["function"]] for row in table.to_pylist()] == texts
+
+
+def test_rows_that_were_put_aside_in_many_pieces_are_those_of_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    sent: list[Sent] = []
+    for frame in rng.permutation(60).tolist():  # header stamps in no order
+        t_ns = START_NS + frame * STEP_NS
+        names = ["a", "b", "c"][: 2 + frame % 2]  # messages of two shapes
+        message = writers.build(
+            TYPES,
+            "sensor_msgs/msg/JointState",
+            header=writers.header(TYPES, t_ns),
+            name=names,
+            position=[frame] * len(names),
+        )
+        sent.append(("/joints", "sensor_msgs/msg/JointState", t_ns + int(rng.integers(10**6)), message))
+    path = writers.ros2(tmp_path / "bag", sent)
+    expected = {name: one.table for name, one in streams(path).items()}
+    monkeypatch.setattr(topics, "BATCH_MESSAGES", 4)
+    found = {name: one.table for name, one in streams(path).items()}
+    assert found == expected
+    for name, table in found.items():
+        assert table.schema.equals(expected[name].schema, check_metadata=True)
+        assert (np.diff(table.column("t_header_ns").to_numpy()) > 0).all()
+
+
+def test_a_message_alone_in_a_batch_has_its_own_values_and_not_those_of_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(topics, "BATCH_MESSAGES", 4)
+    table = only(writers.ros2(tmp_path / "bag", arm(TYPES, frames=5)[::2]))
+    assert table.column("joint1_rad").to_pylist() == [0, 1, 2, 3, 4]
+    assert table.column("t_header_ns").to_pylist() == [START_NS + frame * STEP_NS for frame in range(5)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,11 +79,7 @@ def ros2(
     if options:
         writer.set_compression(**options)
     with writer:
-        connections: dict[str, Any] = {}
-        for topic, name, log_ns, message in sent:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=types)
-            writer.write(connections[topic], log_ns, types.serialize_cdr(message, name))
+        _write(writer, sent, types, types.serialize_cdr)
     return path
 
 
@@ -94,12 +90,16 @@ def ros1(path: Path, sent: Iterable[Sent], compression: str | None = None, types
     if compression:
         writer.set_compression(Writer1.CompressionFormat[compression])
     with writer:
-        connections: dict[str, Any] = {}
-        for topic, name, log_ns, message in sent:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=types)
-            writer.write(connections[topic], log_ns, types.serialize_ros1(message, name))
+        _write(writer, sent, types, types.serialize_ros1)
     return path
+
+
+def _write(writer: Writer1 | Writer2, sent: Iterable[Sent], types: Typestore, serialize: Callable[..., Any]) -> None:
+    connections: dict[str, Any] = {}
+    for topic, name, log_ns, message in sent:
+        if topic not in connections:
+            connections[topic] = writer.add_connection(topic, name, typestore=types)
+        writer.write(connections[topic], log_ns, serialize(message, name))
 
 
 def mcap_json(

@@ -63,3 +63,37 @@ def test_a_wrong_table_of_labels_is_one_sentence_with_its_place(tmp_path: Path, 
     with pytest.raises(TacpipeError) as error:
         found(tmp_path, '[[labels]]\nfile = "labels.csv"\nkey = "trial"')
     assert all(part in str(error.value) for part in ("labels.csv", *WRONG[content])), str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "trial_0: {material: felt}\ntrial_1: {material: cork}\n",
+        "trial-0: {material: felt}\ntrial-1: {material: cork}\n",
+    ],
+    ids=["folders", "names"],
+)
+def test_one_yaml_file_labels_all_recordings_by_their_names_or_those_of_their_folders(
+    tmp_path: Path, text: str
+) -> None:
+    labs.write(tmp_path, 2)
+    (tmp_path / "labels.yaml").write_text(text)
+    made = found(tmp_path, '[[labels]]\nfile = "labels.yaml"')
+    assert {name: one["material"] for name, one in made.items()} == {"trial-0": "felt", "trial-1": "cork"}
+
+
+def test_a_table_may_name_recordings_by_their_folders(tmp_path: Path) -> None:
+    labs.write(tmp_path, 2)
+    (tmp_path / "labels.csv").write_text("folder,material\ntrial_1,cork\ntrial_0,felt\n")
+    made = found(tmp_path, '[[labels]]\nfile = "labels.csv"\nkey = "folder"')
+    assert {name: one["material"] for name, one in made.items()} == {"trial-0": "felt", "trial-1": "cork"}
+
+
+def test_a_yaml_file_of_all_without_a_recordings_entry_is_refused(tmp_path: Path) -> None:
+    labs.write(tmp_path, 2)
+    (tmp_path / "labels.yaml").write_text("trial_0: {material: felt}\n")
+    with pytest.raises(TacpipeError, match=r"labels\.yaml has no row for the recording trial-1"):
+        found(tmp_path, '[[labels]]\nfile = "labels.yaml"')
+    (tmp_path / "labels.yaml").write_text("material: felt\n")
+    with pytest.raises(TacpipeError, match=r"labels\.yaml, material is 'felt'"):
+        found(tmp_path, '[[labels]]\nfile = "labels.yaml"')

@@ -1,4 +1,4 @@
-"""The memory that `ingest table` takes, which must not grow with the file."""
+"""The memory that `tacpipe ingest` takes, which must not grow with the file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
@@ -21,6 +22,13 @@ columns = [{ match = "c{channel}" }]
 """
 COLUMNS, ROWS, BLOCK = 16, 4_000_000, 100_000  # a CSV of 0.6 GB; as a table 0.54 GB, stored 0.4 GB
 MOST_KB = 800_000  # in memory: the program and its libraries, blocks of the file, one group of rows
+LONG_LAYOUT = """
+[streams.arm]
+files = "all.csv"
+long = { channel = "sensor", value = "reading" }
+time = { column = "time", unit = "s" }
+columns = [{ match = "c{channel}" }]
+"""
 RUN = """
 import sys
 from tacpipe.cli import main
@@ -85,3 +93,40 @@ def test_a_file_of_many_recordings_larger_than_memory_is_read(tmp_path: Path) ->
     ran(tmp_path, "ingest table own --layout layout.toml -o rec")
     shards = sorted((tmp_path / "rec").rglob("arm.parquet"))
     assert [pq.ParquetFile(shard).metadata.num_rows for shard in shards] == [ROWS // 4] * 4
+
+
+@pytest.mark.long
+@linux
+def test_a_table_in_long_form_whose_channels_follow_one_another_is_read(tmp_path: Path) -> None:
+    moments = 5 * BLOCK  # 8 million rows, 0.25 GB, of which a table took 1.2 GB
+    (tmp_path / "own").mkdir()
+    values = np.random.default_rng(0).normal(size=BLOCK).round(6)
+    with (tmp_path / "own" / "all.csv").open("wb") as sink:
+        schema = pa.schema([("time", pa.string()), ("sensor", pa.string()), ("reading", pa.float64())])
+        with pc.CSVWriter(sink, schema, write_options=pc.WriteOptions(quoting_style="none")) as writer:
+            for channel, start in np.ndindex(COLUMNS, moments // BLOCK):
+                seconds = rows(start * BLOCK, values, 1).column("time")
+                writer.write_table(
+                    pa.table([seconds, [f"c{channel}"] * BLOCK, np.roll(values, channel)], schema=schema)
+                )
+    (tmp_path / "layout.toml").write_text(LONG_LAYOUT)
+    ran(tmp_path, "ingest table own --layout layout.toml -o rec")
+    (shard,) = (tmp_path / "rec").rglob("arm.parquet")
+    found = pq.ParquetFile(shard)
+    assert (found.metadata.num_rows, found.metadata.num_columns) == (moments, 1 + COLUMNS)
+
+
+@pytest.mark.long
+@linux
+def test_arrays_larger_than_memory_are_read(tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    values = np.random.default_rng(0).normal(size=(BLOCK, COLUMNS))
+    with h5py.File(tmp_path / "own" / "run.h5", "w") as file:  # 0.54 GB, of which a table took 1.2 GB
+        data = file.create_dataset("skin/data", (ROWS, COLUMNS), "f8", chunks=(8192, COLUMNS))
+        stamps = file.create_dataset("skin/time_ns", (ROWS,), "i8", chunks=(8192,))
+        for start in range(0, ROWS, BLOCK):
+            data[start : start + BLOCK] = values
+            stamps[start : start + BLOCK] = np.arange(start, start + BLOCK) * 10**6
+    ran(tmp_path, "ingest hdf5 own -o rec")
+    (shard,) = (tmp_path / "rec").rglob("*.parquet")
+    assert pq.ParquetFile(shard).metadata.num_rows == ROWS

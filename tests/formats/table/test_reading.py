@@ -14,8 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table import binary, reading, text
+from tacpipe.formats.table import binary, long_form, reading, rows, text
 from tacpipe.formats.table.layout import Stream
+from tacpipe.io import spill
 from tacpipe.io.parquet import to_parquet
 from tests.formats.table import labs
 
@@ -108,7 +109,7 @@ def test_a_moment_at_which_a_channel_is_missing_is_nan_in_long_form(tmp_path: Pa
 
 def test_two_values_of_a_channel_at_one_moment_are_refused(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n0,fx,2\n")
-    with pytest.raises(TacpipeError, match=r"two values of fx .* row 2"):
+    with pytest.raises(TacpipeError, match=r"two values of fx .* line 3"):
         reading.table(
             tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
         )
@@ -205,7 +206,7 @@ def same_in_blocks(
     whole = reading.table(path, stream, recording)
     for module in (text, binary):
         monkeypatch.setattr(module, "BLOCK_BYTES", 200)
-    batches = list(reading.batches(reading.opened(path, stream), stream, recording))
+    batches = list(reading.batches(rows.opened(path, stream), stream, recording))
     assert len(batches) > 1 and to_parquet(pa.Table.from_batches(batches)) == to_parquet(whole)
     return whole
 
@@ -308,3 +309,56 @@ def test_json_lines_with_lists_are_columns(tmp_path: Path) -> None:
     (tmp_path / "skin.jsonl").write_text("\n".join(lines))
     found = reading.table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "taxels_{taxel}", type = "uint16" }'))
     assert found.column("taxels_1").to_pylist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("order", ["melted", "by time", "mixed"])
+def test_a_long_form_of_many_runs_is_the_table_that_pandas_pivots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, order: str
+) -> None:
+    monkeypatch.setattr(long_form, "RUN_ROWS", 60)
+    monkeypatch.setattr(long_form, "GRID_VALUES", 20)
+    monkeypatch.setattr(spill, "PIECE_ROWS", 7)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 400)
+    rows = labs.frame(rows=100).melt("time", var_name="sensor", value_name="reading")
+    rows = rows.sample(frac=0.9, random_state=1).sort_index() if order == "melted" else rows
+    rows = rows.sort_values(["time", "sensor"]) if order == "by time" else rows
+    rows = rows.sample(frac=1.0, random_state=2) if order == "mixed" else rows
+    rows.to_csv(tmp_path / "skin.csv", index=False)
+    columns = '{ match = "*" }'
+    found = reading.table(
+        tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', columns)
+    )
+    expected = rows.pivot(index="time", columns="sensor", values="reading")
+    assert found.column_names == ["t_ns", *rows["sensor"].unique()]
+    assert found.column("t_ns").to_pylist() == [round(time * 1000) * 10**6 for time in expected.index]
+    for name in expected:
+        np.testing.assert_array_equal(found.column(name).to_numpy(), expected[name].to_numpy())
+
+
+def test_of_a_long_form_of_many_runs_the_second_of_two_values_is_named_by_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(long_form, "RUN_ROWS", 10)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 40)
+    rows = [f"{row},fx,1" for row in range(50)] + ["7,fx,2"]
+    (tmp_path / "skin.csv").write_text("\n".join(["time,sensor,reading", *rows]) + "\n")
+    stream = labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
+    with pytest.raises(TacpipeError, match=r"two values of fx .* line 52\b"):
+        reading.table(tmp_path / "skin.csv", stream)
+
+
+def test_a_row_of_a_long_form_that_names_no_channel_is_named_by_its_line(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n1,,2\n")
+    stream = labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
+    with pytest.raises(TacpipeError, match=r"line 3, column sensor"):
+        reading.table(tmp_path / "skin.csv", stream)
+
+
+def test_a_long_form_whose_channels_are_numbers_without_end_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(long_form, "MOST_CHANNELS", 5)
+    (tmp_path / "skin.csv").write_text("time,sensor,reading\n" + "".join(f"{row},{row}.5,1\n" for row in range(9)))
+    stream = labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "*" }')
+    with pytest.raises(TacpipeError, match=r"column sensor names more than 5 channels"):
+        reading.table(tmp_path / "skin.csv", stream)

@@ -1,0 +1,89 @@
+"""One recording of a layout, or all that a container holds of one: its streams, attributes, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pyarrow as pa
+
+from tacpipe.errors import TacpipeError
+from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers.container import Contents
+from tacpipe.formats.table import rows
+from tacpipe.formats.table.layout import Stream
+from tacpipe.formats.table.reading import batches, contained
+from tacpipe.plugins.stage import Attribute, Shared
+from tacpipe.printable import listed, plain
+
+SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was read of one recording."""
+
+    streams: Mapping[str, pa.Table | pa.RecordBatchReader]
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # that containers state
+    notes: Sequence[str] = ()  # what was left out or is missing
+
+
+def of(
+    streams: Sequence[Stream], paths: Mapping[str, Path], within: str | None, shared: Shared | None = None
+) -> Recorded:
+    """Return the recording whose files are ``paths`` by stream; ``within`` is its name where a file holds many.
+
+    Streams of one container are read in one pass. Raises as `table` does, and for a stream that its container lacks,
+    unless it is optional.
+    """
+    tables: dict[str, pa.Table | pa.RecordBatchReader] = {}
+    attributes: dict[str, Attribute] = {}
+    notes: list[str] = []
+    together: dict[tuple[str, Path], list[Stream]] = {}
+    for stream in streams:
+        if stream.name not in paths:
+            continue
+        if stream.contained:
+            together.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
+        else:
+            tables[stream.name] = batches(rows.opened(paths[stream.name], stream), stream, within, shared)
+    for (kind, path), several in together.items():
+        contents = kinds.opened(kind, path).read([one.source for one in several], within)
+        there = {one.source: one for one in contents.streams}
+        for stream in several:
+            if stream.source in there:
+                tables[stream.name] = contained(path, there[stream.source], stream)
+            elif not stream.optional:
+                raise _lacking(path, stream, contents, kinds.opened(kind, path).look(within))
+        attributes |= contents.attributes
+        notes += contents.notes
+    return Recorded({one.name: tables[one.name] for one in streams if one.name in tables}, attributes, notes)
+
+
+def all_of(kind: str, path: Path, within: str | None) -> Recorded:
+    """Return all that can be read of a container, or of its episode ``within``; what cannot is named in the notes.
+
+    It is an attribute of the recording too: ``skipped``. Raises `TacpipeError` where nothing can be read.
+    """
+    contents = kinds.opened(kind, path).read(None, within)
+    notes = [*contents.notes, *(f"{path}: {plain(one)} is left out: {why}." for one, why in contents.skipped.items())]
+    tables = {}
+    for found in contents.streams:
+        if found.rows is None or found.rows:
+            tables[found.name] = contained(path, found, Stream(found.name, source=found.source))
+    if not tables:
+        raise TacpipeError(" ".join([f"{path} holds no stream that can be read.", *notes]))
+    skipped = "; ".join(f"{plain(one)}: {why}" for one, why in contents.skipped.items())
+    return Recorded(tables, {**contents.attributes, **({SKIPPED: skipped} if skipped else {})}, notes)
+
+
+def _lacking(path: Path, stream: Stream, contents: Contents, look: Contents) -> TacpipeError:
+    """Return the error for a stream of a layout that its container does not have."""
+    why = contents.skipped.get(stream.source) or look.skipped.get(stream.source)
+    if why:
+        return TacpipeError(f"{path}: {plain(stream.source)} of [streams.{stream.name}] cannot be read: {why}.")
+    return TacpipeError(
+        f"{path} has no {plain(stream.source)}, which [streams.{stream.name}] names; it has "
+        f"{listed([one.source for one in look.streams], 6)}. Correct source, or set optional = true."
+    )

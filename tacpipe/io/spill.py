@@ -1,0 +1,112 @@
+"""Tables put aside on disk, so that what is read need not fit in memory; given back piece by piece, or in order."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.io.files import sentence
+from tacpipe.io.parquet import owned
+
+IN_MEMORY = 1 << 26  # bytes, before a file is made of them
+PIECE_ROWS = 1 << 15  # of a run of rows that is in order
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A table that was put aside: where it is, and the least value of each column that it may be ordered by."""
+
+    start: int
+    size: int
+    rows: int
+    least: Mapping[str, float] = field(default_factory=dict)
+
+
+class Spill:
+    """A temporary file of tables without a name, which is gone with this object or with the process."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115  (closed by the line below)
+        weakref.finalize(self, self._file.close)
+        self._lock = threading.Lock()  # streams of one file may be read by threads
+        self._end = 0
+
+    def add(self, table: pa.Table, orders: Sequence[str] = ()) -> Piece:
+        """Put a table aside; ``orders`` are columns of numbers without nulls.
+
+        Raises `StorageError` where the disk is full.
+        """
+        sink = pa.BufferOutputStream()
+        with pa.ipc.new_stream(sink, table.schema) as writer:
+            writer.write_table(table)
+        content = sink.getvalue()
+        with self._lock:
+            try:
+                self._file.seek(self._end)
+                self._file.write(memoryview(content))
+            except OSError as error:
+                raise sentence(tempfile.gettempdir(), error) from error
+            start, self._end = self._end, self._end + content.size
+        least = {name: table.column(name).to_numpy().min().item() for name in orders if table.num_rows}
+        return Piece(start, content.size, table.num_rows, least)
+
+    def add_run(self, table: pa.Table, order: str) -> list[Piece]:
+        """Put a table aside in the order of a column, in pieces that follow one another."""
+        table = sorted_by(table, order)
+        cuts = range(0, table.num_rows, PIECE_ROWS)
+        return [self.add(table.slice(start, PIECE_ROWS).combine_chunks(), [order]) for start in cuts]
+
+    def read(self, piece: Piece) -> pa.Table:
+        """Return a table that was put aside."""
+        with self._lock:
+            self._file.seek(piece.start)
+            content = self._file.read(piece.size)
+        return pa.ipc.open_stream(owned(content)).read_all()
+
+
+def sorted_by(table: pa.Table, order: str) -> pa.Table:
+    """Return the rows in the order of a column of numbers; equal ones stay as they are."""
+    values = table.column(order).to_numpy()
+    if not (np.diff(values) < 0).any():
+        return table
+    return table.combine_chunks().take(pa.array(np.argsort(values, kind="stable")))
+
+
+def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: str) -> Iterator[pa.Table]:
+    """Yield the rows of pieces in the order of a column; where it is equal, in the order of the pieces.
+
+    ``read`` returns the table of a piece. Those whose ranges of values overlap are in memory at one time. Rows of one value
+    are in one table of those that are yielded.
+
+    >>> spill = Spill()
+    >>> pieces = [spill.add(pa.table({"t": one}), ["t"]) for one in ([4, 1], [3, 9], [12])]
+    >>> [one.column("t").to_pylist() for one in in_order(pieces, spill.read, "t")]
+    [[1], [3, 4, 9], [12]]
+    """
+    waiting: list[tuple[int, pa.Table]] = []  # place of the piece, its rows that were not yielded
+    for place, piece in sorted(enumerate(pieces), key=lambda one: (one[1].least[order], one[0])):
+        yield from _before(waiting, order, piece.least[order])
+        waiting.append((place, sorted_by(read(piece), order)))
+    yield from _before(waiting, order, None)
+
+
+def _before(waiting: list[tuple[int, pa.Table]], order: str, least: float | None) -> Iterator[pa.Table]:
+    """Yield the rows below ``least`` as one table, and leave the others waiting."""
+    ready: list[pa.Table] = []
+    left: list[tuple[int, pa.Table]] = []
+    for place, table in sorted(waiting, key=lambda one: one[0]):
+        values = table.column(order).to_numpy()
+        end = table.num_rows if least is None else int(np.searchsorted(values, least, side="left"))
+        if end:
+            ready.append(table.slice(0, end))
+        if end < table.num_rows:
+            left.append((place, table.slice(end)))
+    waiting[:] = left
+    if ready:
+        yield sorted_by(pa.concat_tables(ready), order)

@@ -1,0 +1,40 @@
+"""What `tacpipe show` and `tacpipe explain` print of what has many files, and what `store link` removes of it."""
+
+from __future__ import annotations
+
+import json
+
+from tests.conftest import Lab
+
+MANY = 12
+
+
+def _export(lab: Lab) -> Lab:
+    """Have the lab export to many files, in folders within folders."""
+    lab.run("simulate forward --trials 1 --duration-s 4 -o data/recordings")
+    lab.run("synchronize data/recordings -o data/synced")
+    lab.run("export zarr data/synced -o out")
+    return lab
+
+
+def test_of_an_export_the_files_are_counted_and_the_first_are_named(lab: Lab) -> None:
+    _export(lab)
+    found = json.loads(lab.run("show out --json").out)
+    assert found["kind"] == "export" and len(found["files"]) > MANY
+    text = lab.run("show out").out
+    assert f"{len(found['files'])}, together" in text and "README.md" in text
+    assert sum(name in text for name in found["files"]) < MANY
+    every = " ".join(lab.run("show out --full").out.split())
+    assert all(name in every for name in found["files"])
+    traced = lab.run("explain out").out
+    assert f"{len(found['files'])} files" in traced and sum(name in traced for name in found["files"]) < MANY
+
+
+def test_link_removes_the_drafts_in_every_folder_of_an_export(lab: Lab) -> None:
+    _export(lab)
+    out = lab.folder / "out"
+    deep = next(path for path in out.rglob("*") if path.is_file() and len(path.relative_to(out).parts) > 3)
+    draft = deep.with_name(f".{deep.name}.0123456789ab.draft")
+    draft.write_bytes(b"half")
+    lab.run("store link out")
+    assert deep.exists() and not draft.exists()
