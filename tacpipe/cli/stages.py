@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -84,7 +84,6 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     if answering and any(given.get(look) for look in ("guess", "print_params", "dry_run")):
         raise UnansweredError
     progress.set_quiet(given["quiet"])
-    folds = grid.folds(given.get("fold") or "0")
     for flag, kind in OPTIONS.items():
         if flag != "fold" and given.get(flag) is not None:  # not every stage has each of them
             fields_of.check(given[flag], kind, f"--{flag}")
@@ -108,8 +107,25 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         return
     if given["output"] is None:
         raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
+    requests = grid.requests(_request(name, stage, params, given), grid.folds(given.get("fold") or "0"))
+    shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
+    how = {"as_json": given["json_"], "quiet": given["quiet"]}
+    if answering:
+        _report_answers(requests, shown, **how)
+    elif stage.trains and rank_processes.launched():
+        _run_launched(requests, shown, **how)
+    elif len(requests) == 1:
+        _report(pipeline.run(requests[0]), shown, **how)
+    else:
+        if stage.trains and not (given["quiet"] or given["check"] or given["compare"]):
+            _estimate(requests)
+        _run_folds(requests, shown, **how)
+
+
+def _request(name: str, stage: AnyStage, params: Any, given: Mapping[str, Any]) -> Request:
+    """Return what the options of a command request."""
     paths: dict[str, Any] = {key: given.get(key) for key in PATHS}
-    request = Request(
+    return Request(
         name,
         params,
         given["output"],
@@ -126,23 +142,15 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         track=tuple(given.get("track") or ()),
         **paths,
     )
-    shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
-    requests = grid.requests(request, folds)
-    if answering:
-        outcomes = [outcome for one in requests if (outcome := pipeline.answered(one)) is not None]
-        if len(outcomes) < len(requests):
-            raise UnansweredError
-        for outcome in outcomes:
-            _report(outcome, shown, as_json=given["json_"], quiet=given["quiet"])
-        return
-    if stage.trains and rank_processes.launched():
-        _run_launched(requests, shown, as_json=given["json_"], quiet=given["quiet"])
-    elif len(requests) == 1:
-        _report(pipeline.run(requests[0]), shown, as_json=given["json_"], quiet=given["quiet"])
-    else:
-        if stage.trains and not (given["quiet"] or given["check"] or given["compare"]):
-            _estimate(requests)
-        _run_folds(requests, shown, as_json=given["json_"], quiet=given["quiet"])
+
+
+def _report_answers(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
+    """Report what is there already. Raises `UnansweredError` where some is not."""
+    outcomes = [outcome for one in requests if (outcome := pipeline.answered(one)) is not None]
+    if len(outcomes) < len(requests):
+        raise UnansweredError
+    for outcome in outcomes:
+        _report(outcome, headline, as_json=as_json, quiet=quiet)
 
 
 def _estimate(requests: Sequence[Request]) -> None:
