@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
 
 
 def asked(name: str, preset: str | None = None, /, **options: Any) -> Any:
     """Return the params of stage ``name`` with these options."""
-    return params_of.build(name, registry.load(name), preset=preset, options=options)
+    return given_params.build(name, registry.load(name), preset=preset, options=options)
 
 
 def fitting(name: str, usual: Mapping[str, Any], **changed: Any) -> Any:

@@ -21,7 +21,7 @@ from tacpipe.models.forecasts import ARCHITECTURES
 from tacpipe.models.patches import BACKBONES
 from tacpipe.models.pointnet import HEADS
 from tacpipe.models.recurrent_autoencoder import DECODERS
-from tacpipe.plugins import fields, registry
+from tacpipe.plugins import fields, given_params, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList, Range, Unit
 from tacpipe.simulation.household import FAMILIES, MODULI_PA
@@ -137,12 +137,12 @@ def test_a_number_out_of_its_range_ends_with_code_2_before_anything_is_read(
         flag = f"--{field.replace('_', '-')}"
         assert ran.err == f"tacpipe: {flag} is {fields.shown(value)}; it must be {fields.describe(RANGED[key])}.\n"
         with pytest.raises(UsageError, match=f"{field} is "):
-            params_of.build(
+            given_params.build(
                 name, stage, sets=[*(f"{k}={v}" for k, v in tagged(name, kind).items()), f"{field}={value}"]
             )
         with pytest.raises(UsageError, match=f"preset odd of {name}: {field} is "), monkeypatch.context() as patched:
             patched.setattr(kind, "PRESETS", {"odd": {field: value}}, raising=False)
-            params_of.build(name, stage, preset="odd", options=tagged(name, kind))
+            given_params.build(name, stage, preset="odd", options=tagged(name, kind))
     assert not any(tmp_path.iterdir())
 
 
@@ -174,13 +174,13 @@ def test_an_option_of_another_kind_of_params_is_refused_and_is_in_no_key(
     stage = registry.load(name)
     monkeypatch.chdir(tmp_path)
     for kind in params_of.kinds(stage):
-        own = params_of.build(name, stage, options=tagged(name, kind))
+        own = given_params.build(name, stage, options=tagged(name, kind))
         assert set(params_of.to_input(own)) == set(fields.hints(kind))
         for other in params_of.kinds(stage):
             for field in set(fields.hints(other)) - set(fields.hints(kind)):
                 default = other.__dataclass_fields__[field].default
                 with pytest.raises(UsageError, match=f"--{field.replace('_', '-')} belongs to the "):
-                    params_of.build(name, stage, options={**tagged(name, kind), field: default})
+                    given_params.build(name, stage, options={**tagged(name, kind), field: default})
                 (tmp_path / "params.yaml").write_text(json.dumps({"own": {**tagged(name, kind), field: default}}))
                 ran = call(f"{command(name, {})} --block own")
                 assert ran.code == 2
@@ -196,7 +196,7 @@ def test_a_preset_that_a_stage_does_not_have_is_refused_and_those_it_has_can_be_
     assert ran.code == 2
     assert ran.err == f"tacpipe: There is no preset glossy for {name}; it has {', '.join(there) or 'none'}.\n"
     for preset in there:
-        assert params_of.build(name, stage, preset=preset)
+        assert given_params.build(name, stage, preset=preset)
 
 
 @pytest.mark.parametrize("name", STAGES)

@@ -18,6 +18,7 @@ from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import keys
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import canonical, digest
+from tacpipe.plugins import given_params
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, stage
 from tests.conftest import Lab
@@ -51,7 +52,7 @@ class Params:
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
-given_params = st.builds(
+any_params = st.builds(
     Params,
     finite,
     st.integers(),
@@ -71,7 +72,7 @@ STAGE: AnyStage = stage(version=3)(cut)
 
 
 def built(**options: Any) -> Params:
-    params = params_of.build("cut", STAGE, options=options)
+    params = given_params.build("cut", STAGE, options=options)
     assert isinstance(params, Params)
     return params
 
@@ -193,29 +194,29 @@ def test_a_list_that_goes_on_for_ever_or_is_too_deep_is_refused() -> None:
 # ---- params
 
 
-@given(given_params)
+@given(any_params)
 def test_the_order_in_which_params_are_given_does_not_count(params: Params) -> None:
     options = {name: value for name, value in asdict(params).items() if value is not None}
     backwards = dict(reversed(options.items()))
     assert key(built(**options)) == key(built(**backwards)) == key(built(**{**options, "frames": params.frames}))
 
 
-@given(given_params, given_params)
+@given(any_params, any_params)
 def test_two_sets_of_params_share_a_key_only_if_they_are_equal(one: Params, other: Params) -> None:
     left, right = built(**asdict(one)), built(**asdict(other))
     assert (key(left) == key(right)) == (left == right)
 
 
-@given(given_params, st.data())
+@given(any_params, st.data())
 def test_any_one_param_that_changes_changes_the_key(params: Params, data: st.DataObject) -> None:
-    other = data.draw(given_params)
+    other = data.draw(any_params)
     name = data.draw(st.sampled_from(list(asdict(params))))
     value = getattr(other, name)
     assume(value != getattr(params, name))
     assert key(built(**asdict(replace(params, **{name: value})))) != key(built(**asdict(params)))
 
 
-@given(given_params)
+@given(any_params)
 def test_params_come_back_from_a_key_and_give_it_again(params: Params) -> None:
     before = built(**asdict(params))
     after = params_of.from_json(STAGE, json.loads(canonical(params_of.to_json(before))))
@@ -227,12 +228,12 @@ def test_a_whole_number_given_for_a_number_gives_the_same_key_from_wherever_it_c
     wanted = key(built(rate_hz=float(number), gains=[float(number)], cutoff_hz=float(number)))
     assert key(built(rate_hz=number, gains=[number], cutoff_hz=number)) == wanted
     sets = [f"rate_hz={number}", f"gains=[{number}.0]", f"cutoff_hz={number}"]
-    assert key(params_of.build("cut", STAGE, sets=sets)) == wanted
+    assert key(given_params.build("cut", STAGE, sets=sets)) == wanted
 
 
 @pytest.mark.parametrize("text", ["2e-2", "0.02", "+2.0E-2", ".2e-1"])
 def test_a_number_with_an_exponent_is_a_number_as_everywhere_but_in_yaml(text: str) -> None:
-    assert key(params_of.build("cut", STAGE, sets=[f"rate_hz={text}"])) == key(built(rate_hz=0.02))
+    assert key(given_params.build("cut", STAGE, sets=[f"rate_hz={text}"])) == key(built(rate_hz=0.02))
 
 
 def test_minus_zero_is_zero() -> None:

@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import pytest
 
 from tacpipe.errors import UsageError
+from tacpipe.plugins import given_params
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import Range
 from tacpipe.plugins.stage import AnyStage, stage
@@ -28,7 +29,7 @@ STAGE: AnyStage = stage(version=1)(cut)
 
 
 def built(**given: object) -> Params:
-    params = params_of.build("cut", STAGE, **given)  # type: ignore[arg-type]
+    params = given_params.build("cut", STAGE, **given)  # type: ignore[arg-type]
     assert isinstance(params, Params)
     return params
 
@@ -169,7 +170,7 @@ GROW: AnyStage = stage(version=1)(grow)
 
 
 def grown(**given: object) -> Any:
-    return params_of.build("grow", GROW, **given)  # type: ignore[arg-type]
+    return given_params.build("grow", GROW, **given)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
 from tacpipe.plugins.requirements import Requirements
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import AUTO, Compute, Device
@@ -90,7 +90,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     if given.get("guess") and stage.guess is not None:
         terminal.result(stage.guess(given["source"]).rstrip("\n"))
         return
-    params = params_of.build(
+    params = given_params.build(
         name,
         stage,
         file=_params_file(given),

@@ -14,8 +14,7 @@ from tacpipe.engine import pipeline
 from tacpipe.engine.request import OPTIONS, Request
 from tacpipe.errors import ResultWarning, UsageError
 from tacpipe.io import progress
-from tacpipe.plugins import fields, registry
-from tacpipe.plugins import params as params_of
+from tacpipe.plugins import fields, given_params, registry
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import AUTO, Compute, Device
 
@@ -60,7 +59,7 @@ def call(
     read = [_path(given) for given in datasets]
     request = Request(
         name,
-        params_of.build(
+        given_params.build(
             name,
             stage,
             file=None if how.params_file is None else Path(how.params_file),

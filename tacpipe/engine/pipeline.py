@@ -22,8 +22,8 @@ from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest
+from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
 from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
 from tacpipe.store.store import MissingError, Store, locate
@@ -229,7 +229,7 @@ class _Run:
         chain = list(given.chain)
         for name, options in wanted.items():
             stage = registry.load(name)
-            chain.append(keys.chain_step(name, stage, params_of.build(name, stage, options=options), None))
+            chain.append(keys.chain_step(name, stage, given_params.build(name, stage, options=options), None))
         behind = Manifest(self.request.name, self.stage.version, chain=chain)
         return self._by_recording.replay(given, behind, self.inputs.beside, str(self.request.datasets[0]))
 

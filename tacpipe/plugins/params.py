@@ -1,4 +1,4 @@
-"""From defaults, ``params.yaml``, presets and options to a stage's params, checked before any data is read.
+"""What a stage declares as its params, and params as they are stored.
 
 A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
 same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
@@ -16,68 +16,16 @@ import re
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import regular, yaml_text
 from tacpipe.plugins import fields as fields_of
-from tacpipe.plugins.constraints import StoredAs, TomlFile
+from tacpipe.plugins.constraints import StoredAs
 from tacpipe.plugins.fields import filled as filled
 from tacpipe.plugins.stage import AnyStage
-from tacpipe.printable import excerpt, listed
+from tacpipe.printable import excerpt
 
 Kind = type[Any]  # a dataclass of params
-
-
-class _Given(NamedTuple):
-    """A value that was given, and where."""
-
-    where: str
-    key: str
-    value: Any
-    option: bool = False
-
-    @property
-    def name(self) -> str:
-        return self.where if self.option else self.key
-
-    @property
-    def place(self) -> str:
-        return "" if self.option else self.where
-
-
-def build(
-    name: str,
-    stage: AnyStage,
-    *,
-    file: Path | None = None,
-    block: str | None = None,
-    preset: str | None = None,
-    sets: Sequence[str] = (),
-    options: Mapping[str, Any] | None = None,
-) -> Any:
-    """Return the params of stage ``name``: defaults, then file, preset, ``--set``, options, each over the one before.
-
-    Raises `UsageError` for an unknown name, a value that is not allowed, an option of another kind of params than the
-    chosen one, and values that do not go together.
-    """
-    early = [] if file is None else _from_file(file, block or name, required=block is not None)
-    late = [_from_set(name, text) for text in sets]
-    late += [_Given(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
-    kind = _chosen(stage, early, late, preset)
-    between = [] if preset is None else _from_preset(name, stage, kind, preset)
-    values: dict[str, Any] = {}
-    for given in (*early, *between, *late):
-        if given.key != tag(stage) or _holds(kind, tag(stage), {given.key: given.value}):  # others were overruled
-            values[given.key] = _checked(stage, kind, given, values)
-    try:
-        made = kind(**values)
-    except TypeError as error:
-        raise UsageError(f"The params of {name} are not complete: {error}.") from error
-    if hasattr(made, "check"):
-        made.check()
-    return made
 
 
 def kinds(stage: AnyStage) -> tuple[Kind, ...]:
@@ -95,8 +43,8 @@ def tag(stage: AnyStage) -> str | None:
     if len(several) == 1:
         return None
     name = _tag_name(several)
-    choices = [_choices(kind, name) for kind in several]
-    if not all(choices) or len({choice for some in choices for choice in some}) < sum(map(len, choices)):
+    several_choices = [choices(kind, name) for kind in several]
+    if not all(several_choices) or len(set().union(*several_choices)) < sum(map(len, several_choices)):
         raise TacpipeError(
             f"The params of {stage.function.__name__} are of {len(several)} kinds, and their first field, {name}, does "
             f"not distinguish them: it must be a Literal in each, with choices that no other has."
@@ -108,7 +56,7 @@ def _tag_name(several: Sequence[Kind]) -> str:
     return dataclasses.fields(several[0])[0].name
 
 
-def _choices(kind: Kind, name: str) -> tuple[Any, ...]:
+def choices(kind: Kind, name: str) -> tuple[Any, ...]:
     """Return the choices of the tag ``name`` that a kind has; empty where its field is not a Literal."""
     wanted = fields_of.bare(fields_of.hints(kind).get(name))
     return get_args(wanted) if get_origin(wanted) is Literal else ()
@@ -125,7 +73,7 @@ def having(stage: AnyStage, field: str) -> list[str]:
     owners = [kind for kind in several if field in fields_of.hints(kind)]
     if name is None or len(owners) == len(several):
         return []
-    return [str(choice) for kind in owners for choice in _choices(kind, name)]
+    return [str(choice) for kind in owners for choice in choices(kind, name)]
 
 
 def defaults(stage: AnyStage, field: str) -> list[Any]:
@@ -137,7 +85,7 @@ def defaults(stage: AnyStage, field: str) -> list[Any]:
 
 def presets(stage: AnyStage) -> list[str]:
     """Return the names of a stage's presets."""
-    return list(dict.fromkeys(preset for kind in kinds(stage) for preset in _presets(kind)))
+    return list(dict.fromkeys(preset for kind in kinds(stage) for preset in presets_of(kind)))
 
 
 def panels(stage: AnyStage) -> dict[str, str]:
@@ -228,7 +176,7 @@ def read(union: Any, values: Mapping[str, Any], where: str) -> Any:
     kind, current = _current(several, values)
     if kind is None:
         name = _tag_name(several)
-        choices = [str(choice) for one in several for choice in _choices(one, name)]
+        choices = [str(choice) for one in several for choice in choices(one, name)]
         found = excerpt(values.get(_stored_name(several[0], name)))
         raise TacpipeError(f"{where}: {name} is {found}; it must be one of {', '.join(choices)}.")
     known = fields_of.hints(kind)
@@ -299,7 +247,7 @@ def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:
     """Return whether stored params name a choice of the tag ``name`` that ``kind`` has."""
     mark = _stored_as(kind, name)
     stored = values.get(mark.name)
-    return stored in [mark.choices.get(choice, choice) for choice in _choices(kind, name)]
+    return stored in [mark.choices.get(choice, choice) for choice in choices(kind, name)]
 
 
 def comments(stage: AnyStage) -> dict[str, str]:
@@ -336,56 +284,6 @@ def _comments(kind: Kind) -> dict[str, str]:
 # ---- kinds of params
 
 
-def _chosen(stage: AnyStage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
-    """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
-    kind = _named(stage, early)
-    if any(given.key == tag(stage) for given in late):
-        return _named(stage, late)
-    if preset is None or preset in _presets(kind):
-        return kind
-    return next((other for other in kinds(stage) if preset in _presets(other)), kind)
-
-
-def _named(stage: AnyStage, given: Sequence[_Given]) -> Kind:
-    """Return the kind that the last tag among ``given`` names, or the default one. Raises `UsageError` for none."""
-    name, found = tag(stage), kinds(stage)[0]
-    for one in given:
-        if one.key == name:
-            value = fields_of.check(one.value, fields(stage)[name], one.name, one.place)
-            found = next(kind for kind in kinds(stage) if value in _choices(kind, str(name)))
-    return found
-
-
-def _holds(kind: Kind, name: str | None, values: Mapping[str, Any]) -> bool:
-    return name is None or values.get(name) in _choices(kind, name)
-
-
-def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
-    """Return a value as the field of ``kind`` has it."""
-    known, name = fields_of.hints(kind), tag(stage)
-    if given.key not in fields(stage):
-        raise fields_of.unknown(given.key, fields(stage), given.where, "param")
-    subject = given.name if given.option else f"{given.place}: {given.key}"
-    current = before.get(name, kind.__dataclass_fields__[name].default) if name else None
-    if given.key in known:
-        wanted = known[given.key]
-        if fields_of.fits(given.value, fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
-            rule = f"with {name} {current} it must be {fields_of.describe(wanted)}"
-            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {rule}.")
-        value = fields_of.check(given.value, wanted, given.name, given.place)
-        files = [mark for mark in fields_of.metadata(wanted) if isinstance(mark, TomlFile)]
-        return files[0].read(value) if files else value
-    owners = having(stage, given.key)
-    raise UsageError(
-        f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "
-        f"Leave it out, or set {name} to {_or(owners)}."
-    )
-
-
-def _or(names: Sequence[str]) -> str:
-    return "".join(names) if len(names) < 2 else f"{', '.join(names[:-1])} or {names[-1]}"
-
-
 @functools.cache
 def _fields(several: tuple[Kind, ...]) -> Mapping[str, Any]:
     found: dict[str, list[Any]] = {}
@@ -403,62 +301,7 @@ def _joined(several: Sequence[Any]) -> Any:
     return several[0] if len(several) == 1 else typing.Union[tuple(several)]  # noqa: UP007
 
 
-def _presets(kind: Kind) -> Mapping[str, Mapping[str, Any]]:
+def presets_of(kind: Kind) -> Mapping[str, Mapping[str, Any]]:
+    """Return the values of each preset of a kind of params, by its name."""
     found: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
-    return found
-
-
-# ---- where values come from
-
-
-def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_Given]:
-    there = _presets(kind)
-    if preset not in presets(stage):
-        have = f"it has {', '.join(presets(stage))}" if presets(stage) else "it has none"
-        raise UsageError(f"There is no preset {preset} for {name}; {have}.")
-    if preset not in there:
-        choices = _or(list(map(str, _choices(kind, tag(stage) or ""))))
-        have = f"it has {', '.join(there)}" if there else "it has none"
-        raise UsageError(f"There is no preset {preset} for the {tag(stage)} {choices} of {name}; {have}.")
-    return [_Given(f"preset {preset} of {name}", key, value) for key, value in there[preset].items()]
-
-
-def _from_set(name: str, text: str) -> _Given:
-    key, _, value = text.partition("=")
-    return _Given(f"--set {text}", key.removeprefix(f"{name}."), _parse(value))
-
-
-def _parse(text: str) -> Any:
-    try:
-        return yaml_text.load(text)
-    except ValueError:
-        return text
-
-
-def _from_file(path: Path, block: str, *, required: bool) -> list[_Given]:
-    where = f"{path}, block {block}"
-    return [_Given(where, key, value) for key, value in _block(path, block, required=required).items()]
-
-
-def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
-    try:
-        found = yaml_text.load(regular.content(path)) or {}
-    except FileNotFoundError:
-        raise UsageError(f"There is no file {path} to read params from.") from None
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except TacpipeError as error:
-        raise UsageError(str(error)) from error
-    except ValueError as error:
-        raise UsageError(f"{path} cannot be read: {error}.") from error
-    for part in block.split("."):
-        if not isinstance(found, dict):
-            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is not a mapping.")
-        if part not in found:
-            if required:
-                raise UsageError(f"{path} has no block {block}; at {part} there are {listed(found)}.")
-            return {}
-        found = found[part]
-    if not isinstance(found, dict):
-        raise UsageError(f"{path}: block {block} is {excerpt(found)}; it should be a mapping of params.")
     return found

@@ -34,7 +34,7 @@ from tacpipe.datasets import manifest
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import report_descriptor
-from tacpipe.plugins import params, registry
+from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
 from tacpipe.recording import header, rig, spool, spool_blocks, spooled
 from tacpipe.sensors.framing import Chunks
@@ -133,7 +133,7 @@ def _manifests() -> list[bytes]:
 
 def _params(data: bytes) -> object:
     stage = registry.load("synchronize")
-    return params.build("synchronize", stage, file=_written("params.yaml", data))
+    return given_params.build("synchronize", stage, file=_written("params.yaml", data))
 
 
 def _rig(data: bytes) -> object:

@@ -10,7 +10,7 @@ import pytest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import yaml_text
 from tacpipe.links import opening
-from tacpipe.plugins import params, registry
+from tacpipe.plugins import given_params, registry
 from tacpipe.recording import rig
 from tests.conftest import Lab
 from tests.promises.counts import count
@@ -200,7 +200,7 @@ def test_params_that_no_person_wrote_are_refused_with_a_sentence(
     (tmp_path / "params.yaml").write_bytes(YAMLS[case].encode("utf-8", "surrogateescape"))
     stage = registry.load("synchronize")
     with bounded(SMALL), pytest.raises(UsageError) as error:
-        params.build("synchronize", stage, file=Path("params.yaml"), block="synchronize")
+        given_params.build("synchronize", stage, file=Path("params.yaml"), block="synchronize")
     assert is_sentence(str(error.value)), str(error.value)
     assert not (tmp_path / "opened").exists()
     count("hostile inputs refused")
@@ -212,7 +212,7 @@ def test_a_value_of_set_is_read_as_carefully(tmp_path: Path, case: str, monkeypa
     stage = registry.load("synchronize")
     value = YAMLS[case].partition("synchronize: ")[2]
     with bounded(SMALL), pytest.raises(UsageError) as error:
-        params.build("synchronize", stage, sets=[f"rate_hz={value}"])
+        given_params.build("synchronize", stage, sets=[f"rate_hz={value}"])
     assert not (tmp_path / "opened").exists()
     assert len(str(error.value)) < 500 or "--set" in str(error.value)
     count("hostile inputs refused")

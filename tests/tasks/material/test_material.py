@@ -15,8 +15,7 @@ from safetensors.torch import load as load_tensors
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics.proportions import wilson
-from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
+from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.material import losses
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
@@ -300,11 +299,11 @@ def test_slides_of_another_shape_are_refused_by_a_loaded_model(tmp_path: Path) -
 
 def test_the_published_code_with_its_quirks_is_a_preset() -> None:
     stage = registry.load("train.material")
-    quirks = params_of.build("train.material", stage, preset="authors")
+    quirks = given_params.build("train.material", stage, preset="authors")
     assert (quirks.pairing, quirks.shuffle, quirks.drop_last, quirks.unpool) == ("fixed", False, True, "last")
     assert (quirks.architecture, quirks.select, quirks.scaling, quirks.epochs) == ("raec", "last", "none", 2000)
     with pytest.raises(UsageError, match=r"no preset huge for train\.material; it has quick, paper, authors"):
-        params_of.build("train.material", stage, preset="huge")
+        given_params.build("train.material", stage, preset="huge")
 
 
 def test_the_published_quirks_train_and_are_judged_on_whole_batches(tmp_path: Path) -> None:

@@ -1,0 +1,166 @@
+"""Params as they are given: in ``params.yaml``, by presets and as options, checked before any data is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import regular, yaml_text
+from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins.constraints import TomlFile
+from tacpipe.plugins.params import Kind
+from tacpipe.plugins.stage import AnyStage
+from tacpipe.printable import excerpt, listed
+
+
+class _Given(NamedTuple):
+    """A value that was given, and where."""
+
+    where: str
+    key: str
+    value: Any
+    option: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.where if self.option else self.key
+
+    @property
+    def place(self) -> str:
+        return "" if self.option else self.where
+
+
+def build(
+    name: str,
+    stage: AnyStage,
+    *,
+    file: Path | None = None,
+    block: str | None = None,
+    preset: str | None = None,
+    sets: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+) -> Any:
+    """Return the params of stage ``name``: defaults, then file, preset, ``--set``, options, each over the one before.
+
+    Raises `UsageError` for an unknown name, a value that is not allowed, an option of another kind of params than the
+    chosen one, and values that do not go together.
+    """
+    early = [] if file is None else _from_file(file, block or name, required=block is not None)
+    late = [_from_set(name, text) for text in sets]
+    late += [_Given(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
+    kind = _chosen(stage, early, late, preset)
+    between = [] if preset is None else _from_preset(name, stage, kind, preset)
+    values: dict[str, Any] = {}
+    chooses = params_of.tag(stage)
+    for given in (*early, *between, *late):
+        if given.key != chooses or given.value in params_of.choices(kind, given.key):  # others were overruled
+            values[given.key] = _checked(stage, kind, given, values)
+    try:
+        made = kind(**values)
+    except TypeError as error:
+        raise UsageError(f"The params of {name} are not complete: {error}.") from error
+    if hasattr(made, "check"):
+        made.check()
+    return made
+
+
+def _chosen(stage: AnyStage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
+    """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
+    kind = _named(stage, early)
+    if any(given.key == params_of.tag(stage) for given in late):
+        return _named(stage, late)
+    if preset is None or preset in params_of.presets_of(kind):
+        return kind
+    return next((other for other in params_of.kinds(stage) if preset in params_of.presets_of(other)), kind)
+
+
+def _named(stage: AnyStage, given: Sequence[_Given]) -> Kind:
+    """Return the kind that the last tag among ``given`` names, or the default one. Raises `UsageError` for none."""
+    name, found = params_of.tag(stage), params_of.kinds(stage)[0]
+    for one in given:
+        if one.key == name:
+            value = fields_of.check(one.value, params_of.fields(stage)[name], one.name, one.place)
+            found = next(kind for kind in params_of.kinds(stage) if value in params_of.choices(kind, str(name)))
+    return found
+
+
+def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
+    """Return a value as the field of ``kind`` has it."""
+    known, name = fields_of.hints(kind), params_of.tag(stage)
+    if given.key not in params_of.fields(stage):
+        raise fields_of.unknown(given.key, params_of.fields(stage), given.where, "param")
+    subject = given.name if given.option else f"{given.place}: {given.key}"
+    current = before.get(name, kind.__dataclass_fields__[name].default) if name else None
+    if given.key in known:
+        wanted = known[given.key]
+        if fields_of.fits(given.value, params_of.fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
+            rule = f"with {name} {current} it must be {fields_of.describe(wanted)}"
+            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {rule}.")
+        value = fields_of.check(given.value, wanted, given.name, given.place)
+        files = [mark for mark in fields_of.metadata(wanted) if isinstance(mark, TomlFile)]
+        return files[0].read(value) if files else value
+    owners = params_of.having(stage, given.key)
+    raise UsageError(
+        f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "
+        f"Leave it out, or set {name} to {_or(owners)}."
+    )
+
+
+def _or(names: Sequence[str]) -> str:
+    return "".join(names) if len(names) < 2 else f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_Given]:
+    there = params_of.presets_of(kind)
+    if preset not in params_of.presets(stage):
+        have = f"it has {', '.join(params_of.presets(stage))}" if params_of.presets(stage) else "it has none"
+        raise UsageError(f"There is no preset {preset} for {name}; {have}.")
+    if preset not in there:
+        choices = _or(list(map(str, params_of.choices(kind, params_of.tag(stage) or ""))))
+        have = f"it has {', '.join(there)}" if there else "it has none"
+        raise UsageError(f"There is no preset {preset} for the {params_of.tag(stage)} {choices} of {name}; {have}.")
+    return [_Given(f"preset {preset} of {name}", key, value) for key, value in there[preset].items()]
+
+
+def _from_set(name: str, text: str) -> _Given:
+    key, _, value = text.partition("=")
+    return _Given(f"--set {text}", key.removeprefix(f"{name}."), _parse(value))
+
+
+def _parse(text: str) -> Any:
+    try:
+        return yaml_text.load(text)
+    except ValueError:
+        return text
+
+
+def _from_file(path: Path, block: str, *, required: bool) -> list[_Given]:
+    where = f"{path}, block {block}"
+    return [_Given(where, key, value) for key, value in _block(path, block, required=required).items()]
+
+
+def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
+    try:
+        found = yaml_text.load(regular.content(path)) or {}
+    except FileNotFoundError:
+        raise UsageError(f"There is no file {path} to read params from.") from None
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except TacpipeError as error:
+        raise UsageError(str(error)) from error
+    except ValueError as error:
+        raise UsageError(f"{path} cannot be read: {error}.") from error
+    for part in block.split("."):
+        if not isinstance(found, dict):
+            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is not a mapping.")
+        if part not in found:
+            if required:
+                raise UsageError(f"{path} has no block {block}; at {part} there are {listed(found)}.")
+            return {}
+        found = found[part]
+    if not isinstance(found, dict):
+        raise UsageError(f"{path}: block {block} is {excerpt(found)}; it should be a mapping of params.")
+    return found
