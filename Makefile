@@ -96,7 +96,7 @@ test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight othe
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one; CALLS=1 all of each stage
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 25 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one; CALLS=1 all of each stage
 	@$(exhaustive)
 	@$(EXHAUSTIVE) tests/promises
 	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
