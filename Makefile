@@ -30,7 +30,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --dist worksteal
 COUNTED := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST)
 # thousands of small projects come and go: in memory, where there are 4 GB of it, no disk delays them
 FAST := $(shell test "$$(df --output=avail /dev/shm 2> /dev/null | tail -n 1)" -gt 4000000 2> /dev/null && echo /dev/shm)
-EXHAUSTIVE := $(if $(FAST),TMPDIR=$(FAST)) TACPIPE_TEST_CALLS=$(CALLS) $(COUNTED) --every $(EVERY)
+EXHAUSTIVE := $(if $(FAST),TMPDIR=$(FAST)) TACPIPE_TEST_CALLS=$(CALLS) $(COUNTED) -o tmp_path_retention_policy=failed --every $(EVERY)
 export PYTHONDONTWRITEBYTECODE := # a command that finds its bytecode starts in a third of the time; tests start hundreds
 PROPERTIES := $(wildcard $(addprefix tests/, test_hashing.py test_keys.py test_dataset.py sensors/test_framing.py \
     sensors/test_every_sensor.py signals/test_clocks.py))
@@ -97,7 +97,7 @@ test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight othe
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 20 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one; CALLS=1 all of each stage
+test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 25 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one; CALLS=1 all of each stage
 	@$(exhaustive)
 	@$(EXHAUSTIVE) tests/promises
 	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)

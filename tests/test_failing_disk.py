@@ -198,6 +198,14 @@ def test_a_limit_of_open_files_names_the_command_that_raises_it(full: Lab) -> No
     assert ran.code == FAILED and "ulimit -n" in ran.err
 
 
+@pytest.mark.parametrize(("number", "limit"), [(errno.EMFILE, "ulimit -n"), (errno.EFBIG, "ulimit -f")], ids=str)
+def test_a_limit_that_a_write_meets_names_the_command_that_raises_it(full: Lab, number: int, limit: str) -> None:
+    with failing(number, lambda path: "/.tacpipe/tmp/" in path):
+        ran = full.call("scale data/r -o data/other --factor 9 --jobs 1")
+    assert ran.code == FAILED and limit in ran.err and ran.err.count("\n") == 1
+    full.run("scale data/r -o data/other --factor 9 --jobs 1")
+
+
 @pytest.mark.parametrize("number", NUMBERS, ids=names)
 def test_a_mark_that_cannot_be_looked_at_chooses_no_other_store(full: Lab, number: int) -> None:
     below = full.folder / "data/s"

@@ -181,18 +181,25 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
         )
     return StorageError(
         f"The store {root} cannot be used: {error.filename or 'a file'}: {error.strerror or error}. "
-        f"Check the disk, then run the same command again."
+        f"To continue, {_hint(error, 'check the disk')}, then run the same command again."
     )
 
 
 def unread(path: Path | str, error: OSError) -> StorageError:
     """Return in words that the system fails to read a file, which states nothing of what the file holds."""
-    hint = "check the disk and its permissions"
-    if error.errno in (errno.EMFILE, errno.ENFILE):
-        hint = "allow more open files (`ulimit -n`)"
+    hint = _hint(error, "check the disk and its permissions")
     return StorageError(
         f"{path} cannot be read: {error.strerror or error}. It may be sound: {hint}, then run the same command again."
     )
+
+
+def _hint(error: OSError, otherwise: str) -> str:
+    """Return what to do about a limit of the system, ``otherwise`` what to do about any other error."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return "allow more open files (`ulimit -n`)"
+    if error.errno == errno.EFBIG:
+        return "allow larger files (`ulimit -f`), or take a file system that holds them"
+    return otherwise
 
 
 def describe(error: OSError) -> str:

@@ -22,6 +22,7 @@ TICK_S = 0.05  # between two looks at what came; what a crash costs is about as 
 SYNC_S = 0.5  # between two syncs of the spool
 FIRST_S = 3.0  # in which every stream that should send all the time must give its first sample
 SILENT_S = 2.0  # without a sample, after which such a stream counts as lost though its link is open
+DRAIN_S = 2.0  # after this program was held up, in which links are read until nothing waits in them
 PREROLL_S = 0.5  # before a trigger, that are recorded too
 
 
@@ -116,8 +117,9 @@ class Recorder:
             yield
         finally:
             self._spool = None
-            if self._look():
-                clock.sleep(TICK_S)  # for those that read the links to fetch what waited meanwhile
+            self._look()
+            if clock.now_ns() - self._awake_ns < DRAIN_S * 1e9:
+                self._drain()
             last = {name: station.end() for name, station in self.stations.items()}
             for name, blocks in last.items():
                 _spooled(spool, name, blocks)
@@ -152,15 +154,21 @@ class Recorder:
         for watch in self.watches.values():
             watch.tare()
 
-    def _look(self) -> bool:
-        """Take note that what came is looked at now; return whether that was overdue, so that links may hold what waited."""
+    def _drain(self) -> None:
+        """Wait for those that read the links to fetch what waited while this program was held up; not for ever."""
+        since_ns = clock.now_ns()
+        while clock.now_ns() - since_ns < DRAIN_S * 1e9:
+            clock.sleep(TICK_S)
+            if all(station.drained(since_ns) for station in self.stations.values()):
+                return
+
+    def _look(self) -> None:
+        """Take note that what came is looked at now, and where that was overdue: links may then hold what waited."""
         now_ns = clock.now_ns()
         since_ns, self._looked_ns = now_ns - (self._looked_ns or now_ns), now_ns
         overdue_ns = since_ns - round(TICK_S * 1e9)
-        if overdue_ns <= STALL_NS:
-            return False
-        self._awake_ns, self._held_ns = now_ns, self._held_ns + overdue_ns
-        return True
+        if overdue_ns > STALL_NS:
+            self._awake_ns, self._held_ns = now_ns, self._held_ns + overdue_ns
 
     def _watched(self, name: str, blocks: list[Chunks | Note]) -> None:
         """Look at what came, and keep it as long as a trigger may want it."""

@@ -14,7 +14,7 @@ from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError
 from tacpipe.recording import clock, silence_diagnosis
-from tacpipe.recording.pace import Pace
+from tacpipe.recording.pace import WAITED_NS, Pace
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.sensors.framing import Chunks
@@ -57,6 +57,7 @@ class Station:
         self._orders: deque[Callable[[Link], None]] = deque()  # carried out by the thread, between two reads
         self._chunks = self._bytes = self._overruns = self._foreign = 0
         self._foreign_s = 0.0  # when such packets were noted last
+        self._empty_ns = 0  # when the link was last known to hold nothing that waits to be read
         self._wait_s = AGAIN_S[0]
 
     def start(self) -> None:
@@ -95,6 +96,10 @@ class Station:
             self._tally = None
             self._note_foreign(self._link)
             return self._taken()
+
+    def drained(self, since_ns: int) -> bool:
+        """Return whether all that waited in the link at that moment was read; True while the link is lost."""
+        return self._link is None or self._empty_ns >= since_ns
 
     def tare(self) -> bool:
         """Have the device take its present reading for zero; return False if it has no such command.
@@ -182,7 +187,6 @@ class Station:
         while not self._ending.is_set():
             came = self._paced(link, READ_S, pace)
             heard_s = self._heard(heard_s, came)
-            self._keep(came)
             self._obey(link, pace)
             if answers:
                 for _, chunk in came:
@@ -197,7 +201,10 @@ class Station:
                     self._note_foreign(link)
 
     def _paced(self, link: Link, timeout_s: float, pace: Pace) -> list[tuple[int, bytes]]:
-        """Return what came, and note where this program was held up before it, and where what is read no longer waited."""
+        """Keep and return what came.
+
+        Where this program was held up before it is noted, and where what is read no longer waited.
+        """
         began_ns = clock.now_ns()
         came = link.read(timeout_s)
         ended_ns = clock.now_ns()
@@ -208,6 +215,9 @@ class Station:
             self._notes.append(Note(at_ns, self.stream.name, STALLED, replace(stall, late_ns=late_ns).detail))
         elif pace.caught_up(began_ns, ended_ns):
             self._notes.append(Note(at_ns, self.stream.name, CAUGHT_UP))
+        self._keep(came)
+        if not came or ended_ns - began_ns > WAITED_NS:
+            self._empty_ns = began_ns
         return came
 
     def _heard(self, before_s: float, came: list[tuple[int, bytes]]) -> float:
@@ -229,11 +239,11 @@ class Station:
         while not self._ending.is_set():
             link.write(asked)
             pace.resume(clock.now_ns())
-            self._keep(self._paced(link, REPLY_S, pace))
+            self._paced(link, REPLY_S, pace)
             self._obey(link, pace)
             due_s = max(due_s + period_s, time.monotonic() - period_s)
             while not self._ending.is_set() and (left_s := due_s - time.monotonic()) > 0:
-                self._keep(self._paced(link, min(left_s, READ_S), pace))  # the rest of a reply that came in pieces
+                self._paced(link, min(left_s, READ_S), pace)  # the rest of a reply that came in pieces
 
     def _obey(self, link: Link, pace: Pace) -> None:
         while self._orders:

@@ -24,6 +24,7 @@ class Script:
         self.sent: dict[str, Sent] = {}
         self.happens: list[tuple[float, Callable[[], object]]] = []
         self.tared: list[float] = []
+        self.drained_s = 0.0  # from when on readers have fetched what waited
         monkeypatch.setattr(clock, "now_ns", lambda: self.t_ns)
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(recorder, "Station", lambda stream: Station(self, stream))
@@ -88,6 +89,10 @@ class Station:
         found = self.take()
         self._tally = None
         return found
+
+    def drained(self, since_ns: int) -> bool:
+        """Return whether what waited was fetched."""
+        return self.script.t_s >= self.script.drained_s
 
     def tare(self) -> bool:
         """Remember when the device was to tare."""

@@ -103,6 +103,21 @@ def test_a_recorder_that_is_never_held_up_says_nothing(tmp_path: Path, monkeypat
     assert sealing.UNCERTAIN not in found.table.column_names
 
 
+def test_a_link_is_drained_when_a_read_found_nothing_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Device(monkeypatch, frames(5000), {1000: 2000})  # 2,000 frames wait then, and a read gives 500
+    read, told = device.read, []
+
+    def noted(timeout_s: float) -> list[tuple[int, bytes]]:
+        told.append((len(came := read(timeout_s)), device.station.drained(START_NS + 3000 * MS)))
+        return came
+
+    device.read = noted  # type: ignore[method-assign]
+    recorded(tmp_path, device)
+    many = [drained for count, drained in told if count == 500]
+    assert len(many) == 4 and not any(many)  # of the read before
+    assert [drained for _, drained in told][-1]
+
+
 @pytest.mark.parametrize("lasts_ms", [250, 460, 5000])
 def test_what_waited_while_the_recorder_was_stopped_has_an_uncertain_arrival(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasts_ms: int
@@ -214,13 +229,15 @@ def test_a_disk_that_is_slow_at_the_end_is_no_silence_of_the_device(
     assert counts(live.only(lab.folder))[-1] >= 4 * RATE_HZ - 1
 
 
-@pytest.mark.parametrize("stopped_s", [0.5, 5.0])
+@pytest.mark.parametrize(("stopped_s", "fetched_s"), [(0.5, 0.01), (5.0, 0.01), (2.0, 1.2)])
 def test_a_recorder_that_was_stopped_at_the_end_blames_no_device(
-    lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch, stopped_s: float
+    lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch, stopped_s: float, fetched_s: float
 ) -> None:
+    """Readers that are starved of a processor fetch what waited only later: ``fetched_s`` after the end of the stop."""
     read = script.sent["force"]
     at_s = 3.99
-    script.sent["force"] = [(t_s if t_s < at_s else max(t_s, at_s + stopped_s + 0.01), data) for t_s, data in read]
+    script.drained_s = at_s + stopped_s + fetched_s
+    script.sent["force"] = [(t_s if t_s < at_s else max(t_s, script.drained_s), data) for t_s, data in read]
     script.happens.append((at_s, lambda: setattr(script, "t_ns", script.t_ns + round(stopped_s * 1e9))))
     lab.run("acquire rig.toml -o rec --duration 4")
 
