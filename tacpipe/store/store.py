@@ -379,6 +379,10 @@ class Store:
     def note_records(self, manifest: str, keys: Collection[str]) -> None:
         """Do nothing: in a folder all records are read in little time."""
 
+    def noted(self, manifest: str) -> set[str]:
+        """Return nothing, as `note_records` notes nothing."""
+        return set()
+
     def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield records and their keys, among them all that belong to a manifest: those of the store."""
         return self.records()
