@@ -103,6 +103,7 @@ LACK = {  # and for each that does need one, with that extra
     "store push s3://lab/store data/split": "bucket",
     "store pull gs://lab/store data/split": "bucket",
     "store verify --remote az://lab/touch/store": "bucket",
+    "split data/segments --scheme random --seed 7 -o {o} --executor slurm": "slurm",
     "show data/synced trial-000 --plot {o}.png": "learn",
     "view data/synced --save {o}.rrd": "view",
     "demo -o {o}": "learn",

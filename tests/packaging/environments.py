@@ -55,6 +55,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "mlflow": (),
     "view": VIEW,
     "ros": ROS,
+    "slurm": (),
     "tensorboard": (),
     "track": (),
     "wandb": (),
