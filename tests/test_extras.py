@@ -101,6 +101,9 @@ LACK = {  # and for each that does need one, with that extra
     "export hdf5 data/recordings -o {o}": "hdf5",
     "export zarr data/synced -o {o}": "zarr",
     "split data/segments --scheme random --seed 7 -o {o} --executor dask": "dask",
+    "store push s3://lab/store data/split": "bucket",
+    "store pull gs://lab/store data/split": "bucket",
+    "store verify --remote az://lab/touch/store": "bucket",
     "split data/segments --scheme random --seed 7 -o {o} --executor slurm": "slurm",
     "show data/synced trial-000 --plot {o}.png": "learn",
     "view data/synced --save {o}.rrd": "view",
@@ -308,7 +311,7 @@ def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monke
 def test_modules_belong_to_the_extra_whose_package_brings_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = {"torch": "learn", "sklearn": "learn", "scipy": "learn", "safetensors": "learn", "matplotlib": "learn"}
     wanted |= {"open3d": "clouds", "serial": "devices", "hid": "devices", "hidraw": "devices", "can": "devices"}
-    wanted |= {"websockets": "devices", "rerun": "view", "rerun_cli": "view"}
+    wanted |= {"obstore": "bucket", "websockets": "devices", "rerun": "view", "rerun_cli": "view"}
 
     assert {module: extras.of(module) for module in wanted} == wanted
     assert extras.of("numpy") is None and extras.of("nobody") is None

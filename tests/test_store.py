@@ -202,3 +202,16 @@ def test_the_store_lies_beside_the_project_or_where_the_environment_says(
     assert project(deep) == tmp_path
     monkeypatch.setenv("TACPIPE_STORE", str(tmp_path / "elsewhere"))
     assert locate(deep).root == tmp_path / "elsewhere"
+
+
+def test_settling_syncs_each_folder_above_the_names_once_and_those_within_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path / "store")
+    store.prepare()
+    synced: list[str] = []
+    monkeypatch.setattr("tacpipe.store.store.sync_folder", lambda path: synced.append(str(Path(path))))
+    store.settle(["objects/ab/x", "objects/ab/y", "records/cd/z"])
+    folders = [str(tmp_path / "store" / name) for name in ("objects/ab", "objects", "records/cd", "records", "")]
+    assert sorted(synced) == sorted(folders)
+    assert synced.index(folders[0]) < synced.index(folders[1]) < synced.index(folders[4])

@@ -120,7 +120,7 @@ def collect(
     needed = _needed(store)
     kept = set(needed.objects)
     unneeded: dict[str, set[str]] = {}  # keys of records, and what they name
-    for key, record in list(store.records()):
+    for key, record in store.records():
         names = set(named(record["result"]))
         if names <= needed.objects:
             continue

@@ -112,6 +112,7 @@ def push(
                     beside=(str(found.directory.absolute()),),
                     ancestors=ancestors,
                     verify=verify,
+                    before="" if before is None else before["manifest"],
                 )
                 _name(there, here, found, owner, name, before, replace=replace)
             if writable:
@@ -302,8 +303,12 @@ def _copy(
     beside: tuple[str, ...],
     ancestors: bool,
     verify: bool,
+    before: str = "",
 ) -> None:
-    """Copy objects, then manifests, then records: what names something comes after it."""
+    """Copy objects, then manifests, then records: what names something comes after it.
+
+    ``before`` is a manifest of the target that has much in common with what is copied, as the last one of that name.
+    """
     plan = _planned(source, target, found, ancestors=ancestors)
     sizes = plan.sizes()
     target.announce(sizes)  # before looking what is there
@@ -323,7 +328,7 @@ def _copy(
     done.bytes += sum(sizes[name] for name in moved)
     done.there += len(sizes) - len(moved)
     done.replaced += sum(name in there for name in moved)
-    _copy_records(source, target, found, sizes)
+    _copy_records(source, target, found, sizes, before)
 
 
 def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
@@ -368,12 +373,16 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
         target.take(name, _counted([execution.reader(source, beside, sizes)(name, path)], size, path))
 
 
-def _copy_records(source: AnyStore, target: AnyStore, found: manifest_of.Found, moved: Collection[str]) -> None:
+def _copy_records(
+    source: AnyStore, target: AnyStore, found: manifest_of.Found, moved: Collection[str], before: str
+) -> None:
     """Copy the records of what was copied, and note in ``target`` which those are."""
+    there = target.noted(found.digest) | (target.noted(before) if before else set())
 
     def commit(one: tuple[str, dict[str, Any]]) -> str:
         key, record = one
-        target.commit(record["identity"], record["result"], record["provenance"])
+        if key not in there:
+            target.commit(record["identity"], record["result"], record["provenance"])
         return key
 
     names = set(moved)

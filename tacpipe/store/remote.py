@@ -69,13 +69,22 @@ class RemoteStore:
     def prepare(self) -> None:
         """Begin the store where there is none yet. Raises `UsageError` as `check` does, and where the server does not
         refuse to create what is there already."""
-        mark = layout.FORMAT.encode() + b"\n"
-        if self.files.create(layout.MARK, mark) and self.files.create(layout.MARK, mark):
+        if self.files.create(layout.MARK, layout.FORMAT.encode() + b"\n"):
+            self._expect_conditional()
+        self.check()
+
+    def _expect_conditional(self) -> None:
+        tried = f"tmp/.{uuid.uuid4().hex}"
+        self.files.create(tried, b"1")
+        replaced = self.files.create(
+            tried, b"2"
+        )  # other content: an answer that is lost is no reason to count it as kept
+        self.files.delete(tried)
+        if replaced:
             raise UsageError(
                 f"The server of {self.place} writes over what is there although it is asked not to (If-None-Match: *), so "
                 f"pushes could replace each other. Use one that supports conditional writes."
             )
-        self.check()
 
     # ---- runs
 
@@ -238,11 +247,14 @@ class RemoteStore:
         content = json.dumps(sorted(keys)).encode()
         self.files.create(f"{SNAPSHOTS}/{manifest}/{bytes_digest(content)}.json", content)
 
+    def noted(self, manifest: str) -> set[str]:
+        """Return the keys of the records that were noted as belonging to a manifest."""
+        entries = list(self.files.list(f"{SNAPSHOTS}/{manifest}"))
+        return {key for entry in entries for key in self._keys(entry.name)}
+
     def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the records that belong to a manifest, with their keys: as was noted, else all of the store's."""
-        noted = [self._keys(entry.name) for entry in self.files.list(f"{SNAPSHOTS}/{manifest}")]
-        keys = (key for some in noted for key in some) if noted else None
-        return self.records(keys)
+        return self.records(self.noted(manifest) or None)
 
     def _keys(self, name: str) -> list[str]:
         """Return the keys that a snapshot notes, none where it is damaged: records save work, no result rests on them."""

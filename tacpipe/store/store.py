@@ -19,7 +19,7 @@ from typing import Any
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import drafts, memory, places, regular
 from tacpipe.io.drafts import Draft
-from tacpipe.io.files import listed, move, present, readable_errors, sync_folders, unread
+from tacpipe.io.files import listed, move, present, readable_errors, sync_folder, sync_folders, unread
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store import layout
 from tacpipe.store.directory import Directory
@@ -204,9 +204,10 @@ class Store:
 
     def settle(self, names: Iterable[str]) -> None:
         """Have names within the store outlast a loss of power, as their contents do; each folder is synced once."""
+        above = {str(folder) for name in names for folder in Path(name).parents}
         with readable_errors(self.root):
-            for path in {os.path.dirname(self.files.path(name)) for name in names}:  # noqa: PTH120
-                sync_folders(path, self._root)
+            for folder in sorted(above, reverse=True):  # those within first
+                sync_folder(self.files.path(folder))
 
     def read(self, name: str, size: int | None = None) -> bytes:
         """Return the content of an object, verified; ``size`` is what its manifest or record declares, in bytes.
@@ -378,6 +379,10 @@ class Store:
 
     def note_records(self, manifest: str, keys: Collection[str]) -> None:
         """Do nothing: in a folder all records are read in little time."""
+
+    def noted(self, manifest: str) -> set[str]:
+        """Return nothing, as `note_records` notes nothing."""
+        return set()
 
     def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield records and their keys, among them all that belong to a manifest: those of the store."""

@@ -45,6 +45,7 @@ ROS = ("export mcap data/recordings -o mcap", "ingest mcap mcap -o data/from-mca
 ZARR = ("export zarr data/synced -o zarr", "ingest zarr zarr --guess")
 EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not without
     "learn": LEARN,
+    "bucket": (),
     "clouds": CLOUDS,
     "dask": (),
     "devices": DEVICES,

@@ -259,3 +259,20 @@ def test_announcements_that_are_older_than_the_grace_by_the_clock_of_the_place_a
     monkeypatch.setattr(files, "list", listed)
     collect(files)
     assert [entry.name for entry in honest("leases")] == names[1:]
+
+
+def test_a_server_that_writes_over_what_it_is_asked_to_keep_is_refused(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run("simulate toy -o data/r --trials 1 --rows 3")
+    files = Stepping({})
+
+    def create(name: str, content: Any) -> bool:
+        files.delete(name)
+        return Bucket.create(files, name, content)
+
+    monkeypatch.setattr(files, "create", create)
+    for _ in range(2):  # a store that is there already is refused too
+        with pytest.raises(UsageError, match="conditional"):
+            push(monkeypatch, files, "data/r")
+    assert not [*files.list("objects"), *files.list("roots")]
