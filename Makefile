@@ -16,6 +16,7 @@ MOCKED_DEVICES := umockdev gir1.2-umockdev-1.0 python3-gi
 BROWSER := chromium fonts-dejavu-core
 VIRTUAL_MACHINE := qemu-system-x86 busybox-static
 SCREEN := xvfb mesa-vulkan-drivers libxkbcommon-x11-0
+SLURM := slurm-wlm munge
 BLOCK_REPLAY := user-mode-linux dmsetup e2fsprogs xfsprogs btrfs-progs
 COUNTS := .cache/counts.jsonl
 SECONDS := 60
@@ -50,7 +51,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -99,6 +100,10 @@ test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, i
 	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
 	@$(EXHAUSTIVE) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
+
+test-slurm: $(VENV)/.dev ## start Slurm on this computer, as root, and put the questions of all executors to its jobs
+	@if ! command -v slurmctld > /dev/null; then $(call debian,$(SLURM)); fi
+	@$(PYTEST) tests/executors -k slurm
 
 test-exits: $(VENV)/.dev ## run 2,000 times `tacpipe show` and other commands that end after reading Parquet, and count exit codes
 	@$(BIN)/python -m tests.promises.exits

@@ -22,6 +22,7 @@ import timing
 MODULES = (
     "startup",
     "small",
+    "executors",
     "verified_reads",
     "synchronization",
     "decode",

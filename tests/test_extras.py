@@ -100,6 +100,7 @@ LACK = {  # and for each that does need one, with that extra
     "export hdf5 data/recordings -o {o}": "hdf5",
     "export zarr data/synced -o {o}": "zarr",
     "split data/segments --scheme random --seed 7 -o {o} --executor dask": "dask",
+    "split data/segments --scheme random --seed 7 -o {o} --executor slurm": "slurm",
     "show data/synced trial-000 --plot {o}.png": "learn",
     "view data/synced --save {o}.rrd": "view",
     "demo -o {o}": "learn",

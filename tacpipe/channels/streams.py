@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -45,6 +45,12 @@ def gaps_before(table: pa.Table) -> Indices:
 def of_quantity(table: pa.Table, quantity: str) -> list[str]:
     """Return the columns of a stream that hold ``quantity``."""
     return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]
+
+
+def unit_of(table: pa.Table, names: Sequence[str]) -> str:
+    """Return the unit of columns; the empty text where they have none, or not all the same."""
+    units = {(table.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
+    return next(iter(units)) if len(units) == 1 else ""
 
 
 def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyArray] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,33 @@ def lowest_part(values: AnyArray, t_ns: Times, rest_s: float) -> Bools:
     found = np.zeros(len(t_ns), bool)
     found[first : stop[first]] = True
     return found
+
+
+def at_rest(which: str, values: AnyArray, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
+    """Return each channel's level without load (channel,), and the rows (time,) it is of, None for those of the start.
+
+    ``which`` is ``start``, for the first ``rest_s`` seconds, or ``lowest``, for those of `lowest_part`. Raises
+    `TacpipeError` if there are no rows.
+    """
+    if which == "start" or not len(t_ns):
+        return rest_level(values, t_ns, rest_s), None
+    rows = lowest_part(values, t_ns, rest_s)
+    level: Floats = np.median(values[rows], axis=0).astype(np.float64)
+    return level, rows
+
+
+def tared(how: Literal["median", "first", "axis_mean"], values: AnyArray, level: Floats, axes: int) -> Floats:
+    """Return what is taken off each channel (channel,) of ``values`` (time, channel).
+
+    ``median`` is ``level``, that of the channels at rest; ``first`` the first row; ``axis_mean`` that of
+    `axis_mean_level`, whose ``axes`` are of a taxel.
+    """
+    if how == "median":
+        return level
+    if how == "first":
+        first: Floats = values[0].astype(np.float64)
+        return first
+    return axis_mean_level(values, axes)
 
 
 def axis_mean_level(values: AnyArray, axes: int = 3) -> Floats:

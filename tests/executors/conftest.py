@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Lab, Ran, tacpipe
+from tests.executors import slurm_server
 
 GIVE_UP_S = 300.0  # only what hangs takes so long
 
@@ -74,7 +75,7 @@ class Apart(Lab):
         self.inside = lab.call  # in this process, where something is replaced
 
     def _call(self, command: str) -> Ran:
-        if "dask" not in command:
+        if not re.search(r"--executor (dask|tls|slurm)", command):
             return self.inside(command)
         done = tacpipe(self.folder, command)
         return Ran(done.returncode, done.stdout, done.stderr)
@@ -104,3 +105,21 @@ def cluster(tmp_path_factory: pytest.TempPathFactory, lab: object) -> Iterator[C
     found = Cluster(tmp_path_factory.mktemp("cluster"))
     yield found
     found.close()
+
+
+@pytest.fixture(scope="module")
+def slurm_of_tests(plugin: Path) -> Iterator[dict[str, str]]:
+    """The environment in which commands find a Slurm that runs, whose jobs find the plug-in of ``lab``."""
+    pytest.importorskip("dask_jobqueue", reason="the extra slurm is not installed")
+    if why := slurm_server.lacking():
+        pytest.skip(why)
+    with slurm_server.running() as environment:
+        yield {**environment, "PYTHONPATH": str(plugin)}
+
+
+@pytest.fixture
+def slurm(slurm_of_tests: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """The executor ``slurm`` of a Slurm that runs."""
+    for name, value in slurm_of_tests.items():
+        monkeypatch.setenv(name, value)
+    return "slurm"

@@ -13,10 +13,13 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::Depr
 TRIALS = 12  # more than this process would compute by itself
 
 
-@pytest.fixture(params=["local", pytest.param("dask", marks=pytest.mark.long)])
+@pytest.fixture(
+    params=["local", *(pytest.param(name, marks=pytest.mark.long) for name in ("dask", "slurm"))],
+)
 def executor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """An executor as `--executor` takes it."""
-    found: str = "local" if request.param == "local" else request.getfixturevalue("scheduler")
+    fixtures = {"dask": "scheduler", "slurm": "slurm"}
+    found: str = "local" if request.param == "local" else request.getfixturevalue(fixtures[request.param])
     return found
 
 

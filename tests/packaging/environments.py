@@ -54,6 +54,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "mlflow": (),
     "view": VIEW,
     "ros": ROS,
+    "slurm": (),
     "tensorboard": (),
     "track": (),
     "wandb": (),

@@ -72,8 +72,9 @@ def encrypted(address: str, jobs: int) -> Iterator[Dask]:
 class Dask:
     """The workers that a client of Dask reaches."""
 
-    def __init__(self, client: Client) -> None:
-        self.client = client
+    def __init__(self, client: Client, expected: int = 0) -> None:
+        """Take a client, and how many workers are ``expected`` where they do not all start at once."""
+        self.client, self._expected = client, expected
         self._scheduler = str(client.scheduler_info(n_workers=0)["address"])
 
     def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
@@ -85,7 +86,7 @@ class Dask:
         if not tasks:
             return
         wanted = agreement.here(tasks[0].name)
-        workers = len(self._workers())
+        workers = max(len(self._workers()), self._expected)
         given = [[_absolute(task) for task in chunk] for chunk in chunks.of(tasks, workers, _MOST)]
         futures = [self.client.submit(_work, wanted, compute, chunk, pure=False) for chunk in given]
         what = f"{len(tasks)} tasks were given to {workers} workers"
@@ -150,7 +151,7 @@ def _started(workers: int) -> Iterator[Dask]:
 
     security = Security.temporary()  # type: ignore[no-untyped-call]
     with (
-        _quiet(),
+        quiet(),
         dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=workers,
@@ -174,7 +175,7 @@ def _client(address: str) -> Iterator[Client]:
     with extras.named("The executor dask"):
         from distributed import Client
 
-    with _quiet():
+    with quiet():
         try:
             client = Client(  # type: ignore[no-untyped-call]
                 address, timeout=_CONNECT_S, set_as_default=False, name="tacpipe"
@@ -186,7 +187,7 @@ def _client(address: str) -> Iterator[Client]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Have Dask log nothing in the block: a worker or scheduler that is gone is a sentence of ours."""
     loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *_dask_loggers())]
     before = [one.level for one in loggers]

@@ -1,0 +1,207 @@
+"""Mark contacts in synchronized recordings: which rows a model is trained on. All rows stay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tacpipe.channels.absent import absent
+from tacpipe.errors import UsageError
+from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
+from tacpipe.plugins.params import added
+from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import Floats
+    from tacpipe.datasets.dataset import Recording
+    from tacpipe.signals.contact import Thresholds
+
+COUNT = "count"
+
+
+@dataclass(frozen=True)
+class Params:
+    """What counts as contact, and as the level without load.
+
+    Thresholds in counts are for streams in counts, and stem from 52 published pick-and-move trials of a XELA uSkin: at
+    rest the load stays below 6 counts, in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts
+    remain for seconds. Those of streams in any other unit follow from the noise at rest, unless they are given.
+    """
+
+    # free: nothing is touched at first; grasped: all of the recording is one contact
+    begins: Literal["free", "grasped"] = "free"
+    # time at the start whose median is each channel's level without load
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
+    # mean change of a finger's taxels from rest at which contact starts
+    on_count: Annotated[PositiveFloat, Unit("count")] = 120.0
+    off_count: Annotated[NonNegativeFloat, Unit("count")] = 80.0  # mean change below which it ends
+    merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # largest gap between two contacts that are merged
+    min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # shortest contact that is kept
+    pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that belongs to it
+    # as on_count, of streams in other units, in theirs; None: from noise at rest
+    on_level: PositiveFloat | None = added(None)
+    # level below which it ends there; None: two thirds of where it starts
+    off_level: NonNegativeFloat | None = added(None)
+    # what `rest` is: median of rest_s; first row; axis_mean: taxels begin at their axis' mean
+    tare: Literal["median", "first", "axis_mean"] = "median"
+    # of streams in counts: unit, on_count and off_count; noise, from their noise at rest as those in other units
+    thresholds: Literal["unit", "noise"] = added("unit")
+    # which rest_s: start of the recording; lowest: those in which the channels are lowest together
+    rest: Literal["start", "lowest"] = added("start")
+
+    def check(self) -> None:
+        """Refuse contacts that end above where they begin, and thresholds in counts that would do nothing."""
+        if self.thresholds == "noise" and (self.on_count, self.off_count) != (Params.on_count, Params.off_count):
+            raise UsageError(
+                f"thresholds is noise, and on_count {self.on_count:g} and off_count {self.off_count:g} would do nothing; "
+                f"give --on-level and --off-level, or leave --thresholds out."
+            )
+        if self.off_count > self.on_count:
+            raise UsageError(
+                f"off_count is {self.off_count:g}, above on_count, {self.on_count:g}; a contact must end at or below the "
+                f"load at which it begins."
+            )
+
+
+@stage(version=2)
+def contacts(params: Params, recording: Recording) -> RecordingOutput:
+    """Mark contacts in synchronized recordings.
+
+    Rows in which either finger is in contact are numbered from 0 in the column ``contact``; all others have -1. Each
+    tactile channel's level without load is written into its field metadata ``rest``. Contact is detected from the
+    median of the first seconds (``rest``), whatever ``tare`` is. A stream in counts has the thresholds of ``on_count``
+    and ``off_count``, unless ``thresholds`` is noise. One in any other unit has those of ``on_level`` and ``off_level``
+    or of its noise at rest (see `tacpipe.signals.contact.noise_thresholds`), and the attributes
+    ``<stream>_contact_on``, ``<stream>_contact_off`` and ``<stream>_contact_unit`` record them. A recording without a
+    contact has a note.
+
+    Example: tacpipe segment contacts data/synced -o data/segments
+    """
+    import numpy as np
+    import pyarrow as pa
+
+    from tacpipe.channels.streams import unit_of
+    from tacpipe.io.parquet import with_metadata
+    from tacpipe.signals.contact import (
+        Thresholds,
+        at_rest,
+        contact_intervals,
+        load,
+        noise_thresholds,
+        tared,
+    )
+
+    table = recording.table()
+    t_ns = table.column("t_ns").to_numpy()  # (time,)
+    loads: list[Floats] = []
+    limits: list[Thresholds] = []
+    rest: dict[str, dict[str, str]] = {}
+    sensors = _sensors(recording.name, table)
+    units = {stream: unit_of(table, names) for stream, names in sensors.items()}
+    fixed = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
+    _check_levels(params, recording.name, units, fixed)
+    for stream, names in sensors.items():
+        values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
+        axes = len({(table.field(name).metadata or {}).get(b"axis") for name in names})
+        level, rows = at_rest(params.rest, values, t_ns, params.rest_s)
+        loads.append(load(values, level, axes))
+        if stream in fixed:
+            limits.append(Thresholds(params.on_count, params.off_count))
+        else:
+            limits.append(_given(params, noise_thresholds(values, loads[-1], t_ns, params.rest_s, rows)))
+        written = tared(params.tare, values, level, axes)
+        rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, written, strict=True)}
+    if params.begins == "grasped":
+        intervals = np.array([[0, len(t_ns)]])
+    else:
+        on, off = np.array(limits).T
+        intervals = contact_intervals(np.array(loads), t_ns, on, off, params.min_s, params.merge_s, params.pad_s)
+    numbers = np.full(len(t_ns), -1, dtype=np.int32)
+    for number, (start, stop) in enumerate(intervals):
+        numbers[start:stop] = number
+    field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
+    largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
+    notes = [] if len(intervals) else [_no_contact(params, units, limits, largest, fixed)]
+    marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
+    return RecordingOutput(marked, _threshold_attributes(units, limits, fixed), notes)
+
+
+def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:
+    """Refuse thresholds in a unit that no stream has: they would do nothing."""
+    if params.on_level is not None and params.on_level <= 0:
+        raise UsageError(f"on_level is {params.on_level:g}; it must be above 0, or every row would be in contact.")
+    described = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
+    if set(fixed) == set(units) and (params.on_level, params.off_level) != (None, None):
+        raise UsageError(
+            f"on_level and off_level are of streams in other units than counts, and recording {name} has {described}; give "
+            f"on_count and off_count, or --thresholds noise."
+        )
+    if COUNT not in units.values() and (params.on_count, params.off_count) != (Params.on_count, Params.off_count):
+        raise UsageError(
+            f"on_count and off_count are of streams in counts, and recording {name} has {described}; give on_level and "
+            f"off_level in that unit, or none: then they follow from the noise at rest."
+        )
+
+
+def _given(params: Params, found: Thresholds) -> Thresholds:
+    """Return the thresholds of a stream in another unit than counts: those given, else those ``found``."""
+    from tacpipe.signals.contact import ENDS
+
+    on = found.on if params.on_level is None else params.on_level
+    return found._replace(on=on, off=ENDS * on if params.off_level is None else params.off_level)
+
+
+def _threshold_attributes(
+    units: Mapping[str, str], limits: Sequence[Thresholds], fixed: Collection[str]
+) -> dict[str, Attribute]:
+    """Return the attributes that record by which thresholds streams other than the ``fixed`` were segmented."""
+    described: dict[str, Attribute] = {}
+    for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
+        if stream not in fixed and math.isfinite(on):
+            begins = f"{stream}_contact" if stream else "contact"
+            described |= {f"{begins}_on": on, f"{begins}_off": off, f"{begins}_unit": unit}
+    return described
+
+
+def _no_contact(
+    params: Params,
+    units: Mapping[str, str],
+    limits: Sequence[Thresholds],
+    largest: Sequence[float],
+    fixed: Collection[str],
+) -> str:
+    """Return the note on a recording without a contact: thresholds, largest load, and what to do."""
+    found = [
+        f"{stream or 'the sensor'} starts contact at a load of {_number(on)} {unit}".rstrip()
+        + f" and reaches {_number(most)} {unit}".rstrip()
+        if math.isfinite(on)
+        else f"{stream or 'the sensor'} never leaves its level at rest"
+        for (stream, unit), (on, _), most in zip(units.items(), limits, largest, strict=True)
+    ]
+    names = ["--on-count"] * bool(fixed) + ["--on-level"] * (set(fixed) != set(units))
+    other = ", or give --thresholds noise" if fixed else ""
+    return (
+        f"no contact of {params.min_s:g} s or more was found in this recording: {'; '.join(found)}. If something was "
+        f"touched, lower {' and '.join(names)}{other}."
+    )
+
+
+def _number(value: float) -> str:
+    """Return a number with three digits that count, without an exponent where it can be."""
+    return f"{float(f'{value:.3g}'):g}"
+
+
+def _sensors(name: str, table: pa.Table) -> dict[str, list[str]]:
+    """Return the tactile columns of each stream, taxel by taxel."""
+    found: dict[str, list[str]] = {}
+    for field in table.schema:
+        metadata = field.metadata or {}
+        if metadata.get(b"quantity") == b"tactile":
+            found.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
+    if not found:
+        raise absent(name, "tactile", table.schema)
+    return found

@@ -1,0 +1,197 @@
+"""Cut out the slide of each recording: of it the frames remain that are alike in all recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.constraints import (
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    StoredAs,
+    Unit,
+)
+from tacpipe.plugins.params import added
+from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Recording
+
+COUNT = "count"
+USUAL_SPEED = 0.75  # quantile of the speed in contact: that of the slide, which is most of it
+_KEPT_WHOLE = (
+    "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
+    "sensor is touched and the arm moves."
+)
+
+
+@dataclass(frozen=True)
+class Params:
+    """Where a slide begins and ends, which of its frames are kept, and what the protocol of the recordings was.
+
+    The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the
+    finger's pressure reached 40 counts. Half the speed lies in the middle between rest and slide, whose ramp takes 0.1
+    s. Over 800 slides the mean pressure of the kept frames is 4 to 133 counts, and the shortest lasts 5.95 s.
+    """
+
+    # static pressure whose first crossing starts the slide
+    pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
+    # fraction of speed_m_s above which the arm slides; only where the arm was recorded
+    moving_fraction: Annotated[Fraction, StoredAs("moving_share")] = 0.5
+    steady_frames: PositiveInt = 5  # rows that the arm must move so fast, or a single wrong reading would count
+    # which frames: of the middle; offset: from offset_frames behind the trigger on; none: all
+    crop: Literal["middle", "offset", "none"] = "middle"
+    frames: PositiveInt = 400  # rows that are kept; recordings without static pressure are kept whole
+    # rows between trigger and kept frames with crop offset; the authors' files have 101
+    offset_frames: NonNegativeInt = 101
+    # rows around a tactile reading, odd, whose median replaces it if it is a spike; 1: never
+    spike_frames: PositiveInt = 7
+    # scaled median absolute deviations of these rows, beyond which it is a spike
+    spike_deviations: NonNegativeFloat = 5.0
+    # least height of a spike; contact changes readings by 0 to 235
+    spike_count: Annotated[NonNegativeFloat, Unit("count")] = 255.0
+    speed_m_s: Annotated[PositiveFloat, Unit("m/s")] = 0.025  # speed of the protocol
+    # fraction by which the slide's median speed may differ; published ones do by 0.016
+    speed_tolerance: NonNegativeFloat = 0.05
+    min_s: Annotated[NonNegativeFloat, Unit("s")] = 5.5  # shortest slide within the protocol
+    # least mean pressure within the protocol; below, the finger hardly touched
+    pressure_low: Annotated[NonNegativeFloat, Unit("count")] = 2.0
+    # largest mean pressure within the protocol; above, the finger was pressed too hard
+    pressure_high: Annotated[NonNegativeFloat, Unit("count")] = 150.0
+    # what the slide begins and ends by: pressure, the static one; load, the taxels' mean change from rest, of any sensor
+    trigger: Literal["pressure", "load"] = added("pressure")
+    # load at which the slide begins, in the unit of the taxels; None: from their noise at rest
+    load_trigger: PositiveFloat | None = added(None)
+    # time whose median is each channel's level without load
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = added(0.2)
+    # which rest_s: start of the recording; lowest: those in which the channels are lowest together
+    rest: Literal["start", "lowest"] = added("start")
+
+    def check(self) -> None:
+        """Refuse an even median, bounds of the pressure with nothing between them, and a load that would do nothing."""
+        if self.load_trigger is not None and self.trigger != "load":
+            raise UsageError(
+                f"load_trigger is {self.load_trigger:g} and trigger is {self.trigger}; give --trigger load with it."
+            )
+        if self.spike_frames % 2 == 0:
+            raise UsageError(
+                f"spike_frames is {self.spike_frames}; it must be odd, for a reading has as many rows on both sides."
+            )
+        if self.pressure_low > self.pressure_high:
+            raise UsageError(
+                f"pressure_low is {self.pressure_low:g}, above pressure_high, {self.pressure_high:g}; it must be the "
+                f"lower one."
+            )
+
+
+@stage(version=1)
+def slides(params: Params, recording: Recording) -> RecordingOutput:
+    """Cut out the slide of each recording.
+
+    All slides have the same number of frames, and single wrong tactile readings are replaced by a median.
+
+    The slide starts where the static pressure first reaches its trigger, and lasts to the end, however the pressure
+    changes; where the arm was recorded, it lasts while the arm moves. Returns the stream ``slide``, and with an arm
+    ``profile``, its speed, force and phase over the whole recording. A slide that differs from the protocol is marked
+    ``outside_protocol`` and kept. Recordings of sensors without static pressure stay whole, unless ``trigger`` is load:
+    then the slide is where the taxels' mean change from rest exceeds its threshold, and where the arm moves, by its
+    positions if nothing else gives its speed. Of such a slide no protocol is known, and none is checked.
+
+    Example: tacpipe segment slides data/touched -o data/slides
+    """
+    from tacpipe.channels import arm
+    from tacpipe.channels.finger import finger, without_spikes
+    from tacpipe.channels.streams import of_quantity
+    from tacpipe.datasets.streams import streams_of
+    from tacpipe.signals import slides as found
+
+    streams = streams_of(recording)
+    table = finger(recording.name, streams)
+    t_ns = table.column("t_ns").to_numpy()  # (time,)
+    if params.trigger == "load":
+        return _slide_by_load(params, recording.name, streams, table)
+    attributes: dict[str, Attribute]
+    table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, params.spike_count)
+    pressures = of_quantity(table, "static_pressure")
+    if not pressures:
+        notes = [_KEPT_WHOLE.format(len(t_ns))] if len(t_ns) > params.frames else []
+        attributes = {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
+        return RecordingOutput({"slide": table}, attributes, notes)
+    pressure = table.column(pressures[0]).to_numpy()
+    profile = arm.profile(streams, t_ns)
+    try:
+        trigger = found.trigger_row(pressure, params.pressure_trigger)
+        slide = (trigger, len(t_ns))
+        if profile:
+            least_m_s = params.moving_fraction * params.speed_m_s
+            slide = found.sliding_rows(profile["speed_m_s"], trigger, least_m_s, params.steady_frames) or slide
+        first, stop = found.kept_rows(slide, params.frames, params.crop, trigger + params.offset_frames)
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {recording.name}: {error}") from error
+    protocol = found.Protocol(
+        params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
+    )
+    rows = slice(first, stop)
+    described = found.measured(pressure[rows], {name: column[rows] for name, column in profile.items()})
+    why = found.departures(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
+    attributes = {**described, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
+    attributes |= {"outside_protocol": bool(why)} | ({"outside_protocol_why": "; ".join(why)} if why else {})
+    tables = {"slide": table.slice(first, stop - first).combine_chunks()}
+    if profile:
+        tables["profile"] = arm.profile_table(t_ns, pressure, profile, found.phases(len(t_ns), slide))
+    return RecordingOutput(tables, attributes)
+
+
+def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], table: pa.Table) -> RecordingOutput:
+    """Return the slide of a sensor of any unit: the rows in contact, and of these those in which the arm moves."""
+    import numpy as np
+
+    from tacpipe.channels import arm
+    from tacpipe.channels.finger import without_spikes
+    from tacpipe.channels.streams import of_quantity, unit_of
+    from tacpipe.signals import slides as found
+    from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load, noise_thresholds
+
+    t_ns, names = table.column("t_ns").to_numpy(), of_quantity(table, "tactile")
+    values = np.column_stack([table.column(one).to_numpy() for one in names])  # (time, channel)
+    axes = len({(table.field(one).metadata or {}).get(b"axis") for one in names})
+    level, rows = at_rest(params.rest, values, t_ns, params.rest_s)
+    loaded = load(values, level, axes)
+    if params.load_trigger is None:
+        limits = noise_thresholds(values, loaded, t_ns, params.rest_s, rows)
+    else:
+        limits = Thresholds(params.load_trigger, ENDS * params.load_trigger)
+    unit = unit_of(table, names)
+    profile = arm.profile(streams, t_ns, by_place=True)
+    try:
+        touched = found.touched_rows(loaded, limits.on, limits.off, unit)
+        slide = touched
+        if profile:
+            usual_m_s = float(np.nanquantile(profile["speed_m_s"][slice(*touched)], USUAL_SPEED))
+            moving = found.sliding_rows(
+                profile["speed_m_s"][: touched[1]], touched[0], params.moving_fraction * usual_m_s, params.steady_frames
+            )
+            slide = moving or touched
+        first, stop = found.kept_rows(slide, params.frames, params.crop, touched[0] + params.offset_frames)
+    except TacpipeError as error:
+        raise TacpipeError(f"Recording {name}: {error}") from error
+    kept = slice(first, stop)
+    height = params.spike_count if unit == COUNT else limits.on
+    table, spikes = without_spikes(table, params.spike_frames, params.spike_deviations, height)
+    attributes: dict[str, Attribute] = {
+        "load_mean": float(f"{loaded[kept].mean():.4g}"),
+        "load_trigger": float(f"{limits.on:.4g}"),
+        "slide_frames": stop - first,
+        "spikes": int(spikes[kept].sum()),
+        "outside_protocol": False,
+    }
+    if profile and np.isfinite(profile["speed_m_s"][kept]).all():
+        attributes["speed_m_s"] = round(float(np.median(profile["speed_m_s"][kept])), 5)
+    return RecordingOutput({"slide": table.slice(first, stop - first).combine_chunks()}, attributes)

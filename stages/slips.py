@@ -1,0 +1,158 @@
+"""Mark slips and drops of a held object, by its distance from the wrist. All rows stay."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated
+
+from tacpipe.channels.absent import absent, entry
+from tacpipe.channels.pose import METRES
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Unit
+from tacpipe.plugins.stage import stage
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import Times
+    from tacpipe.datasets.dataset import Recording
+
+COUNT = "count"
+EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
+
+
+@dataclass(frozen=True)
+class Params:
+    """What counts as slip and as drop, in the readings of a proximity sensor that looks at the held object.
+
+    Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are
+    taken as so many counts as ``count_per_mm`` makes of them, and never saturate. One millimetre is 8 counts on the
+    published rig, its fingers' patch 25 mm, its noise 0.8 counts and its smallest reading 544.
+    """
+
+    channel: str = ""  # column with the readings; empty for the only one whose quantity is proximity
+    # cut-off of the low-pass filter applied before the rate is computed
+    cutoff_hz: Annotated[PositiveFloat, Unit("Hz")] = 5.0
+    # time after the grasp without slip, from which noise and level are estimated
+    still_s: Annotated[PositiveFloat, Unit("s")] = 0.5
+    on_sigma: PositiveFloat = 5.0  # times the rate's noise, beyond which slip begins
+    off_sigma: PositiveFloat = 2.0  # times the rate's noise, below which it ends
+    on_frames: PositiveInt = 3  # rows that it must be beyond
+    off_frames: PositiveInt = 5  # rows that it must be below
+    # least noise of the rate: a reading's step of one count makes 10 of them
+    noise_floor: Annotated[PositiveFloat, Unit("count/s")] = 3.0
+    # largest change of readings that counts as no change of level
+    level_count: Annotated[PositiveFloat, Unit("count")] = 0.75
+    patch_mm: Annotated[PositiveFloat, Unit("mm")] = 25.0  # slipped distance from which an object is lost
+    count_per_mm: Annotated[PositiveFloat, Unit("count/mm")] = 8.0  # sensitivity of the sensor
+    # largest reading of a lost object: nothing is within the sensor's range
+    saturated_count: Annotated[NonNegativeFloat, Unit("count")] = 544.0
+
+    def check(self) -> None:
+        """Refuse slips that end above where they begin."""
+        if self.off_sigma > self.on_sigma:
+            raise UsageError(
+                f"off_sigma is {self.off_sigma:g}, above on_sigma, {self.on_sigma:g}; a slip must end at or below the rate "
+                f"at which it begins."
+            )
+
+
+@stage(version=2)
+def slips(params: Params, recording: Recording) -> pa.Table:
+    """Mark slips and drops of a held object.
+
+    They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
+    recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each
+    contact is a grasp, and a drop lasts until the next one. Without the column ``contact`` all of the recording is one.
+    Outside of contacts, after a drop and where there is no reading nothing slips.
+
+    Example: tacpipe segment slips data/segments -o data/slips
+    """
+    import numpy as np
+    import pyarrow as pa
+
+    from tacpipe.signals import slip
+
+    table = recording.table()
+    if "slip" in table.column_names:
+        raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
+    channel = _proximity(recording.name, params.channel, table)
+    readings, saturated = table.column(channel).to_numpy().astype(np.float64), params.saturated_count
+    unit = (table.field(channel).metadata or {}).get(b"unit", b"").decode()
+    if unit in METRES:
+        readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
+    elif unit not in (COUNT, ""):
+        raise _no_distance(recording.name, channel, unit, table)
+    t_ns = table.column("t_ns").to_numpy()
+    rate_hz = _rate_hz(recording.name, t_ns)
+    contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
+    still, patch_count = round(params.still_s * rate_hz), params.patch_mm * params.count_per_mm
+    limits = slip.Limits(
+        on_sigma=params.on_sigma,
+        off_sigma=params.off_sigma,
+        on_rows=params.on_frames,
+        off_rows=params.off_frames,
+        noise_floor=params.noise_floor,
+        level_count=params.level_count,
+    )
+    values = slip.filled(readings)
+    labels = {name: np.zeros(len(t_ns), dtype=bool) for name in ("slip", "slip_online", "dropped")}
+    grasps = np.flatnonzero((contact >= 0) & (np.diff(contact, prepend=-1) != 0)).tolist()
+    for rows in (slice(*ends) for ends in pairwise([*grasps, len(t_ns)])):  # each grasp has its own level and noise
+        since, held = values[rows], (contact[rows] >= 0) & np.isfinite(readings[rows])
+        lost = slip.dropped(since, still, patch_count, saturated)
+        known_lost = slip.dropped_online(since, still, patch_count, saturated)
+        labels["dropped"][rows] = lost
+        labels["slip"][rows] = held & ~lost & slip.slip_offline(since, rate_hz, params.cutoff_hz, still, limits)
+        known = slip.slip_online(since, rate_hz, params.cutoff_hz, still, limits)
+        labels["slip_online"][rows] = held & ~known_lost & known
+    for name, marks in labels.items():
+        field = pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})
+        table = table.append_column(field, pa.array(marks.astype(np.int8)))
+    return table
+
+
+def _proximity(name: str, channel: str, table: pa.Table) -> str:
+    """Return the column with the distance of the object."""
+    found: list[str] = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == b"proximity"]
+    if channel:
+        if channel not in table.column_names:
+            raise TacpipeError(
+                f"Recording {name} has no column {channel}; proximity is in {', '.join(found) or 'none'}."
+            )
+        return channel
+    if not found:
+        raise absent(name, "proximity", table.schema, unit="mm")
+    if len(found) != 1:
+        raise TacpipeError(
+            f"Recording {name} has {len(found)} columns whose quantity is proximity, and slip is detected in one. "
+            f"Give a synchronized dataset with such a stream, and choose with `--channel` where there are several."
+        )
+    return found[0]
+
+
+def _no_distance(name: str, channel: str, unit: str, table: pa.Table) -> TacpipeError:
+    """Return the error of a proximity in another unit than counts or a length."""
+    stream = (table.field(channel).metadata or {}).get(b"stream", b"").decode()
+    return TacpipeError(
+        f"Recording {name}: {channel} is in {unit}, and slip is detected in counts or in {', '.join(METRES)}. Set unit in "
+        f"{entry(stream)} of the layout file, with scale where the file has another unit, and ingest again."
+    )
+
+
+def _rate_hz(name: str, t_ns: Times) -> float:
+    """Return how many rows there are a second. Raises `TacpipeError` where their steps are not even."""
+    import numpy as np
+
+    if len(t_ns) < 2:
+        raise TacpipeError(f"Recording {name} has {len(t_ns)} rows; slip shows in two or more. Exclude the recording.")
+    steps_ns = np.diff(t_ns)
+    mean_ns = float(steps_ns.mean())
+    if not mean_ns > 0 or np.abs(steps_ns - mean_ns).max() > EVEN * mean_ns:
+        raise TacpipeError(
+            f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is detected "
+            f"on even ones. Synchronize with `--grid uniform`."
+        )
+    return 1e9 / mean_ns

@@ -1,0 +1,196 @@
+"""Workers that are jobs of Slurm: submitted for one command, with what Dask's configuration requests for a job.
+
+Account, partition, cores, memory, walltime and other directives stand in the section ``jobqueue.slurm`` of Dask's
+configuration, as dask-jobqueue documents; ``slurm://PARTITION`` names another partition. Each job is one worker. Its
+connection is encrypted, with certificates made for the command.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.engine.executors import dask as dask_workers
+from tacpipe.errors import TacpipeError
+from tacpipe.io import terminal
+from tacpipe.plugins import extras
+
+if TYPE_CHECKING:
+    from dask_jobqueue import SLURMCluster
+    from distributed import Client, Security
+
+JOBS = 4  # that are submitted unless --jobs gives another number
+CORES, MEMORY = 1, "4 GiB"  # that a job requests where Dask's configuration states nothing
+SECTION = "jobqueue.slurm"
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # each 1 in Dask's workers unless it is set
+_POLL_S = 0.5
+_SHOWN_S = 5.0  # a wait that is longer is stated
+
+
+@contextlib.contextmanager
+def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
+    """Yield ``jobs`` workers, `JOBS` for 0, each a job in the partition ``address``, or in the configured one.
+
+    It waits for the first of them; others join when Slurm starts them. The jobs are cancelled when the block ends. Raises
+    `TacpipeError` where jobs cannot be submitted or all of them end before one has started work, and
+    `MissingModuleError` without dask-jobqueue.
+    """
+    with extras.named("The executor slurm"), _interrupts():
+        import cryptography  # noqa: F401  (of the certificates)
+        import dask
+        import dask_jobqueue  # noqa: F401  (which adds its defaults to Dask's configuration)
+        from distributed import Client
+
+    jobs = jobs or JOBS
+    with (
+        dask_workers.quiet(),
+        dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
+        tempfile.TemporaryDirectory(prefix="slurm-", dir=_shared(dask.config)) as folder,
+        _submitted(address, jobs, _certified(Path(folder)), Path(folder), dask.config) as cluster,
+        Client(cluster, security=cluster.security, set_as_default=False) as client,  # type: ignore[no-untyped-call]
+    ):
+        _wait(client, _numbers(cluster), Path(folder))
+        yield dask_workers.Dask(client, jobs)
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[None]:
+    """Keep the handler of Ctrl-C: dask-jobqueue replaces it on import by one that ends the process with exit code 0."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _shared(config: Any) -> Path:
+    """Return a folder that jobs see too, for certificates and for what they print: the home's, or the configured one."""
+    given = config.get(f"{SECTION}.shared-temp-directory")
+    folder = Path(given).expanduser() if given else Path.home() / ".cache/tacpipe"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _certified(folder: Path) -> Security:
+    """Return a new certificate and its key, in files that only their owner reads."""
+    from distributed import Security
+
+    made = Security.temporary()  # type: ignore[no-untyped-call]
+    files = {}
+    for field in ("tls_ca_file", "tls_client_key"):
+        path = folder / field
+        path.touch(mode=0o600)
+        path.write_text(getattr(made, field))
+        files[field] = str(path)
+    certificate, key = files.values()
+    roles = {
+        f"tls_{role}_{kind}": path
+        for role in ("client", "scheduler", "worker")
+        for kind, path in (("cert", certificate), ("key", key))
+    }
+    return Security(require_encryption=True, tls_ca_file=certificate, **roles)  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
+def _submitted(address: str, jobs: int, security: Security, folder: Path, config: Any) -> Iterator[SLURMCluster]:
+    """Submit the jobs; cancel them when the block ends."""
+    from dask_jobqueue import SLURMCluster
+
+    def configured(name: str, default: Any) -> Any:
+        found = config.get(f"{SECTION}.{name}")
+        return default if found is None else found
+
+    cores = configured("cores", CORES)
+    cluster = SLURMCluster(
+        queue=address or None,
+        cores=cores,
+        memory=configured("memory", MEMORY),
+        processes=1,
+        nanny=True,  # a worker alone may hang as it closes
+        # one task at a time, on all cores of the job; it is Slurm that limits memory
+        worker_extra_args=[*configured("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
+        job_script_prologue=[*configured("job-script-prologue", []), *(f"export {name}={cores}" for name in _THREADS)],
+        job_name="tacpipe",
+        log_directory=str(folder),
+        protocol="tls://",
+        security=security,
+        scheduler_options={"dashboard": False, "dashboard_address": ":0"},
+        silence_logs=logging.CRITICAL,
+    )
+
+    async def submit() -> None:
+        await cluster
+
+    numbers: Sequence[str] = ()
+    try:
+        while len(cluster.worker_spec) < jobs:  # as `scale` does, which drops what sbatch answers
+            cluster.worker_spec.update(cluster.new_worker_spec())
+        try:
+            cluster.sync(submit)
+        except FileNotFoundError as error:
+            raise TacpipeError(
+                "There is no sbatch on this computer: the executor slurm submits jobs from where Slurm's commands are "
+                "installed, as on a login node."
+            ) from error
+        except RuntimeError as error:
+            raise TacpipeError(f"Slurm refused a job: {_reason(str(error))}") from error
+        numbers = _numbers(cluster)
+        yield cluster
+    finally:
+        if numbers:  # at once: `close` asks worker by worker, and a command that is interrupted ends within a second
+            subprocess.run(["scancel", *numbers], check=False, capture_output=True)
+        with contextlib.suppress(Exception):
+            cluster.close(timeout=None if numbers else 1.0)  # without a worker it waits 10 s
+
+
+def _numbers(cluster: SLURMCluster) -> list[str]:
+    """Return the numbers of the jobs that were submitted."""
+    return [str(job.job_id) for job in cluster.workers.values() if job.job_id]
+
+
+def _reason(text: str) -> str:
+    """Return what sbatch printed, of an error of dask-jobqueue.
+
+    >>> _reason("Exit code: 1\\nCommand:\\nsbatch x\\nstdout:\\n\\nstderr:\\nsbatch: error: invalid partition: x\\n\\n")
+    'invalid partition: x'
+    """
+    printed = text.rpartition("stderr:")[2].strip().splitlines()
+    return "; ".join(line.removeprefix("sbatch: ").removeprefix("error: ") for line in printed) or text
+
+
+def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
+    """Return when one job has begun to work. Raises `TacpipeError` where all have ended before."""
+    began_s, shown = time.monotonic(), False
+    while not client.scheduler_info(n_workers=-1)["workers"]:
+        if not _waiting(numbers):
+            raise TacpipeError(
+                f"No job began to work: {', '.join(numbers)} ended at once. {_printed(folder)} Jobs need Python and tacpipe "
+                f"where this computer has them, and a way to reach it."
+            )
+        if not shown and time.monotonic() - began_s > _SHOWN_S:
+            shown = True
+            terminal.note(f"tacpipe: waiting for Slurm to start one of the jobs {', '.join(numbers)}")
+        time.sleep(_POLL_S)
+
+
+def _waiting(numbers: Sequence[str]) -> bool:
+    """Return whether one of the jobs waits or runs, as far as Slurm answers."""
+    command = ["squeue", "--noheader", "--format=%T", "--jobs", ",".join(numbers)]
+    asked = subprocess.run(command, check=False, capture_output=True, text=True)
+    return asked.returncode != 0 or bool(asked.stdout.strip())
+
+
+def _printed(folder: Path) -> str:
+    """Return the last line that a job printed to standard error, as a sentence."""
+    for file in sorted(folder.glob("*.err")):
+        lines = file.read_text(errors="replace").strip().splitlines()
+        if lines:
+            return f"Its last line was: {lines[-1].strip()}."
+    return "They printed nothing."
