@@ -312,7 +312,7 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             "executor",
             str | None,
             typer.Option(
-                None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT."
+                None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT, slurm."
             ),
         ),
         ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),

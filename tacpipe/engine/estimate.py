@@ -34,7 +34,8 @@ class Estimate:
         noun = "model" if self.models == 1 else "models"
         return (
             f"estimate: {self.models} {noun} to train, {self.at_once} at a time, at most "
-            f"{display.duration(self.each_s)} each alone, {self.hours:.2g} h in all; timed on batches of the first, here and now."
+            f"{display.duration(self.each_s)} each alone, {self.hours:.2g} h in all; timed on batches of the first, "
+            f"here and now."
         )
 
 
