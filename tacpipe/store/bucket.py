@@ -172,7 +172,7 @@ class Bucket:
             self._tried(lambda: obstore.delete(self._client, name))
 
     def _tried(self, request: Callable[[], Result], tries: int = 0) -> Result:
-        """Return what a request gives, made again where the connection or the server fails. Raises `StorageError`."""
+        """Return what a request gives, repeated where the connection or the server fails. Raises `StorageError`."""
         import obstore
         from obstore.exceptions import BaseError
 
@@ -223,7 +223,7 @@ class Bucket:
 
 
 def _may_pass(error: Exception) -> bool:
-    """Return whether a request may succeed when it is made again: not one that the server understood and refused."""
+    """Return whether a request may succeed when it is repeated: not one that the server understood and refused."""
     text = str(error)
     status = _STATUS.search(text)
     lasting = status is not None and status[1][0] == "4" and status[1][:3] not in ("408", "429")

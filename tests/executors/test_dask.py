@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::Depr
         ("dask://cluster.example:8786", "tls://cluster.example:8786"),
         ("tls", "tls://"),
         ("local://8786", "8786"),
-        ("ray", "dask, local, tls"),
+        ("ray", "dask, local, slurm, tls"),
     ],
 )
 def test_a_scheduler_that_must_not_or_cannot_be_reached_is_refused(lab: Lab, address: str, named: str) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
+from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
 from tests.training.networks import NETWORKS, losses, weights
 
 SENSITIVE = ("touch pointnet",)  # normalised by the spread of few grasps, which magnifies what is rounded
@@ -35,7 +35,7 @@ def test_the_precision_is_in_a_key_where_it_is_not_the_default(stage: str) -> No
     def stored(**options: Any) -> dict[str, Any]:
         choice = {"train.forward": "gru", "train.material": "raec", "train.touch": "patches"}[stage]
         return params_of.to_json(
-            params_of.build(stage, registry.load(stage), options={"architecture": choice, **options})
+            given_params.build(stage, registry.load(stage), options={"architecture": choice, **options})
         )
 
     assert stored(precision="float32") == stored()
