@@ -242,7 +242,7 @@ def test_a_disk_that_is_full_while_it_seals_keeps_the_spool_and_it_is_recovered(
     real = os.write
 
     def full(handle: int, data: Any) -> int:
-        if len(data) > 2000 and not _is_spool(handle):
+        if os.fstat(handle).st_size + len(data) > 2000 and not _is_spool(handle):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(handle, data)
 

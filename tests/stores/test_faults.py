@@ -98,7 +98,7 @@ def test_a_push_outlasts_a_fault_of_any_one_request(remotes: Remotes, fault: str
     whole = remotes.next()
     remotes.under(at(0, None), f"store push {whole.address} data/s")
     requests, wanted = remotes.faulty.requests, whole.whole()
-    assert requests > 15 and len(wanted) == 4 + 4
+    assert requests > 15 and len(wanted) == 4 + 5  # objects; records of shards, and of them as a group
     for step in range(1 + len(fault) % every, requests + 1, every):
         place = remotes.next()
         ran = remotes.under(at(step, fault), f"store push {place.address} data/s")

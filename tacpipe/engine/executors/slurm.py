@@ -43,9 +43,9 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
     `MissingModuleError` without dask-jobqueue.
     """
     with extras.named("The executor slurm"), _interrupts():
+        import dask_jobqueue  # noqa: F401, I001  (first: what else is missing comes with it; it adds to Dask's configuration)
         import cryptography  # noqa: F401  (of the certificates)
         import dask
-        import dask_jobqueue  # noqa: F401  (which adds its defaults to Dask's configuration)
         from distributed import Client
 
     jobs = jobs or JOBS
