@@ -11,7 +11,8 @@ import pytest
 from tacpipe.engine.execution import Task
 from tacpipe.engine.executors import agreement, dask
 from tests.conftest import Lab
-from tests.executors.conftest import Apart
+from tests.executors.conftest import GIVE_UP_S, Apart
+from tests.executors.test_ends import begun, records, wait_for_one_more
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 
@@ -121,15 +122,14 @@ def test_what_a_killed_worker_left_another_one_computes(lab: Lab, cluster: Any) 
 def test_a_scheduler_that_ends_is_reported_and_what_was_finished_is_kept(lab: Lab, cluster: Any) -> None:
     lab.run("simulate toy -o data/rec --trials 6 --jobs 1")
     cluster.work("only")
-    import threading
-
-    killer = threading.Timer(2.0, cluster.scheduler.send_signal, [signal.SIGKILL])
-    killer.start()
-    ran = lab.call(f"scale data/rec -o data/out --pause-s 0.7 --executor {cluster.executor}")
-    killer.join()
-    assert ran.code == 1
-    assert cluster.address in ran.err
-    assert "Traceback" not in ran.err
+    before = records(lab)
+    command = begun(lab, f"scale data/rec -o data/out --pause-s 0.7 --executor {cluster.executor}")
+    wait_for_one_more(lab, before)
+    cluster.scheduler.send_signal(signal.SIGKILL)
+    _, printed = command.communicate(timeout=GIVE_UP_S)
+    assert command.returncode == 1
+    assert cluster.address in printed
+    assert "Traceback" not in printed
     again = lab.run("scale data/rec -o data/out --pause-s 0.7 --jobs 1")
     assert " 0 reused" not in again.err
 
