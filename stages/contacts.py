@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tacpipe.channels.absent import absent
+from tacpipe.channels.streams import COUNT, axes_of, unit_of
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
 from tacpipe.plugins.params import added
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Floats
     from tacpipe.datasets.dataset import Recording
     from tacpipe.signals.contact import Thresholds
-
-COUNT = "count"
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,6 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     import numpy as np
     import pyarrow as pa
 
-    from tacpipe.channels.streams import unit_of
     from tacpipe.io.parquet import with_metadata
     from tacpipe.signals.contact import (
         Thresholds,
@@ -106,7 +104,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     _check_levels(params, recording.name, units, fixed)
     for stream, names in sensors.items():
         values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
-        axes = len({(table.field(name).metadata or {}).get(b"axis") for name in names})
+        axes = axes_of(table, names)
         level, rows = at_rest(params.rest, values, t_ns, params.rest_s)
         loads.append(load(values, level, axes))
         if stream in fixed:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from tacpipe.channels.streams import COUNT, axes_of, of_quantity, unit_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import (
     Fraction,
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Recording
 
-COUNT = "count"
 USUAL_SPEED = 0.75  # quantile of the speed in contact: that of the slide, which is most of it
 _KEPT_WHOLE = (
     "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
@@ -108,7 +108,6 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     """
     from tacpipe.channels import arm
     from tacpipe.channels.finger import finger, without_spikes
-    from tacpipe.channels.streams import of_quantity
     from tacpipe.datasets.streams import streams_of
     from tacpipe.signals import slides as found
 
@@ -155,13 +154,12 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], t
 
     from tacpipe.channels import arm
     from tacpipe.channels.finger import without_spikes
-    from tacpipe.channels.streams import of_quantity, unit_of
     from tacpipe.signals import slides as found
     from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load, noise_thresholds
 
     t_ns, names = table.column("t_ns").to_numpy(), of_quantity(table, "tactile")
     values = np.column_stack([table.column(one).to_numpy() for one in names])  # (time, channel)
-    axes = len({(table.field(one).metadata or {}).get(b"axis") for one in names})
+    axes = axes_of(table, names)
     level, rows = at_rest(params.rest, values, t_ns, params.rest_s)
     loaded = load(values, level, axes)
     if params.load_trigger is None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.channels.absent import absent, entry
 from tacpipe.channels.pose import METRES
+from tacpipe.channels.streams import COUNT, of_quantity, unit_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.stage import stage
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Times
     from tacpipe.datasets.dataset import Recording
 
-COUNT = "count"
 EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
 
 
@@ -80,7 +80,7 @@ def slips(params: Params, recording: Recording) -> pa.Table:
         raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
     channel = _proximity(recording.name, params.channel, table)
     readings, saturated = table.column(channel).to_numpy().astype(np.float64), params.saturated_count
-    unit = (table.field(channel).metadata or {}).get(b"unit", b"").decode()
+    unit = unit_of(table, [channel])
     if unit in METRES:
         readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
     elif unit not in (COUNT, ""):
@@ -116,7 +116,7 @@ def slips(params: Params, recording: Recording) -> pa.Table:
 
 def _proximity(name: str, channel: str, table: pa.Table) -> str:
     """Return the column with the distance of the object."""
-    found: list[str] = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == b"proximity"]
+    found = of_quantity(table, "proximity")
     if channel:
         if channel not in table.column_names:
             raise TacpipeError(

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import AnyArray, Indices, Int64s
 
+COUNT = "count"  # the unit of readings as a sensor gives them
 TRUTH = "gt_"  # how columns with ground truth begin
 _GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 
@@ -51,6 +52,11 @@ def unit_of(table: pa.Table, names: Sequence[str]) -> str:
     """Return the unit of columns; the empty text where they have none, or not all the same."""
     units = {(table.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
     return next(iter(units)) if len(units) == 1 else ""
+
+
+def axes_of(table: pa.Table, names: Sequence[str]) -> int:
+    """Return how many axes the taxels of these columns have."""
+    return len({(table.field(name).metadata or {}).get(b"axis") for name in names})
 
 
 def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyArray] | None:

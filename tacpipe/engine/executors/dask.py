@@ -34,6 +34,7 @@ from tacpipe.store.store import Store
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 _MOST = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
 _CONNECT_S = 10
 _POLL_S = 1.0
@@ -152,7 +153,7 @@ def _started(workers: int) -> Iterator[Dask]:
     security = Security.temporary()  # type: ignore[no-untyped-call]
     with (
         quiet(),
-        dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
+        dask.config.set(NO_PAGES),
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=workers,
             threads_per_worker=1,

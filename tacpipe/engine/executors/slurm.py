@@ -51,7 +51,7 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
     jobs = jobs or JOBS
     with (
         dask_workers.quiet(),
-        dask.config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),  # no pages
+        dask.config.set(dask_workers.NO_PAGES),
         tempfile.TemporaryDirectory(prefix="slurm-", dir=_shared(dask.config)) as folder,
         _submitted(address, jobs, _certified(Path(folder)), Path(folder), dask.config) as cluster,
         Client(cluster, security=cluster.security, set_as_default=False) as client,  # type: ignore[no-untyped-call]
