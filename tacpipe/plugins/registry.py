@@ -215,7 +215,7 @@ def _package(target: str) -> str | None:
 
     found = (point.dist for group in GROUPS for point in every(group=group) if point.value == target)
     try:
-        return next((one.name for one in found if one is not None), None)
+        return next((one.metadata["Name"] for one in found if one is not None and "Name" in one.metadata), None)
     except FileNotFoundError:  # once `importlib_metadata` was imported it answers, and raises where metadata is missing
         return None
 
