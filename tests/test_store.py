@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.io.drafts import Draft
 from tacpipe.io.hashing import bytes_digest, digest
-from tacpipe.store.store import MissingError, Store, locate, project
+from tacpipe.store.location import locate, project
+from tacpipe.store.store import MissingError, Store
 
 IDENTITY = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
 EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}

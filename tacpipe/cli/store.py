@@ -12,8 +12,9 @@ from tacpipe.errors import DAMAGED, FAILED, UsageError
 from tacpipe.io import progress, terminal
 from tacpipe.maintenance import garbage
 from tacpipe.printable import plain
+from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED
-from tacpipe.store.store import Store, locate
+from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
     from tacpipe.maintenance.pushed import AnyStore

@@ -21,8 +21,9 @@ from tacpipe.maintenance import pushed, transfer
 from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import projects
+from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED
-from tacpipe.store.store import MissingError, locate
+from tacpipe.store.store import MissingError
 
 SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
 IN_STORE, EARLIER = "pushed here", "pushed earlier"

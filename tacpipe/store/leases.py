@@ -20,6 +20,7 @@ from typing import Any
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.io import progress, regular
 from tacpipe.io.files import read_json, readable_errors, write_all
+from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
@@ -42,6 +43,11 @@ class Run:
     def manifests(self) -> list[str]:
         """The digests of the manifests that it reads."""
         return list(self.note.get("manifests", ()))
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys that it makes, whose records and all they name are kept as they come."""
+        return [key for key in self.note.get("keys", ()) if isinstance(key, str) and DIGEST.fullmatch(key)]
 
 
 class Leases:
