@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io import progress, threads
 from tacpipe.io.drafts import Draft
 from tacpipe.io.files import present
@@ -69,7 +69,6 @@ class CachedStore(Store):
         self._there: dict[str, int | None] = {}  # bytes of objects in the bucket, None for those that it has not
         self._made: set[str] = set()  # objects that were put here, and did not go to the bucket yet
         self._no_record: set[str] = set()  # keys without a record there
-        self._broken: set[str] = set()  # objects that are damaged there
 
     @property
     def place(self) -> str:
@@ -177,15 +176,24 @@ class CachedStore(Store):
                 advance()
 
     def _bring(self, name: str, size: int | None = None) -> None:
-        """Bring an object, verified. Raises `MissingError` where the bucket has not it, or has it damaged."""
+        """Bring an object, verified. Raises `MissingError` where the bucket has not it, or has it damaged.
+
+        What is damaged there twice in a row is moved to quarantine there: then it is missing for everybody, and recomputed.
+        """
         self.prepare()
-        try:
-            self.write_file(self.object_path(name), self.bucket.blocks(name, size), mode=0o444)
-        except MissingError as error:
-            self._there[name] = None
-            if not isinstance(error, AbsentError):
-                self._broken.add(name)
-            raise
+        for last in (False, True):
+            try:
+                self.write_file(self.object_path(name), self.bucket.blocks(name, size), mode=0o444)
+                return
+            except AbsentError:
+                self._there[name] = None
+                raise
+            except MissingError:
+                if last:
+                    self._there[name] = None
+                    with contextlib.suppress(StorageError):  # where it may only be read
+                        self.bucket.quarantine(name)
+                    raise
 
     def read(self, name: str, size: int | None = None) -> bytes:
         """Do as `Store.read`; what is not here, or damaged here, is brought."""
@@ -217,16 +225,11 @@ class CachedStore(Store):
         """Have the bucket keep objects that lie here. Raises `MissingError` for one that is damaged."""
 
         def send(name: str) -> None:
-            path = layout.object_name(name)
-            blocks = _Blocks(self, name)
-            if name in self._broken:
-                self.bucket.files.delete(path)
-            self.bucket.files.create(path, blocks)
+            self.bucket.files.create(layout.object_name(name), _Blocks(self, name))
 
         with self._bar("uploading", len(names)) as advance:
             for name, _ in zip(names, threads.each(send, names, AT_ONCE if len(names) > 1 else 1), strict=True):
                 self._there[name] = os.lstat(self.object_path(name)).st_size
-                self._broken.discard(name)
                 advance()
         self._made.difference_update(names)
 
@@ -327,10 +330,11 @@ class CachedStore(Store):
         unknown = [name for name in sizes if self._there.get(name) != sizes[name]]
         found = self.bucket.sizes(unknown)
         absent = [name for name in unknown if found.get(name) != sizes[name]]
-        self._broken.update(name for name in absent if name in found)
         for name in absent:
             if not self._lies(name):
                 raise AbsentError(f"Object {name[:12]} is neither in {self.place} nor in {self.root}.")
+            if name in found:  # of another size, so it is damaged
+                self.bucket.quarantine(name)
         self._upload(absent)
 
 

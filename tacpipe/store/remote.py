@@ -13,6 +13,7 @@ import itertools
 import json
 import re
 import sys
+import time
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -239,6 +240,10 @@ class RemoteStore:
             yield from self.files.blocks(layout.object_name(name), limit)
         except FileNotFoundError:
             raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None
+
+    def quarantine(self, name: str) -> bool:
+        """Move a damaged object out of the way, for whoever wants to know why; return False where it is gone already."""
+        return self.files.move(layout.object_name(name), f"quarantine/{name}.{time.time_ns()}")
 
     def asides(self, name: str = "") -> Iterator[Entry]:
         """Yield what collections have moved aside of an object, or of all."""
