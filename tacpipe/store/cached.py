@@ -211,12 +211,14 @@ class CachedStore(Store):
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         """Do as `Store.put`; it goes to the bucket with the record or the dataset that names it."""
+        self.prepare()
         made = super().put(content, durable=durable)
         self._made.add(made.digest)
         return made
 
     def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
         """Do as `Store.put_written`; it goes to the bucket as what is put."""
+        self.prepare()
         made = super().put_written(write, durable=durable)
         self._made.add(made.digest)
         return made
@@ -326,10 +328,12 @@ class CachedStore(Store):
         raise TacpipeError(f"{name} is written to {self.place} by others all the time. Run the same command again.")
 
     def _complete(self, sizes: Mapping[str, int]) -> None:
-        """Have the bucket hold objects. Raises `MissingError` for one that is neither there nor here."""
-        unknown = [name for name in sizes if self._there.get(name) != sizes[name]]
-        found = self.bucket.sizes(unknown)
-        absent = [name for name in unknown if found.get(name) != sizes[name]]
+        """Have the bucket hold objects that are announced. Raises `MissingError` for one that is neither there nor here.
+
+        They are looked for also if they were sent: a collection may have come between that and the announcement.
+        """
+        found = self.bucket.sizes(sizes)
+        absent = [name for name in sizes if found.get(name) != sizes[name]]
         for name in absent:
             if not self._lies(name):
                 raise AbsentError(f"Object {name[:12]} is neither in {self.place} nor in {self.root}.")

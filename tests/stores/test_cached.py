@@ -8,11 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
 
+from tacpipe.engine import execution
+from tacpipe.engine.execution import Done, Task
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
 from tacpipe.store import bucket, cached, location
@@ -624,7 +626,7 @@ def test_processes_that_are_killed_while_they_upload_leave_a_bucket_in_which_a_r
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         expect_whole(there.files)  # type: ignore[arg-type]
-        lab.run(command)
+        lab.run(f"{command} --jobs 1")
         assert content(folder) == wanted and set(there.whole()) == whole
         expect_whole(there.files)  # type: ignore[arg-type]
         count("runs killed, in a bucket")
@@ -659,13 +661,32 @@ def test_a_worker_of_dask_reaches_the_bucket_by_its_address_and_keeps_copies_of_
     here = Computers(lab, monkeypatch, "s3://lab/dask/store")
     folder = here.enter("client")
     lab.run("simulate toy -o data/r --trials 6 --rows 3")
-    honest = cached.folder
     assert counts(lab.run("scale data/r -o data/s --factor 2 --executor dask --jobs 2 --json").out) == (6, 0)
     here.enter("other")
     lab.run("simulate toy -o data/r --trials 6 --rows 3")
     lab.run("scale data/r -o data/s --factor 2")
-    assert content(folder) == content(Path.cwd()) and honest is cached.folder
+    assert content(folder) == content(Path.cwd())
     expect_whole(places.bucket(here.address).files)  # type: ignore[arg-type]
+
+
+def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucket(
+    computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest = execution.compute
+
+    def elsewhere(task: Task) -> Done:
+        with monkeypatch.context() as there:
+            there.setenv("TACPIPE_CACHE", str(computers.lab.folder / "worker"))
+            return honest(replace(task, run=""))
+
+    computers.run("first", SIMULATE)
+    with monkeypatch.context() as there:
+        there.setattr(execution, "compute", elsewhere)
+        assert counts(computers.lab.run(f"{SCALE} --json").out) == (3, 0)
+    assert json.loads(computers.lab.run(f"{SCALE} --json").out)["reused"] == 3
+    expect_whole(files)
+    computers.run("second", SIMULATE, SCALE)
+    assert content(computers.lab.folder / "second/project") == content(Path.cwd())
 
 
 def test_a_store_of_another_format_is_refused(computers: Computers, files: Stepping) -> None:
