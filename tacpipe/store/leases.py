@@ -233,7 +233,9 @@ def _wait(path: Path, what: str, timeout_s: float) -> int:
 
 def _holder(path: Path, unknown: str = "Another process") -> str:
     """Return in words who holds a lease, and whether it is stopped."""
-    note = read_json(path)
+    note = None
+    with contextlib.suppress(OSError, TacpipeError):  # who it is helps to know, and nothing rests on it
+        note = read_json(path)
     if not note or "pid" not in note:
         return unknown
     stopped = ", which is stopped: `kill -CONT` lets it continue," if _stopped(note) else ""
@@ -289,6 +291,8 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
         if error.errno in _NO_LOCKS:
             return handle
         os.close(handle)
+        if error.errno == errno.ESTALE:  # another computer of a network file system unlinked it meanwhile
+            return None
         with readable_errors(path.parent):
             raise
     os.close(handle)
