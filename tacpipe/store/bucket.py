@@ -142,13 +142,13 @@ class Bucket:
         """Do as `Backend.list`; what has another form than a store's names is listed too."""
         import obstore
 
-        last: str | None = None
         pages: Iterator[Sequence[Any]] | None = None
+        given: set[str] = set()
 
         def next_page() -> list[Entry]:
             nonlocal pages
             if pages is None:  # the first time, and after each failure
-                pages = iter(obstore.list(self._client, folder, offset=last, chunk_size=PAGE))
+                pages = iter(obstore.list(self._client, folder, chunk_size=PAGE))
             try:
                 page = next(pages, [])
             except BaseException:
@@ -157,8 +157,9 @@ class Bucket:
             return [Entry(one["path"], one["size"], one["last_modified"].timestamp()) for one in page]
 
         while page := self._tried(next_page):  # one request each, so whoever looks at some asks for no more
-            yield from (entry for entry in page if last is None or entry.name > last)
-            last = max(last or "", *(entry.name for entry in page))
+            new = [entry for entry in page if entry.name not in given]
+            given.update(entry.name for entry in new)
+            yield from new
 
     def move(self, name: str, to: str) -> bool:
         """Do as `Backend.move`: a copy, which the server makes, and then a deletion."""

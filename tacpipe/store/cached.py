@@ -291,6 +291,10 @@ class CachedStore(Store):
             self._keep_record(record)
         yield from super().records()
 
+    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Do as `Store.records_of`, of the records that are here: those that this computer looked for."""
+        return super().records()
+
     # ---- datasets
 
     def keep(
