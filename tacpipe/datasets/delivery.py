@@ -16,7 +16,7 @@ from tacpipe.store.store import MissingError, Store
 def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool = False) -> None:
     """Have the bucket behind a store keep what ``directory`` (or one file) is about to show; nothing for a folder.
 
-    Recordings cannot be made again, so they are kept here even if the bucket cannot be reached, and a note reports that.
+    Recordings cannot be recomputed, so they are kept here even if the bucket cannot be reached, and a note reports that.
     Raises `StorageError` for what is computed from others. Call it before the root of the directory is set.
     """
     if not store.distant:
