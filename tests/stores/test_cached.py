@@ -208,6 +208,7 @@ def test_where_there_is_nothing_to_do_nobody_is_asked(computers: Computers, file
     assert files.steps == 0
 
 
+@pytest.mark.long
 def test_a_hit_and_one_new_recording_take_as_many_requests_however_many_recordings_there_are(
     computers: Computers, files: Stepping
 ) -> None:
@@ -227,6 +228,7 @@ def test_a_hit_and_one_new_recording_take_as_many_requests_however_many_recordin
     assert taken[18][0] < 40 and taken[18][1] < 5, taken
 
 
+@pytest.mark.long
 def test_a_hit_elsewhere_takes_one_request_an_object_and_few_more(computers: Computers, files: Stepping) -> None:
     computers.run("first", "simulate toy -o data/r --trials 20 --rows 3 --jobs 1")
     computers.enter("second")
@@ -334,6 +336,7 @@ def test_what_a_collection_took_is_computed_again(computers: Computers, files: S
     expect_whole(files)
 
 
+@pytest.mark.long
 def test_what_was_forgotten_there_and_lies_here_goes_there_again_when_it_is_written(
     computers: Computers, files: Stepping
 ) -> None:
@@ -345,6 +348,7 @@ def test_what_was_forgotten_there_and_lies_here_goes_there_again_when_it_is_writ
     expect_whole(files)
 
 
+@pytest.mark.long
 def test_a_dataset_whose_directory_is_gone_is_forgotten_after_the_grace_and_a_snapshot_is_not(
     computers: Computers, files: Stepping
 ) -> None:
@@ -359,6 +363,7 @@ def test_a_dataset_whose_directory_is_gone_is_forgotten_after_the_grace_and_a_sn
     expect_whole(files)
 
 
+@pytest.mark.long
 def test_an_output_that_is_replaced_leaves_no_snapshot_unless_it_was_pushed(
     computers: Computers, files: Stepping
 ) -> None:
@@ -473,6 +478,7 @@ def test_without_a_link_what_is_shown_is_a_hit_and_anything_else_a_sentence(link
     assert linked.under(off, "show data/s").code == 0
 
 
+@pytest.mark.long
 def test_a_label_is_kept_here_where_there_is_no_link_and_goes_there_with_the_next(linked: Linked) -> None:
     there = linked.next()
     run = linked.computers.lab.run
@@ -489,6 +495,7 @@ def test_a_label_is_kept_here_where_there_is_no_link_and_goes_there_with_the_nex
     expect_whole(there.files)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_credentials_are_in_nothing_that_is_kept_or_printed(linked: Linked) -> None:
     place = linked.next()
     printed = ""
@@ -526,7 +533,7 @@ def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 STEPS = pytest.mark.parametrize(
-    "every", [pytest.param(1, marks=pytest.mark.faults), pytest.param(4, marks=pytest.mark.long), 17]
+    "every", [pytest.param(1, marks=pytest.mark.faults), pytest.param(4, marks=pytest.mark.long)]
 )
 
 
