@@ -38,7 +38,7 @@ for client in a b; do
         -o vers=4.2,addr=$net.1,clientaddr=$net.2,nosharecache $net.1:/ /mnt/$client"
     number=$((number + 1))
 done
-echo "CLIENTS $(cat /proc/fs/nfsd/clients/*/info | grep -ac name:)"
+echo "CLIENTS $(ls /proc/fs/nfsd/clients | wc -w)"
 bash "$SCRATCH/work"
 sync
 echo o >/proc/sysrq-trigger
