@@ -24,7 +24,7 @@ import timing
 
 import tacpipe
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 
 BAR = 0.8
 SHARD_MB = 10

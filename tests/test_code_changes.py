@@ -270,6 +270,7 @@ def test_an_address_is_refused_as_the_store_and_from_python(lab: Lab, monkeypatc
         library.open("s3://bucket/r")
     with pytest.raises(UsageError, match="s3://bucket/x is an address"):
         transfer.push(Path("s3://bucket/x"), [Path("data/r")])
-    monkeypatch.setenv("TACPIPE_STORE", "s3://bucket/store")
-    assert "s3://bucket/store is an address" in lab.call("store status").err
-    assert not Path("s3:").exists()
+    monkeypatch.setenv("TACPIPE_STORE", "ftp://bucket/store")
+    refused = lab.call("store status")
+    assert refused.code == 2 and "ftp://" in refused.err and refused.err.count("\n") == 1
+    assert not Path("s3:").exists() and not Path("ftp:").exists()

@@ -15,8 +15,7 @@ import pytest
 from tacpipe.datasets import adoption, manifest
 from tacpipe.errors import FAILED, StorageError
 from tacpipe.maintenance import checkout, garbage, pushed, repair, unnamed
-from tacpipe.store import layout, projects, records
-from tacpipe.store import store as stores
+from tacpipe.store import layout, location, projects, records
 from tacpipe.store.store import Store
 from tests.conftest import Lab
 from tests.test_garbage import age
@@ -210,8 +209,8 @@ def test_a_limit_that_a_write_meets_names_the_command_that_raises_it(full: Lab, 
 def test_a_mark_that_cannot_be_looked_at_chooses_no_other_store(full: Lab, number: int) -> None:
     below = full.folder / "data/s"
     with failing(number, lambda path: path.endswith(".tacpipe"), ("lstat",)), pytest.raises(StorageError):
-        stores.project(below)
-    assert stores.project(below) == full.folder
+        location.project(below)
+    assert location.project(below) == full.folder
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE], ids=names)

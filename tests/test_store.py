@@ -1,3 +1,5 @@
+import errno
+import fcntl
 import json
 import os
 import threading
@@ -10,7 +12,8 @@ from hypothesis import strategies as st
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.io.drafts import Draft
 from tacpipe.io.hashing import bytes_digest, digest
-from tacpipe.store.store import MissingError, Store, locate, project
+from tacpipe.store.location import locate, project
+from tacpipe.store.store import MissingError, Store
 
 IDENTITY = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
 EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}
@@ -144,6 +147,24 @@ def test_leases_let_one_at_a_time_through(store: Store) -> None:
     for thread in threads:
         thread.join()
     assert most == 1
+
+
+def test_a_lease_that_another_computer_unlinked_meanwhile_is_taken_anew(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest, gone = fcntl.flock, [errno.ESTALE, errno.ESTALE]  # as a network file system answers
+
+    def flock(handle: int, operation: int) -> None:
+        if gone:
+            raise OSError(gone.pop(), "Stale file handle")
+        honest(handle, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with store.leases.hold("ab" * 32, timeout_s=5):
+        assert not gone
+    gone.append(errno.ESTALE)
+    with store.at_work():
+        assert not gone
 
 
 def test_a_process_that_died_holds_no_lease(store: Store) -> None:

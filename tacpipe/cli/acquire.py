@@ -76,9 +76,9 @@ def add(program: typer.Typer, summary: str) -> None:
     ) -> None:
         from tacpipe.recording import rig as rig_of
         from tacpipe.recording import trials as trials_of
-        from tacpipe.store import store as stores
+        from tacpipe.store.location import locate
 
-        store = stores.locate()
+        store = locate()
         if rig is None and not recover:
             raise UsageError("acquire needs a rig file, as in `tacpipe acquire rig.toml -o data/recordings`.")
         found = rig_of.read(rig) if rig is not None else None

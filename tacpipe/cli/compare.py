@@ -16,7 +16,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.io.tables import Group, Row, Table
 from tacpipe.metrics import headline
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 
 if TYPE_CHECKING:
     from tacpipe.comparison.engine import Comparison

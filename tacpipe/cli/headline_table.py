@@ -12,7 +12,7 @@ from tacpipe.io.tables import Group, Row, Table
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline
 from tacpipe.plugins import params as params_of
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 
 EMPTY = "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
 

@@ -20,7 +20,7 @@ from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ROLES
 from tacpipe.recording import ending
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 
 SHOWN = 20  # recordings listed before the rest is counted
 _TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings

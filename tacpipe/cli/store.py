@@ -12,8 +12,9 @@ from tacpipe.errors import DAMAGED, FAILED, UsageError
 from tacpipe.io import progress, terminal
 from tacpipe.maintenance import garbage
 from tacpipe.printable import plain
+from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED
-from tacpipe.store.store import Store, locate
+from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
     from tacpipe.maintenance.pushed import AnyStore
@@ -45,11 +46,20 @@ def add(program: typer.Typer, summary: str) -> None:
 def status(as_json: AsJson = False) -> None:
     """Show the place, size and roots of the store.
 
+    Of a store in a bucket also the folder here that is in front of it.
+
     Example: tacpipe store status
     """
     from tacpipe.maintenance import repair as upkeep
 
-    value = upkeep.status(locate())
+    store = locate()
+    if store.distant:
+        from tacpipe.maintenance import cache
+
+        value = cache.status(cache.distant(store))
+        _print(value, as_json=as_json, text=cache.status_text(value))
+        return
+    value = upkeep.status(store)
     _print(value, as_json=as_json, text=upkeep.status_text(value))
 
 
@@ -60,10 +70,10 @@ def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
 
     Example: tacpipe store list
     """
+    from tacpipe.maintenance import cache, transfer
     from tacpipe.maintenance import checkout as checkouts
-    from tacpipe.maintenance import transfer
 
-    listed = checkouts.known(locate() if store is None else transfer.remote_store(store))
+    listed = checkouts.known(cache.behind(locate()) if store is None else transfer.remote_store(store))
     _print(checkouts.to_json(listed), as_json=as_json, text=checkouts.to_text(listed))
 
 
@@ -97,11 +107,14 @@ def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
 
     Example: tacpipe store verify --remote s3://lab/store
     """
-    from tacpipe.maintenance import remote_upkeep, transfer
+    from tacpipe.maintenance import cache, remote_upkeep, transfer
     from tacpipe.maintenance import repair as upkeep
 
     store = locate() if remote is None else transfer.remote_store(remote)
-    found = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
+    if isinstance(store, Store) and store.distant:
+        found = cache.verify(cache.distant(store))
+    else:
+        found = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
     _print(asdict(found), as_json=as_json, text=found.to_text())
     if found.damaged or found.missing or found.lost:
         raise typer.Exit(DAMAGED)
@@ -117,7 +130,13 @@ def repair(as_json: AsJson = False) -> None:
     """
     from tacpipe.maintenance import repair as upkeep
 
-    found = upkeep.repair(locate())
+    store = locate()
+    if store.distant:
+        raise UsageError(
+            f"{store.place} is a bucket: a stage that needs an object that is damaged there recomputes and replaces it, "
+            f"and `tacpipe store push --verify`, from where it is sound, replaces it too."
+        )
+    found = upkeep.repair(store)
     _print(asdict(found), as_json=as_json, text=found.to_text())
     if found.lost:
         raise typer.Exit(DAMAGED)
@@ -143,6 +162,9 @@ def gc(
         list[str] | None, typer.Option("--forget", help="Dataset, pushed or deleted, to keep no longer.")
     ] = None,
     remote: AtRemote = None,
+    cache: Annotated[
+        bool, typer.Option("--cache", help="Remove from this computer alone what the bucket of TACPIPE_STORE has too.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Remove stored objects that nothing needs.
@@ -154,9 +176,14 @@ def gc(
     from tacpipe.maintenance import remote_upkeep, transfer
 
     store = locate() if remote is None else transfer.remote_store(remote)
-    _forget(store, forget or [], dry_run=dry_run)
-    collect = garbage.collect if isinstance(store, Store) else remote_upkeep.collect
-    found = collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)  # type: ignore[arg-type]
+    if isinstance(store, Store) and store.distant:
+        found = _collect_distant(store, forget or [], dry_run, recordings, grace_days, cache=cache)
+    elif cache:
+        raise UsageError(f"--cache is for a store in a bucket, and {store.place} has no folder in front of it.")
+    else:
+        _forget(store, forget or [], dry_run=dry_run)
+        collect = garbage.collect if isinstance(store, Store) else remote_upkeep.collect
+        found = collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)  # type: ignore[arg-type]
     verb = "would remove" if dry_run else "removed"
     text = (
         f"{verb} {found.objects} objects ({found.bytes / 1e6:.1f} MB), {found.records} records, {found.drafts} drafts"
@@ -164,6 +191,20 @@ def gc(
     if found.kept_recordings:
         text += f"; kept {found.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
     _print(asdict(found), as_json=as_json, text=text)
+
+
+def _collect_distant(
+    store: Store, forget: list[str], dry_run: bool, recordings: bool, grace_days: float, *, cache: bool
+) -> garbage.Collected:
+    from tacpipe.maintenance import cache as caches
+
+    distant = caches.distant(store)
+    if cache:
+        if forget or recordings:
+            raise UsageError("--cache removes copies alone; give --forget and --recordings without it.")
+        return caches.clear(distant, dry_run=dry_run)
+    _forget(distant.bucket, forget, dry_run=dry_run)
+    return caches.collect(distant, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
 
 
 def _forget(store: AnyStore, names: list[str], *, dry_run: bool) -> None:

@@ -10,7 +10,7 @@ from tacpipe.cli import identities
 from tacpipe.datasets import manifest
 from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 from tacpipe.trackers import tracker, tracking
 from tacpipe.trackers.tracking import CONFIG, HISTORY, Tracking
 

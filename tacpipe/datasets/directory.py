@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import adoption, replacing
+from tacpipe.datasets.delivery import deliver
 from tacpipe.datasets.manifest import NAME, Manifest, parse
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular
@@ -40,6 +41,7 @@ def publish(store: Store, manifest: Manifest, directory: Path) -> None:
     """Make ``directory`` show ``manifest``, as `change` does; where it does already, only its root is set again."""
     directory = directory.absolute()
     if shows(store, manifest, directory):
+        deliver(store, directory, manifest)
         store.roots.set(directory, bytes_digest(manifest.content))
         return
     change(store, directory, lambda: Change(manifest))
@@ -97,7 +99,9 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
         if before is not None and lasting:
             adoption.adopt(store, directory, before)
+        deliver(store, directory, manifest, lasting=lasting)
         store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
+        store.fetch(objects[path] for path in stale)
         sweep(directory, shards=bool(stale), deep=manifest.exported)
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):

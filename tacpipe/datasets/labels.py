@@ -14,7 +14,7 @@ from tacpipe.datasets.manifest import Found, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 
 _NAMED = 5  # recordings that a refusal names
 

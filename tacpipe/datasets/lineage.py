@@ -12,7 +12,8 @@ from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed
 from tacpipe.store import records
-from tacpipe.store.store import Store, locate
+from tacpipe.store.location import locate
+from tacpipe.store.store import Store
 
 _SHOWN = 5  # names listed before the rest is counted
 

@@ -39,8 +39,13 @@ class ByRecording:
         entries, name, stage = given.included, step["stage"], execution.stage_of(step["stage"])
         found: dict[str, Entry] = {}
         unknown: list[tuple[dict[str, Any], list[str]]] = []
+
+        def identity_of(group: Sequence[str]) -> dict[str, Any]:
+            return keys.of_group(step, stage, {one: entries[one] for one in group})
+
+        self.store.expect(digest(identity_of(group)) for group in keys.groups(entries))
         for group in keys.groups(entries):
-            identity = keys.of_group(step, stage, {one: entries[one] for one in group})
+            identity = identity_of(group)
             record = None if self.request.compare or self._reruns(name) else self.store.record(digest(identity))
             if record is None or not records.complete(self.store, record):
                 unknown.append((identity, group))
@@ -75,6 +80,7 @@ class ByRecording:
         found: dict[str, Mapping[str, Any]] = {}
         missing: list[Task] = []
         rerun = self._reruns(name)
+        self.store.expect(digest(task.identity) for task in tasks)
         for task in tasks:
             record = self.store.record(digest(task.identity))
             if record is not None and not rerun and records.complete(self.store, record):

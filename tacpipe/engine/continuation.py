@@ -12,7 +12,7 @@ from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 
 
 def continued(recordings: Dataset, model: Dataset) -> Dataset:

@@ -12,7 +12,7 @@ from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest
-from tacpipe.store.store import locate
+from tacpipe.store.location import locate
 from tacpipe.training import display, following
 from tacpipe.training.following import Line, Network
 

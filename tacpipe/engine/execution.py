@@ -27,6 +27,7 @@ from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
+from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import devices, display, following
 from tacpipe.training.devices import Compute
@@ -38,7 +39,7 @@ ALONE = "no network was trained, so one process computed it, whatever --devices 
 class Task:
     """One key to make: all that a worker process needs."""
 
-    store: str
+    store: str  # its path or address
     name: str  # of the stage
     identity: Mapping[str, Any]
     recording: str = ""
@@ -75,7 +76,7 @@ class Done:
 
 def compute(task: Task) -> Done:
     """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
-    store, key = Store(task.store, task.run), digest(task.identity)
+    store, key = opened(task.store, task.run), digest(task.identity)
     try:
         with devices.given(task.compute), rank_processes.available(task.to_text(), task.compute) as crew:
             return _computed(task, store, key, crew)
@@ -221,11 +222,11 @@ class _Reader:
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reader_at, (str(self._store.root), self._beside, dict(self._sizes))
+        return _reader_at, (self._store.place, self._beside, dict(self._sizes))
 
 
-def _reader_at(root: str, beside: tuple[str, ...], sizes: Mapping[str, int]) -> _Reader:
-    return _Reader(Store(root), beside, sizes)
+def _reader_at(place: str, beside: tuple[str, ...], sizes: Mapping[str, int]) -> _Reader:
+    return _Reader(opened(place), beside, sizes)
 
 
 def reader(
@@ -269,7 +270,7 @@ def _remake(store: Store, name: str, path: str, why: str, size: int | None = Non
         try:
             with store.leases.hold(key, f"{identity['stage']}, for {path}"):
                 if not store.has(name, size):  # else another process has made it again
-                    execute(Task(str(store.root), identity["stage"], identity, run=store.run), store, store)
+                    execute(Task(store.place, identity["stage"], identity, run=store.run), store, store)
         except TacpipeError as error:
             if error.exit_code != FAILED:
                 raise
@@ -313,8 +314,10 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
         if kind == "Recording":
             found[name] = Recording(task.recording, inputs[name], read)
         elif kind in ("Dataset", "Model", "Parts"):
+            store.fetch(_named(inputs[name] or {}))
             found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
+            store.fetch(name for value in inputs[name] for name in _named(value))
             found[name] = tuple(_dataset(value, read) for value in inputs[name])
         elif kind == "Fitted":
             found[name] = {file: read(value, file) for file, value in inputs[name].items()}
@@ -351,6 +354,12 @@ def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Itera
         return
     with display.on_stderr(registry.whole(name), workspace) as shown, following.in_workspace(workspace, *shown):
         yield
+
+
+def _named(value: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the digests of shards and files of a dataset, as an identity has it."""
+    yield from (shard["digest"] for one in value.get("recordings", {}).values() for shard in one["shards"].values())
+    yield from value.get("files", {}).values()
 
 
 def _dataset(value: Mapping[str, Any], read: Callable[[str, str], bytes]) -> Dataset:

@@ -90,7 +90,7 @@ def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: 
     def task(name: str, entry: Entry) -> Task:
         inputs = {recording: of_recording(entry, stage.reads or ()), **fitted, **({named: name} if named else {})}
         wanted = identity(step["stage"], stage.version, step["params"], inputs)
-        return Task(str(store.root), step["stage"], wanted, name, beside=beside)
+        return Task(store.place, step["stage"], wanted, name, beside=beside)
 
     return [task(name, entry) for name, entry in sorted(given.included.items())]
 
@@ -114,9 +114,7 @@ def source_tasks(
         if called is not None:
             inputs[called] = recording
         named = identity(name, stage.version, params, inputs)
-        return Task(
-            str(store.root), name, named, recording, files={file: str(path) for file, path in source.files.items()}
-        )
+        return Task(store.place, name, named, recording, files={file: str(path) for file, path in source.files.items()})
 
     return [task(recording, source) for recording, source in sources.items()]
 
@@ -128,7 +126,7 @@ def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[T
     width = max(3, len(str(count - 1)))
     return [
         Task(
-            str(store.root),
+            store.place,
             name,
             identity(name, stage.version, params, {argument: number}),
             f"trial-{number:0{width}d}",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from tacpipe.datasets import directory, replacing
+from tacpipe.datasets.delivery import deliver
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine.request import Request
 from tacpipe.errors import DamagedError, UsageError, WouldChangeError
@@ -150,6 +151,7 @@ class _Directory(_Place):
 
     def publish(self, made: Manifest) -> Manifest:
         if not made.recorded and directory.shows(self.store, made, self.path):
+            deliver(self.store, self.path, made)
             self.store.roots.set(self.path, bytes_digest(made.content))
             return made
 
@@ -197,6 +199,7 @@ class _File(_Place):
             if not self.path.exists() or file_digest(self.path) != wanted:
                 directory.sweep_beside(self.path)
                 directory.place(self.store, wanted, self.path, copy=True)
+            deliver(self.store, self.path, made)
             self.store.roots.set(self.path, bytes_digest(made.content))
         return made
 

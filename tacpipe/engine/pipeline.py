@@ -26,7 +26,8 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ORIGINALS, ROLES
 from tacpipe.store import records
-from tacpipe.store.store import MissingError, Store, locate
+from tacpipe.store.location import locate
+from tacpipe.store.store import MissingError, Store
 from tacpipe.trackers import tracker, tracking
 from tacpipe.trackers.tracker import Tracker
 from tacpipe.training import following
@@ -300,6 +301,7 @@ class _Run:
 
     def _whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:
         """Return the result of a key over whole datasets, from the store or by running the stage."""
+        self.store.expect([digest(identity)])
         record = self.store.record(digest(identity))
         known = record is not None and records.complete(self.store, record)
         if record is not None and known and not self.request.compare and not self.request.rerun:
@@ -310,7 +312,7 @@ class _Run:
         if self.request.check:
             raise WouldChangeError(f"{name} would run: there is no result for these inputs and params.")
         task = Task(
-            str(self.store.root),
+            self.store.place,
             name,
             identity,
             beside=self.inputs.beside,

@@ -14,7 +14,7 @@ from typing import Any
 from tacpipe.engine import execution, rank_processes
 from tacpipe.errors import FAILED, TacpipeError
 from tacpipe.io import processes, progress
-from tacpipe.store.store import Store
+from tacpipe.store.location import opened
 from tacpipe.training import devices
 
 _LATER_S = 1.0  # than a rank whose end is the reason for an error of the connection to it
@@ -64,7 +64,7 @@ def _compute(text: str, rank: int, size: int, local: int, meet: Callable[[], Any
     from tacpipe.training import ranks
 
     task = execution.task_of(text)
-    store = Store(task.store)
+    store = opened(task.store)
     try:
         with (
             progress.shown(False),

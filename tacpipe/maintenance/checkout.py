@@ -17,12 +17,13 @@ from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, bytes_digest
-from tacpipe.maintenance import pushed, transfer
+from tacpipe.maintenance import cache, pushed, transfer
 from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import projects
+from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED
-from tacpipe.store.store import MissingError, locate
+from tacpipe.store.store import MissingError
 
 SHOWN, REPLACED, GONE, UNREAD = "at its path", "replaced", "directory gone", "cannot be read"
 IN_STORE, EARLIER = "pushed here", "pushed earlier"
@@ -124,6 +125,8 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
     ``replace``; `DamagedError` if something of it is damaged and cannot be computed again.
     """
     store = locate()
+    if source is None and store.distant:
+        source = cache.behind(store)
     wanted = _named(source or store, name)
     with store.at_work([wanted]):
         content = (source or store).read(wanted, regular.JSON_BYTES)

@@ -71,12 +71,12 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         path = Path(root["path"])
         here, reached = None, root["kind"] == PUSHED
         if not reached:
-            here, reached = _content(path)
+            here, reached = content(path)
         if here is not None:
             _expect_sound(here, path)
             contents[bytes_digest(here)] = here
             wanted.append(bytes_digest(here))
-        expired = _expired(store, root, grace_days, reached=reached, dry_run=dry_run)
+        expired = has_expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
         if root["kind"] == PUSHED:  # each push is a snapshot, kept until it is forgotten
@@ -250,7 +250,7 @@ def ancestors(manifest: manifest_of.Manifest) -> list[str]:
     return [given["manifest"] for several in manifest.inputs.values() for given in several]
 
 
-def _content(path: Path) -> tuple[bytes | None, bool]:
+def content(path: Path) -> tuple[bytes | None, bool]:
     """Return the manifest that lies at a root's path, None if there is none; and whether the path is there.
 
     A path of which the system states no more than that it failed counts as there: an error is not an absence.
@@ -276,7 +276,7 @@ def _expect_sound(content: bytes, path: Path) -> None:
         ) from None
 
 
-def _expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
+def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:
     """Return whether a root's path has been out of reach for the whole grace.
 
     The first look that does not reach it starts the clock, and one that reaches it stops the clock.

@@ -213,6 +213,7 @@ def _needed(store: RemoteStore) -> _Needed:
     for _, run in store.runs().values():
         needed.objects |= run.objects
         wanted += run.manifests
+        needed.objects |= {name for _, record in store.records(run.keys) for name in named(record["result"])}
     for root in store.roots.all():
         wanted += [str(one["manifest"]) for one in (root, *root.get("history", []))]
     damaged = store.roots.damaged()

@@ -14,14 +14,16 @@ from typing import Any
 from tacpipe import printable
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets.delivery import deliver
 from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import readable_errors, walk, write_whole
 from tacpipe.io.hashing import bytes_digest, file_digest
 from tacpipe.printable import plain
 from tacpipe.store import layout
+from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED
-from tacpipe.store.store import AbsentError, MissingError, Store, locate
+from tacpipe.store.store import AbsentError, MissingError, Store
 
 _SHOWN = 10  # foreign files listed before the rest is counted
 _COUNTED = ("objects", "records", "quarantine", "tmp", "checkpoints")  # folders that the status measures
@@ -195,6 +197,7 @@ def link(path: Path) -> int:
             for name, digest in stale:
                 directory_of.place(store, digest, directory / name, copy=manifest.recorded)
         store.put(found.content)
+        deliver(store, directory.absolute(), manifest)
         store.roots.set(directory.absolute(), found.digest)
     return len(stale)
 

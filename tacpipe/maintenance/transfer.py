@@ -21,10 +21,11 @@ from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import addresses, layout, projects, records
 from tacpipe.store.bucket import Bucket
+from tacpipe.store.location import locate
 from tacpipe.store.projects import Project
 from tacpipe.store.remote import RemoteStore
 from tacpipe.store.roots import Root, project_id
-from tacpipe.store.store import MissingError, Store, locate
+from tacpipe.store.store import MissingError, Store
 
 _LOOKS = 100  # pushes of one name that may come first
 

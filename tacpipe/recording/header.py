@@ -16,7 +16,7 @@ from typing import Any
 from tacpipe.datasets import manifest
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt
-from tacpipe.store import store
+from tacpipe.store import location
 from tacpipe.store.roots import BESIDE_NAME
 from tacpipe.store.store import Store
 
@@ -94,7 +94,7 @@ def _project(beside: Store) -> Path | None:
 def _projects(beside: Store) -> list[Path]:
     """Return where a spool's dataset may lie; relative paths begin at the first one."""
     project = _project(beside)
-    here = store.project()
+    here = location.project()
     return [here] if project is None or project == here else [project, here]
 
 

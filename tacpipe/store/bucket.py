@@ -7,7 +7,7 @@ import random
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import timedelta
 from itertools import chain
@@ -26,6 +26,7 @@ TRIES = 5  # of one request
 RETRIES = 2  # of the client, within each of these
 PAUSE_S = 0.2  # after the first; four times longer after each
 PART_BYTES = 8 << 20  # an object up to this size is one request
+PAGE = 1000  # names that one request lists
 _AHEAD = 4  # parts of one object on their way at once
 _LARGE = 4  # objects of several parts on their way at once, which bounds memory to 128 MB
 _COPY_BYTES = 5 * 10**9  # the largest object that S3 copies by itself
@@ -141,11 +142,24 @@ class Bucket:
         """Do as `Backend.list`; what has another form than a store's names is listed too."""
         import obstore
 
-        def found() -> list[Entry]:
-            pages = obstore.list(self._client, folder)
-            return [Entry(one["path"], one["size"], one["last_modified"].timestamp()) for page in pages for one in page]
+        pages: Iterator[Sequence[Any]] | None = None
+        given: set[str] = set()
 
-        yield from self._tried(found)
+        def next_page() -> list[Entry]:
+            nonlocal pages
+            if pages is None:  # the first time, and after each failure
+                pages = iter(obstore.list(self._client, folder, chunk_size=PAGE))
+            try:
+                page = next(pages, [])
+            except BaseException:
+                pages = None
+                raise
+            return [Entry(one["path"], one["size"], one["last_modified"].timestamp()) for one in page]
+
+        while page := self._tried(next_page):  # one request each, so whoever looks at some asks for no more
+            new = [entry for entry in page if entry.name not in given]
+            given.update(entry.name for entry in new)
+            yield from new
 
     def move(self, name: str, to: str) -> bool:
         """Do as `Backend.move`: a copy, which the server makes, and then a deletion."""

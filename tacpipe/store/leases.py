@@ -20,6 +20,7 @@ from typing import Any
 from tacpipe.errors import LockedError, TacpipeError
 from tacpipe.io import progress, regular
 from tacpipe.io.files import read_json, readable_errors, write_all
+from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
 
 LOCK_TIMEOUT_S = 3600.0  # TACPIPE_LOCK_TIMEOUT_S overrides it
@@ -42,6 +43,11 @@ class Run:
     def manifests(self) -> list[str]:
         """The digests of the manifests that it reads."""
         return list(self.note.get("manifests", ()))
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys that it makes, whose records and all they name are kept as they come."""
+        return [key for key in self.note.get("keys", ()) if isinstance(key, str) and DIGEST.fullmatch(key)]
 
 
 class Leases:
@@ -227,7 +233,9 @@ def _wait(path: Path, what: str, timeout_s: float) -> int:
 
 def _holder(path: Path, unknown: str = "Another process") -> str:
     """Return in words who holds a lease, and whether it is stopped."""
-    note = read_json(path)
+    note = None
+    with contextlib.suppress(OSError, TacpipeError):  # who it is helps to know, and nothing rests on it
+        note = read_json(path)
     if not note or "pid" not in note:
         return unknown
     stopped = ", which is stopped: `kill -CONT` lets it continue," if _stopped(note) else ""
@@ -283,6 +291,8 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
         if error.errno in _NO_LOCKS:
             return handle
         os.close(handle)
+        if error.errno == errno.ESTALE:  # another computer of a network file system unlinked it meanwhile
+            return None
         with readable_errors(path.parent):
             raise
     os.close(handle)

@@ -13,7 +13,8 @@ from tacpipe.errors import DamagedError, StorageError
 from tacpipe.io import regular
 from tacpipe.io.files import may_not_write, readable_errors
 from tacpipe.io.hashing import digest
-from tacpipe.store.store import Store, marked
+from tacpipe.store.location import marked
+from tacpipe.store.store import Store
 
 FOLDER = "projects"  # within the store
 _FILE_BYTES = 1 << 16  # the largest identity that is read

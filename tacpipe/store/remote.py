@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import re
 import sys
+import time
 import uuid
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,11 @@ from tacpipe.store.store import AbsentError, MissingError, Object, most, record_
 
 AT_ONCE = 16  # requests on their way at once
 SNAPSHOTS = "snapshots"  # which records belong to which manifest, so that a pull need not read all
-_LISTED = 10  # objects of one shelf from which on the shelf is listed: S3 takes as much for a list as for 12 looks
+_LISTED = 12  # looks that cost as much as a list of 1,000 names, on S3
+_PAGE = 1000  # names that a list gives for one request
+_OUTPUT = "output"  # whether a command wrote it, which worked on the bucket as its own store
 _NUMBER = "number"  # of the version that a root was read from; it is not kept
+_TRIES = 10  # to replace a record, of several who do
 _VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
 
 
@@ -104,20 +108,25 @@ class RemoteStore:
                     f"what was there already. Run the same command again."
                 )
         finally:
-            for name in self._leases:
-                with contextlib.suppress(TacpipeError):  # one that stays is removed by a later collection
+            with contextlib.suppress(TacpipeError):  # what stays is removed by a later collection
+                for name in self._leases:
                     self.files.delete(name)
             self._leases, self._announced = [], set()
 
-    def announce(self, names: Iterable[str]) -> None:
-        """Announce objects to collections; whoever reuses one does so before looking whether it is there."""
+    def announce(self, names: Iterable[str], *, manifests: Iterable[str] = (), keys: Iterable[str] = ()) -> None:
+        """Announce objects to collections; whoever reuses one does so before looking whether it is there.
+
+        Of ``manifests`` all is announced that they name, and of ``keys`` what their records name as soon as these are there.
+        """
         new = sorted(set(names) - self._announced)
-        if not new:
+        several, made = sorted({*manifests} - {*self._manifests}), sorted(set(keys) - self._announced)
+        if not (new or several or made):
             return
         name = f"leases/run-{uuid.uuid4().hex}.lock"
         self._leases.append(name)
-        self.files.create(name, b"\n".join([leases.note(manifests=self._manifests), *(one.encode() for one in new)]))
-        self._announced.update(new)
+        stated = leases.note(manifests=[*self._manifests, *several], **({"keys": made} if made else {}))
+        self.files.create(name, b"\n".join([stated, *(one.encode() for one in new)]))
+        self._announced.update(new, made)
 
     def runs(self) -> dict[str, tuple[Entry, Run]]:
         """Return what is announced now, by its name, with what the place states of it."""
@@ -136,23 +145,34 @@ class RemoteStore:
 
     def sizes(self, names: Collection[str]) -> dict[str, int]:
         """Return the bytes of those objects that are there."""
-        shelves = defaultdict(list)
-        for name in names:
-            shelves[layout.object_name(name).rpartition("/")[0]].append(name)
-        wanted = set(names)
-        looks: list[str] = []
-        for shelf, several in shelves.items():
-            looks += [shelf] if len(several) > _LISTED else [layout.object_name(name) for name in several]
-        found = threads.each(lambda look: self._look(look, wanted), looks, AT_ONCE)
-        return {name: size for some in found for name, size in some}
+        found = self._looked("objects", {layout.object_name(name): name for name in names})
+        return {name: entry.bytes for name, entry in found.items()}
 
-    def _look(self, name: str, wanted: set[str]) -> list[tuple[str, int]]:
-        """Return name and size of the wanted objects in a shelf, or of one object."""
-        if DIGEST.fullmatch(Path(name).name):
-            entry = self.files.stat(name)
-            return [] if entry is None else [(Path(name).name, entry.bytes)]
-        entries = ((Path(entry.name).name, entry.bytes) for entry in self.files.list(name))
-        return [(one, size) for one, size in entries if one in wanted]
+    def present(self, keys: Iterable[str]) -> set[str]:
+        """Return those keys that have a record, sound or not."""
+        return set(self._looked("records", {layout.record_name(key): key for key in keys}))
+
+    def _looked(self, folder: str, wanted: Mapping[str, str]) -> dict[str, Entry]:
+        """Return what the place states of those names (values) that lie at a path (keys) of a folder.
+
+        The folder is listed for as long as that costs no more than a look at each; the rest is looked at.
+        """
+        found: dict[str, Entry] = {}
+        left = dict(wanted)
+        if len(left) > _LISTED:
+            listing = self.files.list(folder)
+            budget = _PAGE * (len(left) // _LISTED)
+            for entry in itertools.islice(listing, budget):
+                name = left.pop(entry.name, None)
+                if name is not None:
+                    found[name] = entry
+                budget -= 1
+                if not left:
+                    return found
+            if budget > 0:  # that was all
+                return found
+        entries = threads.each(self.files.stat, left, AT_ONCE)
+        return found | {left[path]: entry for path, entry in zip(left, entries, strict=True) if entry is not None}
 
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
@@ -221,6 +241,10 @@ class RemoteStore:
         except FileNotFoundError:
             raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None
 
+    def quarantine(self, name: str) -> bool:
+        """Move a damaged object out of the way, for whoever wants to know why; return False where it is gone already."""
+        return self.files.move(layout.object_name(name), f"quarantine/{name}.{time.time_ns()}")
+
     def asides(self, name: str = "") -> Iterator[Entry]:
         """Yield what collections have moved aside of an object, or of all."""
         return (entry for entry in self.files.list("tmp") if entry.name.startswith(f"tmp/{layout.ASIDE}{name}"))
@@ -237,10 +261,34 @@ class RemoteStore:
 
     # ---- records
 
-    def commit(self, identity: Mapping[str, Any], result: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
-        """Record that ``identity`` gave ``result``, unless a record states what it gave: the first to finish wins."""
-        _, content = record_content(identity, result, provenance)
-        self.files.create(layout.record_name(digest(identity)), content)
+    def commit(
+        self,
+        identity: Mapping[str, Any],
+        result: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        *,
+        replace: bool = False,
+    ) -> dict[str, Any]:
+        """Record that ``identity`` gave ``result`` and return the record that holds: the first to finish wins.
+
+        A damaged one is replaced, and with ``replace`` any that was there; else that one holds.
+        """
+        key = digest(identity)
+        record, content = record_content(identity, result, provenance)
+        for _ in range(_TRIES):
+            if self.files.create(layout.record_name(key), content):
+                return record
+            there = None if replace else self.record(key)
+            if there is not None:
+                return there
+            self.files.delete(layout.record_name(key))
+        raise TacpipeError(
+            f"Others replace the record {key[:12]} in {self.place} all the time. Run the same command again."
+        )
+
+    def record(self, key: str) -> dict[str, Any] | None:
+        """Return the record of ``key``, or None; a damaged one counts as none."""
+        return self._record(key)[1]
 
     def note_records(self, manifest: str, keys: Collection[str]) -> None:
         """Note which records belong to a manifest."""
@@ -319,17 +367,32 @@ class RemoteRoots:
             return root
         return None
 
-    def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> bool:
+    def push(
+        self,
+        name: str,
+        project: Mapping[str, str],
+        manifest: str,
+        before: Root | None,
+        *,
+        lasting: bool,
+        output: bool = False,
+    ) -> bool:
         """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``, as `pushed` gave it.
 
-        Returns False where another push came first, and nothing was noted.
+        What was pushed stays in the history until it is forgotten. The ``output`` of a command is no such snapshot: the next
+        output takes its place, unless it is ``lasting``. Returns False where another push came first, and nothing was noted.
         """
-        if before is not None and before["manifest"] == manifest and before.get("project") == project:
+        kept = before is not None and not before.get(_OUTPUT)  # as a snapshot
+        same = before is not None and before["manifest"] == manifest and before.get("project") == project
+        if same and (output or kept):
             return True
         root = {"path": name, "kind": PUSHED, "project": dict(project)}
-        same = before is not None and _name(before) == _name(root)
-        number = before.get(_NUMBER, 0) if before is not None and same else 0
-        return self._succeed({**root, **succeeding(before, manifest, lasting=lasting), _NUMBER: number})
+        number = before.get(_NUMBER, 0) if before is not None and _name(before) == _name(root) else 0
+        succeeded = succeeding(before, manifest, lasting=lasting)
+        if before is not None and not kept and not lasting:
+            succeeded["history"] = [one for one in succeeded["history"] if one["manifest"] != before["manifest"]]
+        stated = {_OUTPUT: True} if output else {}
+        return self._succeed({**root, **succeeded, **stated, _NUMBER: number})
 
     def write(self, root: Root) -> None:
         """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` where another one came first."""
@@ -360,7 +423,7 @@ class RemoteRoots:
 
     def _read(self, wanted: str = "") -> Iterator[tuple[str, Root | None]]:
         """Yield the name of each root, or of the one that is ``wanted``, and its newest version; None for a damaged one."""
-        newest = {name: found[-1] for name, found in self._versions().items() if wanted in ("", name)}
+        newest = {name: found[-1] for name, found in self._versions(wanted).items()}
         return zip(newest, threads.each(self._at, newest.values(), AT_ONCE), strict=True)
 
     def _at(self, version: tuple[int, str]) -> Root | None:
@@ -370,10 +433,12 @@ class RemoteRoots:
             return None if root is None else {**root, _NUMBER: number}
         return None
 
-    def _versions(self) -> dict[str, list[tuple[int, str]]]:
+    def _versions(self, wanted: str = "") -> dict[str, list[tuple[int, str]]]:
         """Return number and file of the versions of each root, the newest last; a root of a folder that was copied is 0."""
         found: dict[str, list[tuple[int, str]]] = {}
-        for entry in self.files.list("roots"):
+        entries = list(self.files.list(f"roots/{wanted}" if wanted else "roots"))
+        copied = self.files.stat(f"roots/{wanted}.json") if wanted and not entries else None
+        for entry in [*entries, *([copied] if copied else [])]:
             match = _VERSION.fullmatch(entry.name)
             if match is not None:
                 found.setdefault(match[1], []).append((int(match[2] or 0), entry.name))

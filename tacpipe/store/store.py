@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
 import os
@@ -17,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import drafts, memory, places, regular
+from tacpipe.io import drafts, memory, regular
 from tacpipe.io.drafts import Draft
-from tacpipe.io.files import listed, move, present, readable_errors, sync_folder, sync_folders, unread
+from tacpipe.io.files import listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store import layout
 from tacpipe.store.directory import Directory
 from tacpipe.store.leases import Announcing, Leases
-from tacpipe.store.roots import BESIDE_NAME, Roots
+from tacpipe.store.roots import Roots
 
 
 class MissingError(DamagedError):
@@ -50,6 +49,7 @@ class Store:
     """
 
     at_once = 1  # objects that a transfer reads or writes at once
+    distant = False  # whether it is kept elsewhere, and this folder lies in front of that
 
     def __init__(self, root: Path | str, run: str = "") -> None:
         self.root = Path(root)
@@ -63,7 +63,7 @@ class Store:
 
     @property
     def place(self) -> str:
-        """The place of the store, as sentences name it."""
+        """The place of the store, as sentences name it and `location.opened` finds it."""
         return self._root
 
     def object_path(self, name: str) -> str:
@@ -131,10 +131,22 @@ class Store:
         if self._run is not None:
             self._run.announce(names)
 
+    def expect(self, keys: Iterable[str]) -> None:
+        """Note that the records of ``keys`` are looked for next, and their results made where there is none.
+
+        A store that is kept elsewhere looks for all of them at once.
+        """
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Note that objects are read next: a store that is kept elsewhere brings several at once."""
+
     # ---- objects
 
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
+        return self._lies(name, size)
+
+    def _lies(self, name: str, size: int | None = None) -> bool:
         try:
             found = self.files.stat(layout.object_name(name))
         except regular.IrregularError:
@@ -146,7 +158,7 @@ class Store:
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
         """Return the bytes of those objects that are there."""
-        there = (name for name in names if self.has(name))
+        there = (name for name in names if self._lies(name))
         return {name: entry.bytes for name in there if (entry := self.files.stat(layout.object_name(name))) is not None}
 
     def room(self) -> int | None:
@@ -167,8 +179,8 @@ class Store:
         there = False
         with contextlib.suppress(MissingError):
             if durable:
-                self.read(name, len(content))
-            there = self.has(name, len(content))
+                self._read(name, len(content))
+            there = self._lies(name, len(content))
         if not there:
             self.write_file(path, content, mode=0o444)
         if durable:  # whoever put it there
@@ -186,7 +198,7 @@ class Store:
             draft.sync()
             name = draft.digest
             self.announce([name])
-            if durable or not self.has(name, draft.bytes):  # a copy that is there may be damaged
+            if durable or not self._lies(name, draft.bytes):  # a copy that is there may be damaged
                 self.files.refuse_linked(self.object_path(name))
                 with readable_errors(self.root):
                     move(path, self.object_path(name))
@@ -216,11 +228,14 @@ class Store:
         do not hash to its name: those are then moved to ``quarantine/``. Raises `StorageError` where the system fails to
         read it (EIO, EMFILE, EACCES, …) or memory is short, which states nothing of the object.
         """
+        return self._read(name, size)
+
+    def _read(self, name: str, size: int | None = None) -> bytes:
         try:
             content = self.files.read(layout.object_name(name), None if size is None else most(size))
         except FileNotFoundError:
             if self._put_back(name):
-                return self.read(name, size)
+                return self._read(name, size)
             raise self._missing(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
@@ -232,7 +247,7 @@ class Store:
         """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
         hashed = hashlib.sha256()
         try:
-            self.has(name)  # puts back what a collection moved aside
+            self._lies(name)  # puts back what a collection moved aside
             for block in self.files.blocks(layout.object_name(name), sys.maxsize if size is None else most(size)):
                 hashed.update(block)
                 yield block
@@ -249,7 +264,7 @@ class Store:
     def _irregular(self, name: str, error: regular.IrregularError) -> MissingError:
         """Return what to state of an object that is not one; what is not a regular file is moved to quarantine."""
         with contextlib.suppress(TacpipeError):
-            self.has(name)
+            self._lies(name)
         return MissingError(f"Object {name[:12]} in {self._root} cannot be read: {str(error).rstrip('.')}.")
 
     def _damaged(self, name: str) -> MissingError:
@@ -417,44 +432,3 @@ def sound(record: dict[str, Any], key: str) -> bool:
 def most(size: int) -> int:
     """Return how many bytes of an object of this declared size are read: a small one that has grown is quarantined."""
     return max(size, memory.AT_HAND)
-
-
-def locate(start: Path | None = None) -> Store:
-    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` next to the project that ``start`` lies in.
-
-    Raises `UsageError` where something else lies there, as `layout.check` does.
-    """
-    named = os.environ.get("TACPIPE_STORE")
-    store = Store(places.local(named).absolute() if named else project(start) / BESIDE_NAME)
-    store.check()
-    return store
-
-
-def project(start: Path | None = None) -> Path:
-    """Return the folder of the project: the nearest one upwards with a store, a ``dvc.yaml`` or a git repository."""
-    here = (start or Path.cwd()).absolute()
-    return marked(here) or here
-
-
-def marked(here: Path) -> Path | None:
-    """Return the nearest folder upwards that has the mark of a project, None where none has."""
-    for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
-        for folder in (here, *here.parents):
-            if _marks(folder / mark):
-                return folder
-    return None
-
-
-def _marks(path: Path) -> bool:
-    """Return whether a mark is there; a link to a disk that is not mounted counts.
-
-    Raises `StorageError` where the system fails to look: without the mark another store would be used.
-    """
-    try:
-        return present(path)
-    except ValueError:  # of a path that nothing can have
-        return False
-    except OSError as error:
-        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
-            return False
-        raise unread(path, error) from error

@@ -1,12 +1,14 @@
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tacpipe.io.regular import IrregularError
 from tacpipe.store import bucket
 from tacpipe.store.backend import Backend
+from tacpipe.store.remote import RemoteStore
 from tests.promises.counts import count
 from tests.stores import places
 from tests.stores.places import Place
@@ -120,3 +122,64 @@ def test_a_folder_of_more_names_than_a_server_lists_at_once_is_listed_whole(loca
     for name in names:
         (tmp_path / "buckets/lab/store" / name).write_bytes(b"")
     assert {one.name for one in places.bucket("s3://lab/store").files.list("objects")} == names
+
+
+def test_a_list_of_many_pages_is_whole_also_where_any_request_for_one_fails_once(
+    without_profiles: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bucket, "PAGE", 3)
+    monkeypatch.setattr(bucket, "PAUSE_S", 0.001)
+    import obstore
+    from obstore.exceptions import GenericError
+    from obstore.store import MemoryStore
+
+    found = bucket.Bucket("s3://lab/store", MemoryStore())
+    names = {f"objects/{number:02x}/{number:02x}{'0' * 62}" for number in range(20)}
+    for name in names:
+        found.create(name, name.encode())
+    honest = obstore.list
+    for failing in range(1, 9):
+        asked = 0
+
+        def failing_once(*given: object, failing: int = failing, **more: object) -> Iterator[object]:
+            nonlocal asked
+            for page in honest(*given, **more):  # type: ignore[call-overload]
+                asked += 1
+                if asked == failing:
+                    raise GenericError("the connection was lost")
+                yield page
+
+        monkeypatch.setattr(obstore, "list", failing_once)
+        listed = [entry.name for entry in found.list("objects")]
+        assert sorted(listed) == sorted(names), failing
+        count("requests to a store failed")
+
+
+def test_only_as_many_pages_are_asked_for_as_are_used(without_profiles: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    from obstore.store import MemoryStore
+
+    asked = []
+
+    class Asked(bucket.Bucket):
+        def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
+            asked.append(request)
+            return super()._tried(request, tries)
+
+    monkeypatch.setattr(bucket, "PAGE", 2)
+    found = Asked("s3://lab/store", MemoryStore())
+    for number in range(8):
+        found.create(f"objects/0{number}/0{number}{'0' * 62}", b"x")
+    asked.clear()
+    next(found.list("objects"))
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("count_of", [3, 40])
+def test_objects_are_looked_for_one_by_one_or_in_a_list_with_the_same_answer(place: Place, count_of: int) -> None:
+    store = RemoteStore(place.files)
+    there = {f"{number:02x}{'1' * 62}": number + 1 for number in range(count_of)}
+    for name, size in there.items():
+        place.files.create(f"objects/{name[:2]}/{name}", b"x" * size)
+    absent = [f"{number:02x}{'2' * 62}" for number in range(count_of)]
+    assert store.sizes([*absent, *there]) == there
+    assert store.sizes(absent) == {} == store.sizes([])

@@ -10,50 +10,15 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import threads
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.maintenance import remote_upkeep, transfer
-from tacpipe.store.backend import Entry
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.remote import RemoteStore
 from tests.conftest import Lab
 from tests.promises.counts import count
+from tests.stores.stepping import Stepping
 
 Item = TypeVar("Item")
 FOLDERS = ("", "objects", "records", "roots", "snapshots", "leases", "tmp")
 EVERY = pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 7])
-
-
-class Stepping(Bucket):
-    """A bucket in memory, in which something else happens before one of its steps."""
-
-    def __init__(
-        self, content: dict[str, bytes], step: int = 0, meanwhile: Callable[[], object] = lambda: None
-    ) -> None:
-        from obstore.store import MemoryStore
-
-        client = MemoryStore()
-        super().__init__("s3://lab/store", client)
-        self.days = 0
-        self.begin(0, lambda: None)
-        for name, value in content.items():
-            assert self.create(name, value)
-
-    def _tried(self, request: Callable[[], Any], tries: int = 0) -> Any:
-        self.steps += 1
-        if self.steps == self._step:
-            self._meanwhile()
-        return super()._tried(request, tries)
-
-    def begin(self, step: int, meanwhile: Callable[[], object]) -> None:
-        """Count steps from here; before the one of this number ``meanwhile`` happens."""
-        self.steps, self._step, self._meanwhile = 0, step, meanwhile
-
-    def list(self, folder: str) -> Iterator[Entry]:
-        """Do as `Bucket.list`; what is there is listed as ``days`` older than it is."""
-        for entry in super().list(folder):
-            yield entry._replace(changed_s=entry.changed_s - self.days * 86400)
-
-    def content(self) -> dict[str, bytes]:
-        """Return all content by name."""
-        return {entry.name: self.read(entry.name) for entry in self.list("")}
 
 
 @pytest.fixture(autouse=True)

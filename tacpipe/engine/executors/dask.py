@@ -27,8 +27,10 @@ from tacpipe.engine.executors import agreement, chunks
 from tacpipe.engine.processor import usable_cores
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress, termination
+from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
 from tacpipe.store import records
+from tacpipe.store.location import opened
 from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
@@ -92,7 +94,7 @@ class Dask:
         futures = [self.client.submit(_work, wanted, compute, chunk, pure=False) for chunk in given]
         what = f"{len(tasks)} tasks were given to {workers} workers"
         with termination.reporting(f"tacpipe: interrupted; {what}: those that wait are cancelled, those at work end."):
-            store = Store(tasks[0].store, tasks[0].run)
+            store = opened(tasks[0].store, tasks[0].run)
             try:
                 for done in self._results(futures, tasks[0].name):
                     if done.record is not None:  # a worker announces it too, until that worker ends
@@ -251,7 +253,13 @@ def _check(name: str, wanted: Mapping[str, Any], task: Task) -> None:
         raise UsageError(
             f"Worker {name} would not compute what this computer does: {'; '.join(other)}. Install the same there."
         )
-    if task.run and not _at_work(task.run):
+    store = opened(task.store)
+    if store.distant:  # reached by its address, with this worker's own credentials
+        try:
+            store.record(digest(task.identity))
+        except TacpipeError as error:
+            raise TacpipeError(f"Worker {name} does not reach the store: {error}") from error
+    elif task.run and not _at_work(task.run):
         raise TacpipeError(
             f"Worker {name} does not find the store {task.store} as this command sees it, or the command has ended: workers "
             f"need the store at the same path, as on a shared file system."
@@ -266,8 +274,11 @@ def _at_work(run: str) -> bool:
 def _lease(task: Task) -> str:
     """Return a lease of this worker's own, which announces the objects it makes for as long as the task's run is at work.
 
-    Two computers do not write to one lease: on a network file system one would overwrite what the other announces.
+    Two computers do not write to one lease: on a network file system one would overwrite what the other announces. In a
+    bucket the client has announced the keys, so there is none.
     """
+    if opened(task.store).distant:
+        return ""
     if not task.run or task.run in _leases:
         return _leases.get(task.run, "")
     begun: Queue[str] = Queue()

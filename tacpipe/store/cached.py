@@ -1,0 +1,360 @@
+"""A store in a bucket as stages use it: a store in a folder of this computer in front, which keeps what was read and made.
+
+What the folder has is used as it is, and asks nothing of the network. What it lacks comes from the bucket, each object
+verified by its digest. What is made goes to the bucket at once: objects, then the record that names them; the name of a
+dataset comes last. So the bucket holds what its records and names state, wherever a process or a connection ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.io import progress, threads
+from tacpipe.io.drafts import Draft
+from tacpipe.io.files import present
+from tacpipe.io.hashing import digest
+from tacpipe.store import addresses, layout, records
+from tacpipe.store.addresses import Address
+from tacpipe.store.bucket import Bucket
+from tacpipe.store.remote import AT_ONCE, RemoteStore
+from tacpipe.store.store import AbsentError, MissingError, Object, Store
+
+VARIABLE = "TACPIPE_CACHE"
+_LOOKS = 100  # pushes of one name that may come first
+_buckets: dict[tuple[int, Path], Bucket] = {}  # of this process: a client outlives the tasks that use it
+_stores: set[tuple[int, Path]] = set()  # of these, the ones that are known to hold a store
+
+
+def folder(address: Address) -> Path:
+    """Return the folder in front of a bucket: below ``TACPIPE_CACHE``, else below the cache of this user.
+
+    Its name holds a digest of the address and of the server: the same address at another one is another store.
+    """
+    named = os.environ.get(VARIABLE)
+    above = Path(named).expanduser() if named else _of_user() / "tacpipe"
+    endpoint = addresses.settings(address).config.get("endpoint", "")
+    shown = "-".join([address.scheme, *address.path.split("/")])[:80].replace(" ", "_")
+    return above.absolute() / f"{shown}-{digest([str(address), endpoint])[:12]}"
+
+
+def _of_user() -> Path:
+    named = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(named) if Path(named).is_absolute() else Path("~/.cache").expanduser()
+
+
+class CachedStore(Store):
+    """The store at an address; ``root`` is the folder in front of it. Raises `StorageError` where the bucket is needed
+    and cannot be reached."""
+
+    distant = True
+
+    def __init__(self, address: Address, run: str = "") -> None:
+        super().__init__(folder(address), run)
+        self.address = address
+        self._remote: RemoteStore | None = None
+        self._is_prepared = False  # the folder
+        self._work: ExitStack | None = None  # what ends with the run that was begun here
+        self._is_announced = False  # in the bucket
+        self._reads: list[str] = []
+        self._forget()
+
+    def _forget(self) -> None:
+        self._asked: set[str] = set()  # objects that are looked for next
+        self._there: dict[str, int | None] = {}  # bytes of objects in the bucket, None for those that it has not
+        self._made: set[str] = set()  # objects that were put here, and did not go to the bucket yet
+        self._no_record: set[str] = set()  # keys without a record there
+
+    @property
+    def place(self) -> str:
+        """The address of the store."""
+        return str(self.address)
+
+    @property
+    def bucket(self) -> RemoteStore:
+        """The store in the bucket, which need not have begun yet. Raises `UsageError` where it has another format."""
+        if self._remote is None:
+            key = os.getpid(), self.root
+            if key not in _buckets:
+                _buckets[key] = Bucket(self.address)
+            self._remote = RemoteStore(_buckets[key])
+            if key not in _stores and self._remote.check():
+                _stores.add(key)
+        return self._remote
+
+    def prepare(self) -> None:
+        """Create the folder where there is none yet; raises as `Store.prepare`."""
+        if not self._is_prepared:
+            super().prepare()
+            self._is_prepared = True
+
+    # ---- runs
+
+    @contextlib.contextmanager
+    def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
+        """Do as `Store.at_work`; collections in the bucket hear of it once something is asked of that."""
+        reads = sorted(manifests)
+        if self._run is not None:
+            with super().at_work(reads):
+                yield
+            return
+        self._forget()
+        self._reads = reads
+        try:
+            with super().at_work(reads), ExitStack() as self._work:
+                yield
+        finally:
+            self._work, self._is_announced = None, False
+
+    def announce(self, names: Iterable[str]) -> None:
+        """Do as `Store.announce`. The bucket is asked for all of them as soon as one is looked for and is not here."""
+        several = list(names)
+        self._asked.update(several)
+        super().announce(several)
+
+    def _announce(self, names: Collection[str], *, manifests: Collection[str] = (), keys: Collection[str] = ()) -> None:
+        """Announce to collections in the bucket, where a run was begun here: a worker's is announced by who began it."""
+        if self._work is None:
+            return
+        if not self._is_announced:
+            self._work.enter_context(self.bucket.at_work(self._reads))
+            _stores.add((os.getpid(), self.root))
+            self._is_announced = True
+        self.bucket.announce(names, manifests=manifests, keys=keys)
+
+    def expect(self, keys: Iterable[str]) -> None:
+        """Bring the records of ``keys`` that are not here, and announce that the others are made."""
+        unknown = [key for key in keys if key not in self._no_record and not present(self.record_path(key))]
+        if not unknown:
+            return
+        self._announce((), keys=unknown)
+        there = self.bucket.present(unknown)
+        self._no_record.update(set(unknown) - there)
+        for _, record in self.bucket.records(there):
+            self._keep_record(record)
+            self._asked.update(records.named(record["result"]))
+
+    # ---- objects
+
+    def has(self, name: str, size: int | None = None) -> bool:
+        """Return whether an object of this digest (and size in bytes) is here or in the bucket."""
+        if self._lies(name, size):
+            return True
+        if name not in self._there:
+            self._look({*self._asked, name})
+        there = self._there[name]
+        return there is not None and size in (None, there)
+
+    def _look(self, names: Iterable[str]) -> None:
+        """Ask the bucket, once for all, which of some objects it has."""
+        wanted = [name for name in names if name not in self._there and not present(self.object_path(name))]
+        self._asked.clear()
+        self._announce(wanted)
+        found = self.bucket.sizes(wanted)
+        self._there.update({name: found.get(name) for name in wanted})
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Bring objects that are not here, several at once; what cannot be brought is reported by who reads it."""
+        absent = [name for name in dict.fromkeys(names) if not present(self.object_path(name))]
+        if not absent:
+            return
+        super().announce(absent)
+
+        def bring(name: str) -> None:
+            with contextlib.suppress(MissingError):
+                self._bring(name)
+
+        self.prepare()
+        self.bucket  # noqa: B018  (before there are threads)
+        with self._bar("downloading", len(absent)) as advance:
+            for _ in threads.each(bring, absent, AT_ONCE if len(absent) > 1 else 1):
+                advance()
+
+    def _bring(self, name: str, size: int | None = None) -> None:
+        """Bring an object, verified. Raises `MissingError` where the bucket has not it, or has it damaged.
+
+        What is damaged there twice in a row is moved to quarantine there: then it is missing for everybody, and recomputed.
+        """
+        self.prepare()
+        for last in (False, True):
+            try:
+                self.write_file(self.object_path(name), self.bucket.blocks(name, size), mode=0o444)
+                return
+            except AbsentError:
+                self._there[name] = None
+                raise
+            except MissingError:
+                if last:
+                    self._there[name] = None
+                    with contextlib.suppress(StorageError):  # where it may only be read
+                        self.bucket.quarantine(name)
+                    raise
+
+    def read(self, name: str, size: int | None = None) -> bytes:
+        """Do as `Store.read`; what is not here, or damaged here, is brought."""
+        try:
+            return super().read(name, size)
+        except MissingError:
+            self._bring(name, size)
+            return super().read(name, size)
+
+    def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
+        """Do as `Store.blocks`; what is not here is brought."""
+        if not self._lies(name):
+            self._bring(name, size)
+        yield from super().blocks(name, size)
+
+    def put(self, content: bytes, *, durable: bool = False) -> Object:
+        """Do as `Store.put`; it goes to the bucket with the record or the dataset that names it."""
+        self.prepare()
+        made = super().put(content, durable=durable)
+        self._made.add(made.digest)
+        return made
+
+    def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
+        """Do as `Store.put_written`; it goes to the bucket as what is put."""
+        self.prepare()
+        made = super().put_written(write, durable=durable)
+        self._made.add(made.digest)
+        return made
+
+    def _upload(self, names: Collection[str]) -> None:
+        """Have the bucket keep objects that lie here. Raises `MissingError` for one that is damaged."""
+
+        def send(name: str) -> None:
+            self.bucket.files.create(layout.object_name(name), _Blocks(self, name))
+
+        with self._bar("uploading", len(names)) as advance:
+            for name, _ in zip(names, threads.each(send, names, AT_ONCE if len(names) > 1 else 1), strict=True):
+                self._there[name] = os.lstat(self.object_path(name)).st_size
+                advance()
+        self._made.difference_update(names)
+
+    def _bar(self, description: str, total: int) -> contextlib.AbstractContextManager[Callable[..., None]]:
+        """Do as `progress.bar`, but in a task: there is one for all of these."""
+        return progress.bar(description, total) if self._work is not None else contextlib.nullcontext(_no_bar)
+
+    def read_here(self, name: str, size: int | None = None) -> Iterator[bytes]:
+        """Yield the blocks of an object that lies here; raises as `Store.blocks`."""
+        return super().blocks(name, size)
+
+    # ---- records
+
+    def read_record(self, key: str) -> dict[str, Any]:
+        """Do as `Store.read_record`; one that is not here is brought."""
+        try:
+            return super().read_record(key)
+        except MissingError:
+            record = None if key in self._no_record else self.bucket.record(key)
+            if record is None:
+                raise
+            return self._keep_record(record)
+
+    def commit(
+        self,
+        identity: Mapping[str, Any],
+        result: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        *,
+        replace: bool = False,
+        durable: bool = False,
+    ) -> dict[str, Any]:
+        """Do as `Store.commit`, in the bucket, which has the objects that were put here before it has the record."""
+        self._begin()
+        self._upload([name for name in dict.fromkeys(records.named(result)) if name in self._made])
+        kept = self.bucket.commit(identity, result, provenance, replace=replace)
+        return self._keep_record(kept, durable=durable)
+
+    def _begin(self) -> None:
+        """Begin the store in the bucket where there is none."""
+        key = os.getpid(), self.root
+        if key not in _stores:
+            self.bucket.prepare()
+            _stores.add(key)
+
+    def _keep_record(self, record: Mapping[str, Any], *, durable: bool = False) -> dict[str, Any]:
+        """Keep a record of the bucket here, in place of any other, and return it."""
+        identity, result, provenance = record["identity"], record["result"], record["provenance"]
+        self._no_record.discard(digest(identity))
+        self.prepare()
+        return super().commit(identity, result, provenance, replace=True, durable=durable)
+
+    def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield every key and its record, those of the bucket too; they are kept here."""
+        keys = [Path(entry.name).stem for entry in self.bucket.files.list("records")]
+        for _, record in self.bucket.records(key for key in keys if not present(self.record_path(key))):
+            self._keep_record(record)
+        yield from super().records()
+
+    def records_of(self, manifest: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Do as `Store.records_of`, of the records that are here: those that this computer looked for."""
+        return super().records()
+
+    # ---- datasets
+
+    def keep(
+        self,
+        name: str,
+        project: Mapping[str, str],
+        manifest: str,
+        needs: Callable[[str], Mapping[str, int]],
+        *,
+        before: str = "",
+        lasting: bool = False,
+    ) -> None:
+        """Have the bucket keep ``manifest`` and all that it ``needs``, as the dataset ``name`` of a project.
+
+        ``needs`` gives names and bytes of objects for the digest of a manifest that lies here, nothing for another one;
+        ``before`` is the manifest that this computer last knew under that name: what the bucket's own newest version needs
+        was there when that was named, has been needed since, and is not looked for. ``lasting`` is as `Store.roots` has it.
+        """
+        roots = self.bucket.roots
+        root = roots.pushed(name, project["id"])
+        if root is not None and root["manifest"] == manifest:
+            return
+        with self.at_work([manifest]):
+            wanted, known = needs(manifest), needs(before) if before else {}
+            self._announce(wanted.keys() - known.keys(), manifests=[before] if known else [])
+            root = roots.pushed(name, project["id"])
+            if root is None or root["manifest"] != before:
+                known = {}
+                self._announce(wanted.keys())
+            self._complete({one: size for one, size in wanted.items() if one not in known})
+            for _ in range(_LOOKS):
+                if roots.push(name, project, manifest, root, lasting=lasting, output=True):
+                    return
+                root = roots.pushed(name, project["id"])
+        raise TacpipeError(f"{name} is written to {self.place} by others all the time. Run the same command again.")
+
+    def _complete(self, sizes: Mapping[str, int]) -> None:
+        """Have the bucket hold objects that are announced. Raises `MissingError` for one that is neither there nor here.
+
+        They are looked for also if they were sent: a collection may have come between that and the announcement.
+        """
+        found = self.bucket.sizes(sizes)
+        absent = [name for name in sizes if found.get(name) != sizes[name]]
+        for name in absent:
+            if not self._lies(name):
+                raise AbsentError(f"Object {name[:12]} is neither in {self.place} nor in {self.root}.")
+            if name in found:  # of another size, so it is damaged
+                self.bucket.quarantine(name)
+        self._upload(absent)
+
+
+class _Blocks:
+    """The verified blocks of an object that lies here, as often as they are asked for."""
+
+    def __init__(self, store: CachedStore, name: str) -> None:
+        self._store, self._name = store, name
+
+    def __iter__(self) -> Iterator[bytes]:
+        return self._store.read_here(self._name)
+
+
+def _no_bar(note: str = "") -> None:
+    """Show nothing."""

@@ -1,0 +1,712 @@
+"""Stages that work on a store in a bucket, each computer with a folder of its own in front."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+
+from tacpipe.engine import execution
+from tacpipe.engine.execution import Done, Task
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.maintenance import remote_upkeep, transfer
+from tacpipe.store import bucket, cached, location
+from tacpipe.store.addresses import Address, parsed
+from tacpipe.store.bucket import Bucket
+from tacpipe.store.cached import CachedStore
+from tacpipe.store.remote import RemoteStore
+from tests.conftest import Lab, Ran
+from tests.promises.counts import count
+from tests.stores import places, proxy
+from tests.stores.places import KEY, SECRET, Place
+from tests.stores.proxy import FAULTS, Proxy
+from tests.stores.stepping import Stepping
+from tests.stores.test_faults import at, since
+from tests.test_pipeline import counts
+
+SIMULATE = "simulate toy -o data/r --trials 3 --rows 3 --jobs 1"
+SCALE = "scale data/r -o data/s --factor 2 --jobs 1"
+CHAIN = (SIMULATE, SCALE, "centre data/s -o data/c --split data/split --jobs 1")
+EVERY = pytest.mark.parametrize(
+    "every",
+    [pytest.param(1, marks=pytest.mark.faults), pytest.param(5, marks=pytest.mark.long)],
+)
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Retries follow soon, and clients of other tests are forgotten."""
+    monkeypatch.setattr(bucket, "PAUSE_S", 0.001)
+    monkeypatch.setattr(bucket, "RETRIES", 0)
+    monkeypatch.setattr(cached, "_buckets", {})
+    monkeypatch.setattr(cached, "_stores", set())
+
+
+@dataclass
+class Computers:
+    """Several computers with projects of the same name that share one bucket."""
+
+    lab: Lab
+    monkeypatch: pytest.MonkeyPatch
+    address: str
+    names: list[str] = field(default_factory=list)
+
+    def enter(self, name: str) -> Path:
+        """Work on a computer from here on; return the folder of its project."""
+        folder = self.lab.folder / name / "project"
+        if name not in self.names:
+            self.names.append(name)
+            shutil.rmtree(self.lab.folder / ".tacpipe", ignore_errors=True)  # each has a project of its own
+            folder.mkdir(parents=True)
+            (folder / "dvc.yaml").touch()
+        self.monkeypatch.chdir(folder)
+        self.monkeypatch.setenv("TACPIPE_STORE", self.address)
+        self.monkeypatch.setenv("TACPIPE_CACHE", str(folder.parent / "cache"))
+        return folder
+
+    def run(self, name: str, *commands: str) -> str:
+        """Run commands on a computer that must succeed; return what the last one prints."""
+        before = Path.cwd(), os.environ["TACPIPE_CACHE"]
+        self.enter(name)
+        printed = [self.lab.run(command).out for command in commands][-1]
+        self.monkeypatch.chdir(before[0])
+        self.monkeypatch.setenv("TACPIPE_CACHE", before[1])
+        return printed
+
+    @property
+    def store(self) -> CachedStore:
+        """The store of the computer at work."""
+        found = location.locate()
+        assert isinstance(found, CachedStore)
+        return found
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Return all files of the datasets in a project."""
+    below = folder / "data"
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(below.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def computers(lab: Lab, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Computers:
+    """Computers that share a bucket in memory, the first of which is entered; each request is a step."""
+    files = Stepping({})
+    for module in (cached, transfer):
+        monkeypatch.setattr(module, "Bucket", lambda address: request.node.files)
+    request.node.files = files
+    found = Computers(lab, monkeypatch, "s3://lab/store")
+    found.enter("first")
+    return found
+
+
+@pytest.fixture
+def files(computers: Computers, request: pytest.FixtureRequest) -> Stepping:
+    """The bucket of `computers`."""
+    found: Stepping = request.node.files
+    return found
+
+
+@pytest.fixture
+def emptied(computers: Computers, request: pytest.FixtureRequest) -> Callable[[dict[str, bytes]], Stepping]:
+    """A function that puts another bucket in the place of that of `computers`, with this content, and clears all caches."""
+
+    def empty(kept: dict[str, bytes]) -> Stepping:
+        request.node.files = Stepping(kept)
+        cached._buckets.clear()
+        cached._stores.clear()
+        for name in computers.names:
+            shutil.rmtree(computers.lab.folder / name, ignore_errors=True)
+        computers.names.clear()
+        computers.enter("first")
+        found: Stepping = request.node.files
+        return found
+
+    return empty
+
+
+def expect_whole(files: Bucket) -> None:
+    """Expect that a bucket is sound, and that every record names what is there."""
+    store = RemoteStore(files)
+    found = remote_upkeep.verify(store)
+    assert found.clean, found.to_text()
+    named = {
+        shard["digest"]
+        for _, record in store.records()
+        for entry in record["result"]["recordings"].values()
+        for shard in entry["shards"].values()
+    }
+    assert named <= set(store.sizes(named))
+
+
+# ---- what a user sees
+
+
+def test_a_chain_gives_the_same_bytes_with_any_store(lab: Lab, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = lab.folder / "plain"
+    plain.mkdir()
+    (plain / ".tacpipe").mkdir()
+    monkeypatch.chdir(plain)
+    lab.run(SIMULATE)
+    lab.run(SCALE)
+    here = Computers(lab, monkeypatch, place.address)
+    folder = here.enter("first")
+    lab.run(SIMULATE)
+    lab.run(SCALE)
+    assert content(folder) == content(plain)
+    objects = {path.name for path in (plain / ".tacpipe/objects").glob("*/*")}
+    records = {path.name for path in (plain / ".tacpipe/records").glob("*/*")}
+    assert {Path(name).name for name in place.names("objects")} == objects
+    assert {Path(name).name for name in place.names("records")} == records
+    assert lab.run("store verify").out.endswith("all sound\n")
+
+
+@pytest.mark.long
+def test_another_computer_reuses_what_the_first_one_computed_whatever_server_keeps_it(
+    lab: Lab, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = Computers(lab, monkeypatch, place.address)
+    first, second = both.enter("first"), both.enter("second")
+    both.run("first", SIMULATE, SCALE)
+    assert counts(both.run("second", f"{SIMULATE} --json")) == (0, 3)
+    assert counts(both.run("second", f"{SCALE} --json")) == (0, 3)
+    assert content(first) == content(second)
+    both.run("second", "store gc --cache" if "://" in place.address else "store gc")
+    assert counts(both.run("second", f"{SCALE} --json")) == (0, 3)
+    assert both.run("first", "store verify").endswith("all sound\n")
+
+
+def test_another_computer_brings_only_what_it_needs_and_computes_nothing(computers: Computers, files: Stepping) -> None:
+    first = computers.enter("first")
+    computers.run("first", SIMULATE, SCALE)
+    second = computers.enter("second")
+    assert counts(computers.lab.run(f"{SIMULATE} --json").out) == (0, 3)
+    objects = {path.name for path in computers.store.root.glob("objects/*/*")}
+    named = {digest for _, digest in computers.lab.manifest("first/project/data/r").objects()}
+    assert objects == named | {manifest_digest(second / "data/r")}
+    assert counts(computers.lab.run(f"{SCALE} --json").out) == (0, 3)
+    assert content(first) == content(second)
+
+
+def manifest_digest(directory: Path) -> str:
+    """Return the digest of a dataset's manifest."""
+    from tacpipe.io.hashing import bytes_digest
+
+    return bytes_digest((directory / "manifest.json").read_bytes())
+
+
+def test_where_there_is_nothing_to_do_nobody_is_asked(computers: Computers, files: Stepping) -> None:
+    computers.run("first", SIMULATE, SCALE)
+    files.begin(0, lambda: None)
+    assert counts(computers.lab.run(f"{SCALE} --json").out) == (0, 3)
+    assert files.steps == 0
+
+
+@pytest.mark.long
+def test_a_hit_and_one_new_recording_take_as_many_requests_however_many_recordings_there_are(
+    computers: Computers, files: Stepping
+) -> None:
+    taken: dict[int, tuple[int, int]] = {}
+    for several in (6, 18):
+        simulate = f"simulate toy -o data/r{several} --rows {several} --jobs 1 --trials"
+        scale = f"scale data/r{several} -o data/s{several} --factor 2 --jobs 1"
+        computers.run("first", f"{simulate} {several}", scale, f"{simulate} {several + 1}")
+        files.begin(0, lambda: None)
+        assert counts(computers.lab.run(f"{scale} --json").out) == (1, several)
+        new = files.steps
+        shutil.rmtree(f"data/s{several}")
+        files.begin(0, lambda: None)
+        assert counts(computers.lab.run(f"{scale} --json").out) == (0, several + 1)
+        taken[several] = new, files.steps
+    assert taken[6] == taken[18], taken
+    assert taken[18][0] < 40 and taken[18][1] < 5, taken
+
+
+@pytest.mark.long
+def test_a_hit_elsewhere_takes_one_request_an_object_and_few_more(computers: Computers, files: Stepping) -> None:
+    computers.run("first", "simulate toy -o data/r --trials 20 --rows 3 --jobs 1")
+    computers.enter("second")
+    files.begin(0, lambda: None)
+    assert counts(computers.lab.run("simulate toy -o data/r --trials 20 --rows 3 --json").out) == (0, 20)
+    assert files.steps < 2 * 20 + 25  # there are two streams
+
+
+def test_status_list_and_checkout_show_what_the_bucket_holds(computers: Computers) -> None:
+    computers.run("first", SIMULATE, SCALE)
+    computers.enter("second")
+    status = json.loads(computers.lab.run("store status --json").out)
+    assert (status["store"], status["objects"]["files"], len(status["roots"])) == ("s3://lab/store", 11, 2)
+    assert status["cache"]["objects"]["files"] == 0 and status["cache"]["path"].startswith(os.environ["TACPIPE_CACHE"])
+    listed = json.loads(computers.lab.run("store list --json").out)["manifests"]
+    assert {one["path"] for one in listed} == {"data/r", "data/s"}
+    (wanted,) = [one["manifest"] for one in listed if one["path"] == "data/s"]
+    computers.lab.run(f"store checkout {wanted} -o data/back")
+    there = computers.lab.folder / "first/project/data/s/manifest.json"
+    assert Path("data/back/manifest.json").read_bytes() == there.read_bytes()
+    assert computers.lab.call("store repair").code == 2
+    assert "s3://lab/store" in computers.lab.run("store status").out
+
+
+def test_copies_here_are_cleared_and_brought_again(computers: Computers, files: Stepping) -> None:
+    folder = computers.enter("first")
+    computers.run("first", SIMULATE, SCALE)
+    before = content(folder)
+    cleared = json.loads(computers.lab.run("store gc --cache --json").out)
+    assert cleared["objects"] == 11 and not list(computers.store.root.glob("objects/*/*"))
+    assert counts(computers.lab.run(f"{SCALE} --json").out) == (0, 3) and content(folder) == before
+    expect_whole(files)
+
+
+def test_what_the_bucket_lacks_stays_when_copies_are_cleared(computers: Computers, files: Stepping) -> None:
+    computers.run("first", SIMULATE)
+    lost = next(iter(files.list("objects"))).name
+    files.delete(lost)
+    computers.lab.run("store gc --cache")
+    assert [str(path.relative_to(computers.store.root)) for path in computers.store.root.glob("objects/*/*")] == [lost]
+
+
+def test_copies_are_cleared_of_a_bucket_alone(lab: Lab) -> None:
+    assert lab.call("store gc --cache").code == 2
+
+
+def test_each_address_and_server_has_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def folder(address: str, endpoint: str = "") -> Path:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+        found = parsed(address)
+        assert isinstance(found, Address)
+        return cached.folder(found)
+
+    monkeypatch.setenv("TACPIPE_CACHE", str(tmp_path / "copies"))
+    several = [
+        folder("s3://lab/a"),
+        folder("s3://lab/b"),
+        folder("s3://lab/a", "http://rig:8333"),
+        folder("gs://lab/a"),
+    ]
+    assert len(set(several)) == 4 and all(one.parent == tmp_path / "copies" for one in several)
+    assert folder("s3://lab/a/") == several[0]
+    monkeypatch.delenv("TACPIPE_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert folder("s3://lab/a") == tmp_path / "cache/tacpipe" / several[0].name
+
+
+# ---- damage, and what is gone
+
+
+def test_a_damaged_copy_here_is_brought_again(computers: Computers, files: Stepping) -> None:
+    computers.run("first", SIMULATE)
+    name = computers.lab.manifest("first/project/data/r").recordings["trial-001"]["shards"]["left"]["digest"]
+    path = Path(computers.store.object_path(name))
+    path.chmod(0o644)
+    path.write_bytes(b"x" * path.stat().st_size)
+    shutil.rmtree("data/r")
+    assert counts(computers.lab.run(f"{SIMULATE} --json").out) == (0, 3)
+    assert computers.store.read(name) == files.read(f"objects/{name[:2]}/{name}")
+
+
+def test_a_damaged_object_of_the_bucket_is_recomputed_and_replaced(computers: Computers, files: Stepping) -> None:
+    computers.run("first", SIMULATE, SCALE)
+    name = computers.lab.manifest("first/project/data/s").recordings["trial-001"]["shards"][""]["digest"]
+    path = f"objects/{name[:2]}/{name}"
+    sound = files.read(path)
+    files.delete(path)
+    files.create(path, sound[:-1] + b"x")
+    second = computers.enter("second")
+    computers.lab.run(SIMULATE)
+    ran = computers.lab.call(SCALE)
+    assert ran.code == 0, ran.err
+    assert content(second) == content(computers.lab.folder / "first/project")
+    assert files.read(path) == sound
+    expect_whole(files)
+
+
+def test_what_a_collection_took_is_computed_again(computers: Computers, files: Stepping) -> None:
+    computers.run("first", SIMULATE, SCALE)
+    shutil.rmtree("data/s")
+    computers.lab.run("store gc --forget data/s")
+    assert len(list(files.list("objects"))) == 7
+    computers.run("second", SIMULATE)
+    assert counts(computers.run("second", f"{SCALE} --json")) == (3, 0)
+    expect_whole(files)
+
+
+@pytest.mark.long
+def test_what_was_forgotten_there_and_lies_here_goes_there_again_when_it_is_written(
+    computers: Computers, files: Stepping
+) -> None:
+    computers.run("first", SIMULATE, SCALE, "store gc --forget data/s")
+    assert len(list(files.list("objects"))) == 7
+    shutil.rmtree("data/s")
+    assert counts(computers.lab.run(f"{SCALE} --json").out) == (0, 3)
+    assert len(list(files.list("objects"))) == 11
+    expect_whole(files)
+
+
+@pytest.mark.long
+def test_a_dataset_whose_directory_is_gone_is_forgotten_after_the_grace_and_a_snapshot_is_not(
+    computers: Computers, files: Stepping
+) -> None:
+    computers.run("first", SIMULATE, SCALE, "scale data/r -o data/t --factor 3 --jobs 1")
+    computers.lab.run("store push s3://lab/store data/t")
+    shutil.rmtree("data/s")
+    shutil.rmtree("data/t")
+    computers.lab.run("store gc")
+    assert {root["path"] for root in RemoteStore(files).roots.all()} == {"data/r", "data/s", "data/t"}
+    computers.lab.run("store gc --grace-days 0")
+    assert {root["path"] for root in RemoteStore(files).roots.all()} == {"data/r", "data/t"}
+    expect_whole(files)
+
+
+@pytest.mark.long
+def test_an_output_that_is_replaced_leaves_no_snapshot_unless_it_was_pushed(
+    computers: Computers, files: Stepping
+) -> None:
+    def held() -> list[str]:
+        (root,) = [root for root in RemoteStore(files).roots.all() if root["path"] == "data/s"]
+        return [root["manifest"], *(one["manifest"] for one in root["history"])]
+
+    computers.run("first", SIMULATE, SCALE)
+    first = manifest_digest(Path("data/s"))
+    computers.lab.run("scale data/r -o data/s --factor 3 --jobs 1")
+    second = manifest_digest(Path("data/s"))
+    assert held() == [second] != [first]
+    computers.lab.run("store push s3://lab/store data/s")
+    computers.lab.run("scale data/r -o data/s --factor 4 --jobs 1")
+    assert held() == [manifest_digest(Path("data/s")), second]
+
+
+# ---- links that fail
+
+
+@dataclass
+class Linked:
+    """A computer whose requests go through a proxy, and a new store for each try."""
+
+    computers: Computers
+    faulty: Proxy
+    number: int = 0
+
+    def next(self) -> Place:
+        """Begin with a new store, and with nothing on the computer."""
+        self.number += 1
+        self.computers.address = f"s3://lab/{self.number}/store"
+        self.computers.names.clear()
+        self.computers.enter(f"computer-{self.number}")
+        return places.bucket(self.computers.address)
+
+    def under(self, fault: Callable[[int], str | None], command: str) -> Ran:
+        """Run a command while requests fail."""
+        self.faulty.begin(fault)
+        ran = self.computers.lab.call(command)
+        self.faulty.fault = lambda number: None
+        return ran
+
+
+@pytest.fixture
+def faulty(localbucket: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+    """A proxy before the server that the environment names."""
+    with proxy.between(localbucket) as found:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", found.endpoint)
+        yield found
+
+
+@pytest.fixture
+def linked(lab: Lab, faulty: Proxy, monkeypatch: pytest.MonkeyPatch) -> Linked:
+    """A computer behind a proxy."""
+    return Linked(Computers(lab, monkeypatch, ""), faulty)
+
+
+@EVERY
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_stage_outlasts_a_fault_of_any_one_request(linked: Linked, fault: str, every: int) -> None:
+    whole = linked.next()
+    linked.under(at(0, None), SIMULATE)
+    requests, wanted = linked.faulty.requests, whole.whole()
+    assert requests > 20 and len(wanted) == 7 + 4
+    for step in range(1 + len(fault) % every, requests + 1, every):
+        there = linked.next()
+        ran = linked.under(at(step, fault), SIMULATE)
+        assert ran.code == 0, (step, ran.err)
+        assert digests(there.whole()) == digests(wanted), step
+        expect_whole(there.files)  # type: ignore[arg-type]
+        count("requests to a store failed")
+
+
+def digests(found: dict[str, bytes]) -> set[str]:
+    """Return the names of objects and of records; records hold times too."""
+    return set(found)
+
+
+@EVERY
+@pytest.mark.parametrize("fault", ["refused", "503", "cut upload", "cut answer"])
+def test_a_stage_whose_link_fails_for_good_ends_in_a_sentence_and_its_rerun_gives_the_same_bytes(
+    linked: Linked, fault: str, every: int
+) -> None:
+    whole = linked.next()
+    linked.under(at(0, None), SIMULATE)
+    shown = content(Path.cwd())
+    requests, wanted = linked.faulty.requests, whole.whole()
+    failed = 0
+    for step in range(1 + len(fault) % every, requests + 1, every):
+        there = linked.next()
+        ran = linked.under(since(step, fault), SIMULATE)
+        assert ran.code in (0, 1) and "Traceback" not in ran.err and SECRET not in ran.err + ran.out, (step, ran)
+        failed += ran.code
+        if RemoteStore(there.files).check():
+            expect_whole(there.files)  # type: ignore[arg-type]
+        linked.computers.lab.run(SIMULATE)
+        assert digests(there.whole()) == digests(wanted) and content(Path.cwd()) == shown, step
+        expect_whole(there.files)  # type: ignore[arg-type]
+        count("requests to a store failed")
+    assert failed
+
+
+def test_without_a_link_what_is_shown_is_a_hit_and_anything_else_a_sentence(linked: Linked) -> None:
+    linked.next()
+    computers, off = linked.computers, since(1, "refused")
+    computers.lab.run(SIMULATE)
+    computers.lab.run(SCALE)
+    assert counts(linked.under(off, f"{SCALE} --json").out) == (0, 3)
+    other = linked.under(off, "scale data/r -o data/t --factor 9 --jobs 1")
+    assert other.code == 1 and computers.address in other.err and other.err.count("\n") == 1
+    assert linked.under(off, "show data/s").code == 0
+
+
+@pytest.mark.long
+def test_a_label_is_kept_here_where_there_is_no_link_and_goes_there_with_the_next(linked: Linked) -> None:
+    there = linked.next()
+    run = linked.computers.lab.run
+    run(SIMULATE)
+    run("store push s3://lab/elsewhere data/r")  # a project has its identity from now on
+    ran = linked.under(since(1, "refused"), "label data/r trial-000 --set material=foam")
+    assert ran.code == 0 and linked.computers.address in ran.err
+    assert "foam" in run("show data/r --json").out
+    (root,) = RemoteStore(there.files).roots.all()
+    assert root["manifest"] != manifest_digest(Path("data/r"))
+    run("label data/r trial-001 --set material=cork")
+    (root,) = RemoteStore(there.files).roots.all()
+    assert root["manifest"] == manifest_digest(Path("data/r"))
+    expect_whole(there.files)  # type: ignore[arg-type]
+
+
+@pytest.mark.long
+def test_credentials_are_in_nothing_that_is_kept_or_printed(linked: Linked) -> None:
+    place = linked.next()
+    printed = ""
+    for command in (SIMULATE, SCALE, "store status", "store status --json", "explain data/s", "store list"):
+        ran = linked.computers.lab.run(command)
+        printed += ran.out + ran.err
+    printed += linked.under(since(1, "503"), "scale data/r -o data/t --factor 9").err
+    kept = [entry.name.encode() + place.files.read(entry.name) for entry in place.files.list("")]
+    here = [path.read_bytes() for path in Path.cwd().parent.rglob("*") if path.is_file()]
+    for secret in (SECRET, KEY):
+        assert secret not in printed
+        assert not [one for one in [*kept, *here] if secret.encode() in one]
+
+
+# ---- several at once
+
+
+def steps(
+    emptied: Callable[[dict[str, bytes]], Stepping], base: dict[str, bytes], every: int, run: Callable[[], object]
+) -> range:
+    """Return the numbers of the requests that something takes on a bucket of this content."""
+    files = emptied(base)
+    files.begin(0, lambda: None)
+    run()
+    assert files.steps > 10
+    return range(1, files.steps + 1, every)
+
+
+@pytest.fixture
+def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Requests follow each other, so that a step is the same one each time."""
+    from tacpipe.io import threads
+
+    monkeypatch.setattr(threads, "each", lambda work, items, at_once: map(work, items))
+
+
+STEPS = pytest.mark.parametrize(
+    "every", [pytest.param(1, marks=pytest.mark.faults), pytest.param(4, marks=pytest.mark.long)]
+)
+
+
+@STEPS
+@pytest.mark.parametrize("other", [SIMULATE, "simulate toy -o data/r --trials 2 --rows 3 --jobs 1"])
+def test_the_same_or_another_run_elsewhere_at_any_request_does_no_harm(
+    computers: Computers,
+    emptied: Callable[[dict[str, bytes]], Stepping],
+    one_at_a_time: None,
+    every: int,
+    other: str,
+) -> None:
+    for step in steps(emptied, {}, every, lambda: computers.run("first", SIMULATE)):
+        files = emptied({})
+        files.begin(step, lambda: computers.run("second", other))
+        computers.run("first", SIMULATE)
+        expect_whole(files)
+        assert counts(computers.run("third", f"{SIMULATE} --json")) == (0, 3)
+        folder = computers.lab.folder
+        assert content(folder / "first/project") == content(folder / "third/project")
+        count("runs beside runs, in a bucket")
+
+
+@STEPS
+def test_a_collection_at_any_request_of_a_run_takes_nothing_that_it_needs(
+    computers: Computers, emptied: Callable[[dict[str, bytes]], Stepping], one_at_a_time: None, every: int
+) -> None:
+    computers.run("first", SIMULATE)
+    files = emptied({})
+    computers.run("first", SIMULATE)
+    for root in RemoteStore(files).roots.all():
+        RemoteStore(files).roots.remove(root)
+    garbage = files.content()  # which nothing names any more, and a run would reuse
+
+    def collect() -> None:
+        remote_upkeep.collect(RemoteStore(files), dry_run=False, recordings=True)
+
+    for base in ({}, garbage):
+        for step in steps(emptied, base, every, lambda: computers.run("first", SIMULATE)):
+            files = emptied(base)
+            files.begin(step, collect)
+            computers.run("first", SIMULATE)
+            expect_whole(files)
+            assert counts(computers.run("second", f"{SIMULATE} --json")) == (0, 3), step
+            count("collections beside runs, in a bucket")
+
+
+@STEPS
+def test_a_run_that_is_killed_at_any_request_leaves_a_sound_bucket_and_its_rerun_gives_the_same_bytes(
+    computers: Computers, emptied: Callable[[dict[str, bytes]], Stepping], one_at_a_time: None, every: int
+) -> None:
+    class Killed(BaseException):
+        """Ends a run as no handler expects."""
+
+    def killed() -> None:
+        raise Killed
+
+    files = emptied({})
+    computers.run("first", SIMULATE)
+    wanted = {name for name in files.content() if name.startswith(("objects", "records"))}
+    shown = content(Path.cwd())
+    for step in steps(emptied, {}, every, lambda: computers.run("first", SIMULATE)):
+        files = emptied({})
+        files.begin(step, killed)
+        with pytest.raises(Killed):
+            computers.lab.call(SIMULATE)
+        files.begin(0, lambda: None)
+        if RemoteStore(files).check():
+            expect_whole(files)
+        computers.enter("first")
+        computers.lab.run(SIMULATE)
+        expect_whole(files)
+        assert content(Path.cwd()) == shown
+        assert {name for name in files.content() if name.startswith(("objects", "records"))} == wanted
+        count("runs killed, in a bucket")
+
+
+@pytest.mark.long
+def test_processes_that_are_killed_while_they_upload_leave_a_bucket_in_which_a_rerun_gives_the_same_bytes(
+    lab: Lab, localbucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = "simulate toy -o data/r --trials 40 --rows 3"
+    plain = Computers(lab, monkeypatch, "s3://lab/plain/store")
+    folder = plain.enter("plain")
+    lab.run(command)
+    wanted, whole = content(folder), set(places.bucket(plain.address).whole())
+    for number in range(6):
+        killed = Computers(lab, monkeypatch, f"s3://lab/killed-{number}/store")
+        folder = killed.enter(f"killed-{number}")
+        there = places.bucket(killed.address)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tacpipe", *command.split(), "--jobs", "2"], start_new_session=True
+        )
+        while process.poll() is None and len(there.names("objects")) < 1 + 7 * number:
+            time.sleep(0.002)
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        expect_whole(there.files)  # type: ignore[arg-type]
+        lab.run(f"{command} --jobs 1")
+        assert content(folder) == wanted and set(there.whole()) == whole
+        expect_whole(there.files)  # type: ignore[arg-type]
+        count("runs killed, in a bucket")
+
+
+@pytest.mark.long
+def test_two_computers_that_run_the_same_and_other_stages_at_once_end_with_the_same_bytes(
+    lab: Lab, localbucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = Computers(lab, monkeypatch, "s3://lab/shared/store")
+    line = [sys.executable, "-m", "tacpipe"]
+    for command in ("simulate toy -o data/r --trials 20 --rows 3", "scale data/r -o data/s --factor 2"):
+        running = []
+        for name in ("first", "second"):
+            both.enter(name)
+            running.append(subprocess.Popen([*line, *command.split(), "--jobs", "2"]))
+        both.enter("third")
+        running.append(subprocess.Popen([*line, *["simulate", "toy", "-o", "data/r", "--trials", "11", "--rows", "3"]]))
+        running.append(subprocess.Popen([*line, "store", "gc"]))
+        assert [process.wait() for process in running] == [0, 0, 0, 0]
+    assert content(lab.folder / "first/project") == content(lab.folder / "second/project")
+    expect_whole(places.bucket(both.address).files)  # type: ignore[arg-type]
+    both.enter("fourth")
+    assert counts(lab.run("simulate toy -o data/r --trials 20 --rows 3 --json").out) == (0, 20)
+
+
+@pytest.mark.long
+def test_a_worker_of_dask_reaches_the_bucket_by_its_address_and_keeps_copies_of_its_own(
+    lab: Lab, localbucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    here = Computers(lab, monkeypatch, "s3://lab/dask/store")
+    folder = here.enter("client")
+    lab.run("simulate toy -o data/r --trials 6 --rows 3")
+    assert counts(lab.run("scale data/r -o data/s --factor 2 --executor dask --jobs 2 --json").out) == (6, 0)
+    here.enter("other")
+    lab.run("simulate toy -o data/r --trials 6 --rows 3")
+    lab.run("scale data/r -o data/s --factor 2")
+    assert content(folder) == content(Path.cwd())
+    expect_whole(places.bucket(here.address).files)  # type: ignore[arg-type]
+
+
+def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucket(
+    computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest = execution.compute
+
+    def elsewhere(task: Task) -> Done:
+        with monkeypatch.context() as there:
+            there.setenv("TACPIPE_CACHE", str(computers.lab.folder / "worker"))
+            return honest(replace(task, run=""))
+
+    computers.run("first", SIMULATE)
+    with monkeypatch.context() as there:
+        there.setattr(execution, "compute", elsewhere)
+        assert counts(computers.lab.run(f"{SCALE} --json").out) == (3, 0)
+    assert json.loads(computers.lab.run(f"{SCALE} --json").out)["reused"] == 3
+    expect_whole(files)
+    computers.run("second", SIMULATE, SCALE)
+    assert content(computers.lab.folder / "second/project") == content(Path.cwd())
+
+
+def test_a_store_of_another_format_is_refused(computers: Computers, files: Stepping) -> None:
+    files.create("format", b"99\n")
+    ran = computers.lab.call(SIMULATE)
+    assert ran.code == 2 and "99" in ran.err
+    with pytest.raises(UsageError):
+        computers.store.bucket  # noqa: B018
+
+
+def test_a_record_that_others_replace_all_the_time_is_an_error(
+    files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "create", lambda name, content: False)
+    with pytest.raises(TacpipeError, match="again"):
+        RemoteStore(files).commit({"stage": "x"}, {"recordings": {}, "files": {}}, {}, replace=True)
