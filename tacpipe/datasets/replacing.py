@@ -21,7 +21,7 @@ from tacpipe.datasets import recording_names
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import places, regular
-from tacpipe.io.hashing import bytes_digest, digest
+from tacpipe.io.hashing import digest
 from tacpipe.printable import listed, plain
 from tacpipe.store.store import Store
 
@@ -250,7 +250,7 @@ def returning_labels(
     # what a manifest held that is not lasting, the one after it holds too
     names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
     found: dict[str, Mapping[str, Any]] = {}
-    for name in names if before is None else [name for name in names if name != bytes_digest(before.content)]:
+    for name in names if before is None else [name for name in names if name != before.content_digest]:
         try:
             known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
         except StorageError:
