@@ -140,16 +140,18 @@ def test_two_recordings_on_two_pages_that_name_one_path_are_refused(few_are_many
         manifest.parse(Manifest("stage", 1, recordings=recordings).content, "given")
 
 
-def test_a_large_manifest_takes_little_more_memory_than_its_text() -> None:
+def test_a_large_manifest_takes_little_more_memory_than_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "LARGE", 1 << 18)
+    monkeypatch.setattr(pages, "PAGE_BYTES", 1 << 12)
     attributes = {"material": "felt", "sensor": "xela-uskin", "speed_m_s": 0.25}
-    entries = {f"trial-{number:06d}": {"attributes": attributes, "shards": {"": SHARD}} for number in range(20_000)}
+    entries = {f"trial-{number:06d}": {"attributes": attributes, "shards": {"": SHARD}} for number in range(2_000)}
     content = Manifest("stage", 1, recordings=entries).content
     assert len(content) > pages.LARGE
     entries.clear()
     tracemalloc.start()
     try:
         found = manifest.parse(content, "given")
-        assert sum(size for _, size in found.sizes()) == 20_000
+        assert sum(size for _, size in found.sizes()) == 2_000
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -180,3 +182,32 @@ def test_stages_give_the_same_datasets_where_recordings_are_kept_as_text(
     monkeypatch.undo()
     monkeypatch.chdir(lab.folder)
     assert chain("second") == text
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_a_dataset_in_pages_opens_its_recordings_when_they_are_asked_for(lab: Lab) -> None:
+    lab.run("simulate toy --rows 2 --trials 9 -o data/toy")
+    lab.run("label data/toy trial-002 --exclude dropped")
+    opened = tacpipe.open(lab.folder / "data/toy")
+    names = [f"trial-{number:03d}" for number in range(9) if number != 2]
+
+    assert list(opened.recordings) == [one.name for one in opened] == names
+    assert (len(opened), "trial-002" in opened, "trial-003" in opened) == (8, False, True)
+    with pytest.raises(tacpipe.UsageError):
+        opened["trial-002"]
+    some = opened.only(["trial-007", "trial-001"])
+    assert [one.name for one in some] == ["trial-001", "trial-007"]
+    assert some["trial-001"].table("left").equals(opened.recordings["trial-001"].table("left"))
+    copied = pickle.loads(pickle.dumps(some))
+    assert copied.to_pandas("left").equals(some.to_pandas("left"))
+    assert [one.name for one in opened.select(trial=lambda trial: trial > 6)] == ["trial-007", "trial-008"]
+
+
+@given(MANY, st.integers(1, 600))
+def test_the_size_of_a_shard_is_found_by_its_path(recordings: dict[str, Any], page_bytes: int) -> None:
+    whole = Manifest("stage", 1, recordings=recordings, files={"a/b": {"digest": "0" * 64, "bytes": 7}})
+    found = paged(whole, page_bytes)
+    for path, name, size in whole.contents():
+        assert found.size_of(name, path) == whole.size_of(name, path) == size
+        assert found.size_of("1" * 64, path) is None
+    assert whole.size_of("0" * 64, "not/there") is None

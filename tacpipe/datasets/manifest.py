@@ -130,6 +130,15 @@ class Manifest:
         """Yield digest and size in bytes of every shard and file."""
         return ((name, size) for _, name, size in self.contents())
 
+    def size_of(self, name: str, path: str) -> int | None:
+        """Return how many bytes the shard or file of this digest has at ``path``, None where there is none."""
+        bare = path.removesuffix(".parquet")
+        parts = bare.split("/")
+        places = [(bare, ""), *(("/".join(parts[:at]), "/".join(parts[at:])) for at in range(1, len(parts)))]
+        known = [self.recordings[one]["shards"].get(stream) for one, stream in places if one in self.recordings]
+        sizes = (one["bytes"] for one in [self.files.get(path), *known] if one is not None and one["digest"] == name)
+        return next(sizes, None)
+
     @cached_property
     def _listing(self) -> list[_Listed] | None:
         """What `check` found of a manifest of many recordings, so that `contents` parses them not again."""
