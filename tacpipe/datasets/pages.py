@@ -24,8 +24,9 @@ _KEPT = 4  # pages that stay parsed
 _BEGIN, _END = b'\n "recordings": {\n', b"\n }"
 _MEMBER = b'\n  "'  # begins a line of a recording's name, and no other line
 _NAME = re.compile(rb'  ("(?:[^"\\]|\\.)*"): ')
+_SHARD = ("bytes", "digest", "rows")
 _ORDER = "its recordings are not in the order of their names"
-_NAMES = re.compile(rb'^  ("(?:[^"\\]|\\.)*"): ', re.MULTILINE)
+_NAMES = re.compile(rb'\n  ("(?:[^"\\]|\\.)*"): ')  # literal from the start, so that searching is fast
 _CONSTANTS = {None: "null", True: "true", False: "false"}
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
 
@@ -99,7 +100,8 @@ class Pages(Mapping[str, Entry]):
                 yield self._page(number)
 
     def _names(self, number: int) -> list[str]:
-        found: list[str] = json.loads(b"[%b]" % b",".join(_NAMES.findall(self.texts[number])))
+        names = _NAMES.findall(b"\n" + bytes(self.texts[number]))
+        found: list[str] = json.loads(b"[%b]" % b",".join(names))
         return found
 
     def _page(self, number: int) -> dict[str, Entry]:
@@ -179,7 +181,35 @@ def write(value: Mapping[str, Any]) -> bytes:
 
 def page(entries: Mapping[str, Entry]) -> bytes:
     """Return recordings as they stand in a manifest, in the order of names, between the braces."""
-    return indented(dict(entries), "\n ")[len("{\n") : -len("\n }")].encode() if entries else b""
+    return ",\n".join(
+        [f"  {encode_basestring_ascii(name)}: {_entry(entries[name])}" for name in sorted(entries)]
+    ).encode()
+
+
+def _entry(entry: Entry) -> str:
+    """Return what `indented` returns for the entry of a recording, in half the time where it has the usual form."""
+    attributes, shards = entry["attributes"], entry["shards"]
+    usual = all(type(one["bytes"]) is type(one["rows"]) is int and len(one) == len(_SHARD) for one in shards.values())
+    if len(entry) > len(("attributes", "shards")) or not (attributes and shards and usual):
+        return indented(entry, "\n  ")
+    labels = [f"{encode_basestring_ascii(name)}: {_label(attributes[name])}" for name in sorted(attributes)]
+    streams = [
+        f'{encode_basestring_ascii(name)}: {{\n     "bytes": {one["bytes"]},\n     "digest": '
+        f'{encode_basestring_ascii(one["digest"])},\n     "rows": {one["rows"]}\n    }}'
+        for name, one in sorted(shards.items())
+    ]
+    inner = ",\n    "
+    return (
+        f'{{\n   "attributes": {{\n    {inner.join(labels)}\n   }},'
+        f'\n   "shards": {{\n    {inner.join(streams)}\n   }}\n  }}'
+    )
+
+
+def _label(value: Any) -> str:
+    kind = type(value)
+    if kind is str:
+        return encode_basestring_ascii(value)
+    return repr(value) if kind is int else indented(value, "\n    ")
 
 
 @dataclass(frozen=True)
