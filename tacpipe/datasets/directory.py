@@ -112,12 +112,23 @@ def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:
 
     Without ``shards`` those of the manifest alone; ``deep``: in folders at any depth, as exports have them.
     """
-    below = (Path(place) for place, _, _ in walk(directory, links=False)) if deep else listed(directory)
-    for folder in (directory, *(below if shards else ())):
-        if folder == directory or (folder.is_dir() and not folder.is_symlink()):
-            for path in listed(folder, f".*{_DRAFT}"):
-                if _OURS.fullmatch(path.name):
-                    _remove_draft(path)
+    if deep:
+        folders = [Path(place) for place, _, _ in walk(directory, links=False)]
+    else:
+        folders = [directory, *(_folders(directory) if shards else ())]
+    for folder in folders:
+        for path in listed(folder, f".*{_DRAFT}"):
+            if _OURS.fullmatch(path.name):
+                _remove_draft(path)
+
+
+def _folders(folder: Path) -> list[Path]:
+    """Return the folders in a folder, links left out; of a hundred thousand files none is looked at."""
+    try:
+        with os.scandir(folder) as found:
+            return sorted(folder / one.name for one in found if one.is_dir(follow_symlinks=False))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
 
 
 def sweep_beside(path: Path) -> None:

@@ -140,7 +140,7 @@ def changed(recordings: Mapping[str, Entry], entries: Mapping[str, Entry | None]
 
 def beside(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tuple[str, Entry | None, Entry | None]]:
     """Yield name and entry, before and now, of all recordings of two datasets, in the order of names."""
-    left, right = _ordered(before), _ordered(now)
+    left, right = ordered(before), ordered(now)
     old, new = next(left, None), next(right, None)
     while old is not None or new is not None:
         if new is None or (old is not None and old[0] < new[0]):
@@ -155,7 +155,8 @@ def beside(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tu
             old, new = next(left, None), next(right, None)
 
 
-def _ordered(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
+def ordered(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
+    """Return names and entries in the order of names."""
     return iter(recordings.items() if isinstance(recordings, Pages) else sorted(recordings.items()))
 
 

@@ -178,8 +178,8 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
             f"Rename the new ones, or give -o another directory, {alone}"
         )
     _refuse_alike(before, output, plan, alone)
-    others = sorted(set(before.recordings) - set(plan.sources))
-    if plan.sources and others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
+    others = sorted(set(before.recordings) - set(plan.sources)) if plan.sources else []
+    if others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
         raise UsageError(
             f"{output} holds {len(others)} recordings that this source does not have ({listed(others, _SHOWN)}), and they "
             f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
@@ -190,6 +190,8 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
 def _refuse_alike(before: Manifest, output: Path, plan: Plan, alone: str) -> None:
     """Raise `UsageError` where a new recording has the raw files of one at ``output``, or its name but for case."""
     new = [name for name in plan.sources if name not in before.recordings]
+    if not new:
+        return
     names = {recording_names.folded(name): name for name in before.recordings}
     files = {frozenset(dict(digests).items()): name for name, digests in before.sources.items()}
     for name in new:

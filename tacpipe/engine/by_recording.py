@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 from tacpipe.datasets import manifest, pages
@@ -50,8 +51,9 @@ class ByRecording:
         missing: list[Task] = []
         stored: dict[str, Mapping[str, Any]] = {}  # of groups of which something is missing
         many = len(entries) >= pages.MANY
+        ordered = pages.ordered(entries)
         for group in keys.groups(entries):
-            some = {one: entries[one] for one in group}
+            some = dict(islice(ordered, len(group)))
             asked = _Asked(keys.of_group(step, stage, some), some)
             made = None if self.request.compare or self._reruns(name) else self._of_group(asked)
             if made is None:
