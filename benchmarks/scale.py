@@ -1,11 +1,13 @@
 """How commands grow with the number of recordings, measured on simulated stores of tiny shards.
 
-    python benchmarks/scale.py [--counts 10000 100000] [--folder FOLDER]
+    python benchmarks/scale.py [--counts 10000 100000] [--folder FOLDER] [--manifest-alone]
 
 Objects, records and directories are written by the library's own functions, in bulk and without waiting for the disk.
 Each recording is a copy of one that was simulated, with bytes of its own before the footer, so that each has another
 digest. Each command is a process of its own: seconds, peak of resident memory, bytes read and system calls that look at
-files (by `strace`, where it is installed, in a run of its own) are those of the process.
+files (by `strace`, where it is installed, in a run of its own) are those of the process. With ``--manifest-alone`` all
+recordings share the shards of one, and none lies in the dataset's directory: a million takes minutes and no inodes, and
+the steps are those that look at the manifest.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from typing import Any
 import timing
 
 from tacpipe.datasets import directory
-from tacpipe.datasets.manifest import Entry, find
+from tacpipe.datasets.manifest import NAME, Entry, find
 from tacpipe.engine import keys
 from tacpipe.io import parquet
 from tacpipe.io.hashing import digest
@@ -37,6 +39,7 @@ SIMULATE = "simulate forward --trials 1 --duration-s 4 --tactile-rate-hz 25 --ro
 STREAM, COLUMNS = "xela1", 5  # what each recording keeps of the simulated one
 LOOKS = "newfstatat,stat,lstat,statx,access,openat,getdents64"
 HIT = "synchronize recordings -o synced --quiet"
+OPEN = "import tacpipe; tacpipe.open('synced')['trial-0000001']"
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Cost:
 class Lab:
     """A project of many recordings, all of which were synchronized before, each alone."""
 
-    def __init__(self, folder: Path, count: int) -> None:
+    def __init__(self, folder: Path, count: int, *, manifest_alone: bool = False) -> None:
         folder.mkdir(parents=True)
         (folder / ".tacpipe").mkdir()
         self.folder, self.store = folder, Store(folder / ".tacpipe")
@@ -65,6 +68,7 @@ class Lab:
         self._rows = table.num_rows
         self._made = replace(made, recordings={})
         self.count = 0
+        self._listed = "", ""  # digests of the dataset and of its manifest, that was listed last
         self.entries: dict[str, Entry] = {}
         self.add(1)
         timing.run(f"tacpipe {HIT}", folder)
@@ -73,7 +77,10 @@ class Lab:
         self._one = self._record(self.entries)
         (stored,) = self._one["result"]["recordings"][""]["shards"].values()
         self._synced = self.store.read(stored["digest"])
-        self.add(count - 1, synchronized=True)
+        if manifest_alone:
+            self.list_alone(count)
+        else:
+            self.add(count - 1, synchronized=True)
 
     def add(self, count: int, *, synchronized: bool = False) -> None:
         """Add recordings to the dataset, whose results are in the store where they were ``synchronized``."""
@@ -92,6 +99,25 @@ class Lab:
         self.store.put(manifest.content)
         directory.publish(self.store, manifest, self.folder / "recordings")
 
+    def list_alone(self, count: int) -> None:
+        """Have both manifests name ``count`` recordings with the shards of one, and write nothing else."""
+        for place in ("recordings", "synced"):
+            found = find(self.folder / place).manifest
+            (entry,) = found.recordings.values()
+            entries = {
+                f"trial-{number:07d}": {**entry, "attributes": {**entry["attributes"], "trial": number}}
+                for number in range(count)
+            }
+            inputs = (
+                {}
+                if place == "recordings"
+                else {"datasets": [{"dataset": self._listed[0], "manifest": self._listed[1]}]}
+            )
+            listed = replace(found, recordings=entries, inputs=inputs)
+            self._listed = listed.digest, self.store.put(listed.content).digest
+            self.store.roots.set(self.folder / place, self._listed[1])
+            (self.folder / place / NAME).write_bytes(listed.content)
+
     def _entry(self, number: int) -> Entry:
         attributes = {"material": f"m{number % 20}", "sensor": "xela-uskin", "trial": number}
         return {"attributes": attributes, "shards": {STREAM: {**self._put(self._raw, number), "rows": self._rows}}}
@@ -109,6 +135,7 @@ class Lab:
 STEPS = {  # in this order; those that change the dataset come last
     "all results stored, the run new": HIT,
     "hit": HIT,
+    "open, one recording": OPEN,
     "show": "show recordings",
     "explain": "explain synced",
     "split": "split synced -o split --quiet",
@@ -119,6 +146,9 @@ STEPS = {  # in this order; those that change the dataset come last
     "one label, synchronized": HIT,
     "one new recording": HIT,
 }
+
+
+OF_MANIFEST = ("open, one recording", "show", "explain", "split", "one label")  # look at no shard, or at twenty
 
 
 def measure(lab: Lab) -> dict[str, Cost]:
@@ -137,7 +167,8 @@ def measure(lab: Lab) -> dict[str, Cost]:
 def cost(lab: Lab, command: str) -> Cost:
     """Return what a command of tacpipe costs; its looks are not counted."""
     begun = time.perf_counter()
-    words = [timing.PYTHON, "-S", "-c", timing.SMALL, f"{timing.BIN}/tacpipe", *shlex.split(command)]
+    program = [timing.PYTHON, "-c", command] if command == OPEN else [f"{timing.BIN}/tacpipe", *shlex.split(command)]
+    words = [timing.PYTHON, "-S", "-c", timing.SMALL, *program]
     done = subprocess.run(words, cwd=lab.folder, env=timing.environment_of(), stdout=subprocess.PIPE, check=False)
     seconds = time.perf_counter() - begun
     if done.returncode:
@@ -163,7 +194,7 @@ def table(found: dict[int, dict[str, Cost]]) -> str:
         len(counts) > 1
     )
     lines = [f"| step | {' | '.join(heads)} |", "| --- |" + " ---: |" * (5 * len(counts) + (len(counts) > 1))]
-    for name in STEPS:
+    for name in (name for name in STEPS if name in found[counts[0]]):
         cells = [name]
         for cost in (found[count][name] for count in counts):
             megabytes = (f"{size / 1e6:,.0f}" for size in (cost.memory_bytes, cost.read_bytes))
@@ -184,13 +215,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--folder", type=Path, help="Where to make the stores; they stay there.")
+    parser.add_argument("--manifest-alone", action="store_true", help="Measure what looks at manifests alone.")
     given = parser.parse_args()
     setattr(os, "fsync", lambda handle: None)  # noqa: B010  (of this process alone, which makes what is measured)
     found = {}
     with tempfile.TemporaryDirectory(prefix="tacpipe-scale-") as temporary:
         for count in given.counts:
-            found[count] = measure(Lab((given.folder or Path(temporary)) / str(count), count))
-    print(table(found))
+            lab = Lab((given.folder or Path(temporary)) / str(count), count, manifest_alone=given.manifest_alone)
+            steps = {name: cost(lab, STEPS[name]) for name in OF_MANIFEST} if given.manifest_alone else measure(lab)
+            found[count] = steps
+            print(table({count: steps}), flush=True)
+    if len(found) > 1:
+        print(table(found))
 
 
 if __name__ == "__main__":

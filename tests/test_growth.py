@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import directory, manifest
+from tacpipe.datasets import directory, manifest, pages
 from tacpipe.engine import keys
 from tacpipe.errors import DamagedError
 from tacpipe.store.store import Store
@@ -133,7 +133,7 @@ VALUES = st.recursive(
 
 @given(VALUES)
 def test_a_manifest_is_indented_as_the_standard_library_does(value: Any) -> None:
-    assert manifest.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+    assert pages.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
 
 
 def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
@@ -141,7 +141,7 @@ def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
         with pytest.raises((ValueError, TypeError)) as expected:
             json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
         with pytest.raises(expected.type):
-            manifest.indented(value)
+            pages.indented(value)
 
 
 def test_a_manifest_that_was_edited_is_refused_though_the_sound_one_was_read(lab: Lab) -> None:

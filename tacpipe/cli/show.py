@@ -36,8 +36,7 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     """
     found = manifest_of.find(path)
     store = locate(found.directory)
-    sizes = dict(found.manifest.sizes())
-    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),), sizes))
+    opened = Dataset(found.manifest, execution.reader(store, (str(found.directory.absolute()),), found.manifest))
     about = _about(opened)
     if model_overview.is_result(opened):
         return {"kind": "result", **about, **model_overview.of_result(opened, found, store)}
@@ -77,10 +76,9 @@ def _about(opened: Dataset) -> dict[str, Any]:
 
 def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
     """Return how many recordings have each role, by fold, where the dataset is a split; else nothing."""
-    shards = list(opened.recordings.values())
-    if len(shards) != 1 or shards[0].streams != ("",):
+    if len(opened) != 1 or (shard := next(iter(opened))).streams != ("",):
         return {}
-    table = shards[0].table()
+    table = shard.table()
     if not set(_SPLIT) <= set(table.column_names):
         return {}
     found: dict[str, dict[str, int]] = {}

@@ -9,7 +9,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.datasets.manifest import Manifest, shard_path
+from tacpipe.datasets.manifest import Entry, Manifest, shard_path
+from tacpipe.datasets.pages import Pages
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
@@ -160,13 +161,9 @@ class Dataset:
         directory: Path | None = None,
         opener: Callable[[Path | str], Dataset] | None = None,
     ) -> None:
-        included = manifest.included
-        chosen = sorted(included if names is None else names)
         self.source = manifest
         self.path = directory  # where it was opened; None for one that a stage was given
-        self.recordings: Mapping[str, Recording] = {
-            name: Recording(name, included[name], read, self) for name in chosen
-        }
+        self.recordings: Mapping[str, Recording] = _recordings(self, manifest.included, read, names)
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
         self._read, self._opener = read, opener
 
@@ -383,6 +380,39 @@ class Dataset:
         if len(streams) > 1:
             raise UsageError(f"Name the stream to read: the recordings have {', '.join(sorted(streams))}.")
         return next(iter(streams), "")
+
+
+class _Recordings(Mapping[str, Recording]):
+    """Recordings of a large dataset by name, each made when it is asked for."""
+
+    def __init__(
+        self, dataset: Dataset, entries: Mapping[str, Entry], read: Reader, names: Sequence[str] | None
+    ) -> None:
+        self._dataset, self._entries, self._read = dataset, entries, read
+        self._names = None if names is None else dict.fromkeys(names)  # of a part of the dataset
+
+    def __getitem__(self, name: str) -> Recording:
+        if self._names is not None and name not in self._names:
+            raise KeyError(name)
+        return Recording(name, self._entries[name], self._read, self._dataset)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries if self._names is None else self._names)
+
+    def __len__(self) -> int:
+        return len(self._entries if self._names is None else self._names)
+
+
+def _recordings(
+    dataset: Dataset, entries: Mapping[str, Entry], read: Reader, names: Iterable[str] | None
+) -> Mapping[str, Recording]:
+    """Return recordings by name, in the order of names; all of ``entries``, or those of these names."""
+    if isinstance(entries, Pages) and names is None:
+        return _Recordings(dataset, entries, read, None)
+    chosen = sorted(entries if names is None else names)
+    if isinstance(entries, Pages):
+        return _Recordings(dataset, entries, read, [name for name in chosen if entries[name]])
+    return {name: Recording(name, entries[name], read, dataset) for name in chosen}
 
 
 def _reopened(

@@ -7,17 +7,18 @@ import os
 import re
 import stat
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from tacpipe.datasets import adoption, replacing
+from tacpipe.datasets import adoption, pages, replacing
 from tacpipe.datasets.delivery import deliver
-from tacpipe.datasets.manifest import NAME, Manifest, parse
+from tacpipe.datasets.manifest import NAME, Manifest, parse, shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole
-from tacpipe.io.hashing import bytes_digest, digest, file_digest
+from tacpipe.io.hashing import digest, file_digest
 from tacpipe.store.store import MissingError, Store
 
 _DRAFT = ".draft"
@@ -42,14 +43,14 @@ def publish(store: Store, manifest: Manifest, directory: Path) -> None:
     directory = directory.absolute()
     if shows(store, manifest, directory):
         deliver(store, directory, manifest)
-        store.roots.set(directory, bytes_digest(manifest.content))
+        store.roots.set(directory, manifest.content_digest)
         return
     change(store, directory, lambda: Change(manifest))
 
 
 def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
     """Return whether ``directory`` shows ``manifest`` already, with all that it names."""
-    return _current(directory, manifest.content) and not _stale(store, manifest, directory)
+    return _current(directory, manifest) and next(_stale(store, manifest, directory), None) is None
 
 
 def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manifest:
@@ -80,19 +81,16 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
 def _show(store: Store, wanted: Change, directory: Path) -> None:
     manifest, relabelled = wanted.manifest, wanted.relabelled
     check_output(store, directory)
-    objects = dict(manifest.objects())
-    current = _current(directory, manifest.content)
-    shown = {} if relabelled or current else _named(directory)
-    if relabelled:
-        stale = []
-    elif current or manifest.exported:  # files of an export are large copies, so those that are right stay
-        stale = _stale(store, manifest, directory)
-    else:  # what the manifest before named already stays, so that a recording that comes costs itself
-        sizes = dict(manifest.sizes())
-        stale = [
-            path for path, name in objects.items() if shown.get(path) != name or not _lies(directory, path, sizes[name])
-        ]
-    gone = set(shown) - set(objects)
+    current = _current(directory, manifest)
+    stale: dict[str, str] = {}
+    gone: set[str] = set()
+    if current or (
+        manifest.exported and not relabelled
+    ):  # files of an export are large copies: those that are right stay
+        stale = dict(_stale(store, manifest, directory))
+    if not current and not relabelled:  # what was named already stays, so that a recording that comes costs itself
+        unlike, gone = _compared(_shown(directory), manifest, directory)
+        stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
@@ -100,12 +98,12 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         if before is not None and lasting:
             adoption.adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
-        store.roots.set(directory, bytes_digest(manifest.content), durable=True, lasting=lasting)
+        store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting)
         store.fetch(objects[path] for path in stale)
         sweep(directory, shards=bool(stale), deep=manifest.exported)
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
-                place(store, objects[path], directory / path, copy=manifest.copied)
+                place(store, stale[path], directory / path, copy=manifest.copied)
         _remove(directory, gone)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
@@ -118,12 +116,23 @@ def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:
 
     Without ``shards`` those of the manifest alone; ``deep``: in folders at any depth, as exports have them.
     """
-    below = (Path(place) for place, _, _ in walk(directory, links=False)) if deep else listed(directory)
-    for folder in (directory, *(below if shards else ())):
-        if folder == directory or (folder.is_dir() and not folder.is_symlink()):
-            for path in listed(folder, f".*{_DRAFT}"):
-                if _OURS.fullmatch(path.name):
-                    _remove_draft(path)
+    if deep:
+        folders = [Path(place) for place, _, _ in walk(directory, links=False)]
+    else:
+        folders = [directory, *(_folders(directory) if shards else ())]
+    for folder in folders:
+        for path in listed(folder, f".*{_DRAFT}"):
+            if _OURS.fullmatch(path.name):
+                _remove_draft(path)
+
+
+def _folders(folder: Path) -> list[Path]:
+    """Return the folders in a folder, links left out; of a hundred thousand files none is looked at."""
+    try:
+        with os.scandir(folder) as found:
+            return sorted(folder / one.name for one in found if one.is_dir(follow_symlinks=False))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
 
 
 def sweep_beside(path: Path) -> None:
@@ -159,8 +168,35 @@ def writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _stale(store: Store, manifest: Manifest, directory: Path) -> list[str]:
-    return [path for path, name in manifest.objects() if not _matches(f"{directory}/{path}", store, name)]
+def _stale(store: Store, manifest: Manifest, directory: Path) -> Iterator[tuple[str, str]]:
+    """Yield path and digest of what ``directory`` does not hold as the store does."""
+    return (one for one in manifest.objects() if not _matches(f"{directory}/{one[0]}", store, one[1]))
+
+
+def _compared(shown: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
+    """Return what is to be placed in ``directory``, path and digest, and the paths that are to go.
+
+    Placed is what it lacks, in this size, and what ``shown``, its manifest, has otherwise.
+    """
+    stale: dict[str, str] = {}
+    gone: set[str] = set()
+    files = {} if shown is None else shown.files
+    for name, before, now in pages.beside({} if shown is None else shown.recordings, manifest.recordings):
+        old, new = ({} if one is None else one["shards"] for one in (before, now))
+        gone.update(shard_path(name, stream) for stream in old if stream not in new)
+        for stream, shard in new.items():
+            path = shard_path(name, stream)
+            if not (_same(old.get(stream), shard) and _lies(directory, path, shard["bytes"])):
+                stale[path] = shard["digest"]
+    gone.update(path for path in files if path not in manifest.files)
+    for path, file in manifest.files.items():
+        if not (_same(files.get(path), file) and _lies(directory, path, file["bytes"])):
+            stale[path] = file["digest"]
+    return stale, gone.difference(path for path, _ in manifest.objects()) if gone else gone
+
+
+def _same(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> bool:
+    return before is not None and before["digest"] == now["digest"]
 
 
 def refuse_links(directory: Path, paths: Iterable[str]) -> None:
@@ -252,9 +288,9 @@ def _matches(path: str, store: Store, name: str) -> bool:
     return same or (there.st_size == stored.st_size and file_digest(path) == name)
 
 
-def _current(directory: Path, content: bytes) -> bool:
+def _current(directory: Path, manifest: Manifest) -> bool:
     try:
-        return regular.content(directory / NAME, regular.JSON_BYTES) == content
+        return regular.content(directory / NAME, regular.JSON_BYTES) == manifest.content
     except (FileNotFoundError, NotADirectoryError):
         return False
 
@@ -268,10 +304,9 @@ def _lies(directory: Path, path: str, size: int) -> bool:
     return stat.S_ISREG(there.st_mode) and there.st_size == size
 
 
-def _named(directory: Path) -> dict[str, str]:
-    """Return path and digest of all that the manifest in ``directory`` names; nothing if there is no readable one."""
+def _shown(directory: Path) -> Manifest | None:
+    """Return the manifest in ``directory``; None if there is no readable one."""
     try:
-        content = regular.content(directory / NAME, regular.JSON_BYTES)
-        return dict(parse(content, str(directory)).objects())
+        return parse(regular.content(directory / NAME, regular.JSON_BYTES), str(directory))
     except (FileNotFoundError, TacpipeError):
-        return {}
+        return None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tacpipe import printable
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets.manifest import Manifest
+from tacpipe.datasets import pages
+from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed
@@ -121,23 +123,42 @@ def _input_changes(store: Store, argument: str, before: list[dict[str, str]], no
         raise
     except TacpipeError:
         return [f"inputs.{argument}: another dataset, whose manifest is no longer in the store"]
-    found = []
-    for part in ("shards", "attributes"):
-        left, right = (
-            {name: entry[part] for manifest in several for name, entry in manifest.recordings.items()}
-            for several in (old, new)
-        )
-        found += _compared(f"inputs.{argument}.{part}", left, right, quiet_names=part == "attributes")
+    found = _recordings_compared(f"inputs.{argument}", *(_together(several) for several in (old, new)))
     files = ({name: file for manifest in several for name, file in manifest.files.items()} for several in (old, new))
     return [*found, *_compared(f"inputs.{argument}.files", *files)]
 
 
-def _compared(what: str, before: dict[str, Any], now: dict[str, Any], *, quiet_names: bool = False) -> list[str]:
+def _together(manifests: Sequence[Manifest]) -> Mapping[str, Entry]:
+    if len(manifests) == 1:
+        return manifests[0].recordings
+    return {name: entry for manifest in manifests for name, entry in manifest.recordings.items()}
+
+
+def _recordings_compared(what: str, before: Mapping[str, Entry], now: Mapping[str, Entry]) -> list[str]:
+    """Return in words in which recordings two datasets differ; each is looked at once, next to the one of its name."""
+    new: list[str] = []
+    gone: list[str] = []
+    others: dict[str, list[str]] = {"shards": [], "attributes": []}
+    for name, old, entry in pages.beside(before, now):
+        if old is None or entry is None:
+            (new if old is None else gone).append(name)
+            continue
+        for part, names in others.items():
+            names += [name] if old[part] != entry[part] else []
+    shards = {"new": new, "gone": gone, "other": others["shards"]}
+    return [*_counted(f"{what}.shards", shards), *_counted(f"{what}.attributes", {"other": others["attributes"]})]
+
+
+def _compared(what: str, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
     groups = {
-        "new": [] if quiet_names else sorted(set(now) - set(before)),
-        "gone": [] if quiet_names else sorted(set(before) - set(now)),
+        "new": sorted(set(now) - set(before)),
+        "gone": sorted(set(before) - set(now)),
         "other": sorted(name for name in set(before) & set(now) if before[name] != now[name]),
     }
+    return _counted(what, groups)
+
+
+def _counted(what: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
     return [f"{what}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
 
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from array import array
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from json.encoder import encode_basestring_ascii
-from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
+from tacpipe.datasets import pages
 from tacpipe.errors import DamagedError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.files import unread
-from tacpipe.io.hashing import DIGEST, bytes_digest, digest
+from tacpipe.io.hashing import DIGEST, bytes_digest, canonical
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 
@@ -28,10 +30,14 @@ NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add t
 _PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"  # the last: of Zarr
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 _PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
-_CONSTANTS = {None: "null", True: "true", False: "false"}
+_DIGESTS = re.compile(rf"(?:{DIGEST.pattern}\n)*")
+_SHARED = f"two of its shards and files share a path, or one is called {NAME}"
+_ATTRIBUTES = frozenset((str, int, float, bool, type(None)))
+_TEXT, _WHOLE = frozenset((str,)), frozenset((int,))
 _REMEMBERED = 2
 _parsed: dict[str, Manifest] = {}  # by the digest of their content, the last ones that were verified
-Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+Entry = pages.Entry
+_Listed: TypeAlias = "tuple[str, str, array[int]]"  # paths and digests, one a line, and sizes in bytes
 
 
 @dataclass(frozen=True)
@@ -52,21 +58,21 @@ class Manifest:
     @cached_property
     def digest(self) -> str:
         """The dataset's digest: of names, attributes, shards and files, and not of how they were made."""
-        recordings = {
-            name: {
-                "attributes": entry["attributes"],
-                "shards": {stream: shard["digest"] for stream, shard in entry["shards"].items()},
-            }
-            for name, entry in self.recordings.items()
-        }
-        return digest({"recordings": recordings, "files": {name: file["digest"] for name, file in self.files.items()}})
+        hashed = _Hashed(self.files)
+        for part in pages.parts(self.recordings):
+            hashed.add(part)
+        return hashed.digest()
 
     @cached_property
     def content(self) -> bytes:
         """The bytes of ``manifest.json``: the same manifest gives the same bytes."""
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        value = {"format": FORMAT, "digest": self.digest, **fields}
-        return indented(value).encode() + b"\n"
+        return pages.write({"format": FORMAT, "digest": self.digest, **fields})
+
+    @cached_property
+    def content_digest(self) -> str:
+        """The digest of ``manifest.json``."""
+        return bytes_digest(self.content)
 
     @property
     def recorded(self) -> bool:
@@ -83,40 +89,62 @@ class Manifest:
         """Whether its directory holds copies, not links: recordings, and exports, in which other tools may write."""
         return self.recorded or self.exported
 
-    @property
-    def included(self) -> dict[str, Entry]:
+    @cached_property
+    def included(self) -> Mapping[str, Entry]:
         """The recordings that nobody excluded."""
-        return {name: entry for name, entry in self.recordings.items() if not entry["attributes"].get("excluded")}
+        recordings = self.recordings
+        some = recordings.holding(b'"excluded"') if isinstance(recordings, pages.Pages) else [recordings]
+        excluded = [name for part in some for name, entry in part.items() if entry["attributes"].get("excluded")]
+        return pages.changed(self.recordings, dict.fromkeys(excluded)) if excluded else self.recordings
 
     def labelled(self, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
         """Return the manifest with attributes set by hand; labels of recordings that are not here are dropped."""
         kept = {
             name: {**self.labels.get(name, {}), **values} for name, values in labels.items() if name in self.recordings
         }
-        recordings = dict(self.recordings)
-        for name, values in kept.items():
-            attributes = {**recordings[name]["attributes"], **values}
+        changed = {}
+        for name, values in sorted(kept.items()):
+            attributes = {**self.recordings[name]["attributes"], **values}
             known = {key: value for key, value in attributes.items() if value is not None}
-            recordings[name] = {**recordings[name], "attributes": known}
+            changed[name] = {**self.recordings[name], "attributes": known}
+        recordings = pages.changed(self.recordings, changed)
         return replace(self, recordings=recordings, labels={**self.labels, **kept})
+
+    def contents(self) -> Iterator[tuple[str, str, int]]:
+        """Yield path in the directory, digest and size in bytes of every shard and file."""
+        if self._listing is not None:
+            for paths, digests, sizes in self._listing:
+                yield from zip(paths.split("\n"), digests.split("\n"), sizes, strict=False)
+            return
+        for name, entry in self.recordings.items():
+            for stream, shard in entry["shards"].items():
+                yield shard_path(name, stream), shard["digest"], shard["bytes"]
+        for name, file in self.files.items():
+            yield name, file["digest"], file["bytes"]
 
     def objects(self) -> Iterable[tuple[str, str]]:
         """Yield (path in the directory, digest) of every shard and file."""
-        for name, entry in self.recordings.items():
-            for stream, shard in entry["shards"].items():
-                yield shard_path(name, stream), shard["digest"]
-        for name, file in self.files.items():
-            yield name, file["digest"]
+        return ((path, name) for path, name, _ in self.contents())
 
     def sizes(self) -> Iterable[tuple[str, int]]:
         """Yield digest and size in bytes of every shard and file."""
-        for entry in self.recordings.values():
-            for shard in entry["shards"].values():
-                yield shard["digest"], shard["bytes"]
-        for file in self.files.values():
-            yield file["digest"], file["bytes"]
+        return ((name, size) for _, name, size in self.contents())
 
-    @property
+    def size_of(self, name: str, path: str) -> int | None:
+        """Return how many bytes the shard or file of this digest has at ``path``, None where there is none."""
+        bare = path.removesuffix(".parquet")
+        parts = bare.split("/")
+        places = [(bare, ""), *(("/".join(parts[:at]), "/".join(parts[at:])) for at in range(1, len(parts)))]
+        known = [self.recordings[one]["shards"].get(stream) for one, stream in places if one in self.recordings]
+        sizes = (one["bytes"] for one in [self.files.get(path), *known] if one is not None and one["digest"] == name)
+        return next(sizes, None)
+
+    @cached_property
+    def _listing(self) -> list[_Listed] | None:
+        """What `check` found of a manifest of many recordings, so that `contents` parses them not again."""
+        return None
+
+    @cached_property
     def rows(self) -> int:
         """How many rows all shards have together."""
         return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
@@ -130,25 +158,15 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
     name = bytes_digest(content)
     if name in _parsed:  # a command meets the same manifest several times
         return _parsed[name]
-    regular.expect_parsed(where, len(content))
     try:
-        value = json.loads(content)
-        found, stored = value.pop("format"), value.pop("digest")
-        if found != FORMAT:
-            if type(found) is not int or found < FORMAT:
-                raise ValueError(f"its format is {excerpt(found)}")
-            raise UsageError(
-                f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}. Install a newer tacpipe."
-            )
-        manifest = Manifest(**value)
-        manifest.__dict__["content"] = content  # primes the cached property: the bytes are at hand
-        computed = stored if verified else manifest.digest
-        check(manifest)
+        manifest, stored = _read(content, where, verified=verified)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(
             f"{where} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
             f"again."
         ) from None
+    manifest.__dict__.update(content=content, content_digest=name)  # primes cached properties: both are at hand
+    computed = stored if verified else manifest.digest
     if computed != stored:
         raise DamagedError(
             f"{where} was edited by hand: what it names has the digest {computed[:12]}, it states {excerpt(stored)[1:13]}. "
@@ -161,31 +179,51 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
     return manifest
 
 
-def indented(value: Any, line: str = "\n") -> str:
-    """Return what ``json.dumps(value, sort_keys=True, indent=1, allow_nan=False)`` returns, in half the time.
+def _read(content: bytes, where: str, *, verified: bool) -> tuple[Manifest, str]:
+    """Return the manifest of these bytes, with its own digest at hand, and the digest that they state."""
+    if len(content) >= pages.LARGE and (value := pages.split(content, where)) is not None:
+        with contextlib.suppress(ValueError):  # pages that are not as they should be: all of it is parsed
+            return _checked(value, where, verified=verified)
+    regular.expect_parsed(where, len(content))
+    return _checked(json.loads(content), where, verified=verified)
 
-    The standard library indents in Python and not in C. ``line`` begins each line. Raises as that does.
 
-    >>> indented({"b": [1, {"c": None}], "a": {}}) == json.dumps({"a": {}, "b": [1, {"c": None}]}, indent=1)
-    True
-    """
-    kind = type(value)
-    if kind is str:
-        return encode_basestring_ascii(value)
-    if kind is int or (kind is float and isfinite(value)):
-        return repr(value)
-    if value is None or kind is bool:
-        return _CONSTANTS[value]
-    inner = f"{line} "
-    if kind is dict and value:
-        if any(type(key) is not str for key in value):
-            return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", line)
-        names = sorted(value)
-        texts = [f"{encode_basestring_ascii(name)}: {indented(value[name], inner)}" for name in names]
-        return f"{{{inner}{f',{inner}'.join(texts)}{line}}}"
-    if kind in (list, tuple) and value:
-        return f"[{inner}{f',{inner}'.join([indented(one, inner) for one in value])}{line}]"
-    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", line)
+def _checked(value: dict[str, Any], where: str, *, verified: bool) -> tuple[Manifest, str]:
+    found, stored = value.pop("format"), value.pop("digest")
+    if found != FORMAT:
+        if type(found) is not int or found < FORMAT:
+            raise ValueError(f"its format is {excerpt(found)}")
+        raise UsageError(
+            f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}. Install a newer tacpipe."
+        )
+    manifest = Manifest(**value)
+    if verified and isinstance(manifest.recordings, pages.Pages):
+        listing: list[_Listed] = []
+        check(manifest, listing=listing, hashed=False)
+        manifest.__dict__["_listing"] = listing
+        return manifest, stored
+    check(manifest, hashed=not verified)
+    return manifest, stored
+
+
+class _Hashed:
+    """The digest of a dataset: the canonical JSON of its files and recordings, which come in parts."""
+
+    def __init__(self, files: Mapping[str, Any]) -> None:
+        self._hash = hashlib.sha256(b'{"files":' + canonical({name: file["digest"] for name, file in files.items()}))
+        self._between = b',"recordings":{'
+
+    def add(self, recordings: Mapping[str, Entry]) -> None:
+        """Add those that come next in the order of names."""
+        text = canonical({name: _described(entry) for name, entry in recordings.items()})[1:-1]
+        if text:
+            self._hash.update(self._between + text)
+            self._between = b","
+
+    def digest(self) -> str:
+        """Return the digest of all that was added; nothing may be added after that."""
+        self._hash.update(b"}}" if self._between == b"," else self._between + b"}}")
+        return self._hash.hexdigest()
 
 
 def safe_path(path: str) -> bool:
@@ -201,33 +239,86 @@ def safe_path(path: str) -> bool:
     return short and _PATH.fullmatch(path) is not None
 
 
-def check(manifest: Manifest) -> None:
-    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: it may be untrusted."""
+def check(manifest: Manifest, *, hashed: bool = True, listing: list[_Listed] | None = None) -> None:
+    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: it may be untrusted.
+
+    Each recording is looked at once: its digest, where it is to be ``hashed``, and its rows are at hand afterwards, and all
+    that it names is added to ``listing``.
+    """
     _check_lineage(manifest)
-    contents = list(manifest.files.values())
-    for entry in manifest.recordings.values():
-        for name, value in entry["attributes"].items():
-            if not isinstance(value, str | int | float | None):
-                raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
-        contents += entry["shards"].values()
-    counts = [one["bytes"] for one in contents] + [one["rows"] for one in contents[len(manifest.files) :]]
-    for count in counts:
-        if type(count) is not int or count < 0:
-            raise ValueError(f"{str(count)[:80]!r} is not a count of rows or bytes")
-    for one in contents:
-        _expect_digest(one["digest"])
-    _check_paths([path for path, _ in manifest.objects()])
+    _check_contents(manifest.files.values())
+    _check_paths([*manifest.files], ())
+    foldered, rows = False, 0
+    hashes = _Hashed(manifest.files) if hashed else None
+    for part in pages.parts(manifest.recordings):
+        for entry in part.values():
+            if not _ATTRIBUTES.issuperset(map(type, entry["attributes"].values())):
+                _refuse_attributes(entry["attributes"])
+        shards = [shard for entry in part.values() for shard in entry["shards"].values()]
+        _check_contents(shards)
+        counts = [shard["rows"] for shard in shards]
+        _check_counts(counts)
+        rows += sum(counts)
+        paths = [shard_path(name, stream) for name, entry in part.items() for stream in entry["shards"]]
+        _check_paths(paths, manifest.files)
+        foldered |= any("/" in name for name in part)
+        if hashes is not None:
+            hashes.add(part)
+        if listing is not None and shards:
+            listing.append(_listed(paths, shards))
+    if listing is not None and manifest.files:
+        listing.append(_listed([*manifest.files], manifest.files.values()))
+    if foldered and isinstance(manifest.recordings, pages.Pages):  # two pages may name one path
+        _refuse_shared([path for path, _ in manifest.objects()])
+    manifest.__dict__.update({"rows": rows} | ({} if hashes is None else {"digest": hashes.digest()}))
 
 
-def _check_paths(paths: list[str]) -> None:
-    text = "\n".join(paths)  # a thousand at once: a hit does not wait for a thousand calls
-    plain = text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
+def _listed(paths: Iterable[str], contents: Collection[Mapping[str, Any]]) -> _Listed:
+    digests = "\n".join([one["digest"] for one in contents])
+    return "\n".join(paths), digests, array("q", [one["bytes"] for one in contents])
+
+
+def _refuse_attributes(attributes: Mapping[str, Any]) -> None:
+    for name, value in attributes.items():
+        if not isinstance(value, str | int | float | None):
+            raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
+
+
+def _check_contents(contents: Collection[Mapping[str, Any]]) -> None:
+    _check_counts([one["bytes"] for one in contents])
+    digests = [one["digest"] for one in contents]
+    if not (_TEXT.issuperset(map(type, digests)) and _DIGESTS.fullmatch("".join([f"{one}\n" for one in digests]))):
+        for one in digests:
+            _expect_digest(one)
+
+
+def _check_counts(counts: Collection[Any]) -> None:
+    if not _WHOLE.issuperset(map(type, counts)) or min(counts, default=0) < 0:
+        wrong = next(count for count in counts if type(count) is not int or count < 0)
+        raise ValueError(f"{str(wrong)[:80]!r} is not a count of rows or bytes")
+
+
+def _check_paths(paths: list[str], others: Collection[str]) -> None:
+    text = "\n".join(paths)  # hundreds at once: a hit does not wait for a thousand calls
+    plain = text and text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
     if not plain or max(map(len, paths), default=0) > NAME_BYTES:
         for path in paths:
             if not safe_path(path):
                 raise ValueError(f"the path {path[:80]!r} leads out of the dataset, or no file can have it")
-    if len(set(paths)) < len(paths) or NAME in paths:
-        raise ValueError(f"two of its shards and files share a path, or one is called {NAME}")
+    _refuse_shared(paths)
+    if NAME in paths or (others and not set(others).isdisjoint(paths)):
+        raise ValueError(_SHARED)
+
+
+def _refuse_shared(paths: Sequence[str]) -> None:
+    if len(set(paths)) < len(paths):
+        raise ValueError(_SHARED)
+
+
+def _described(entry: Entry) -> dict[str, Any]:
+    """Return what the dataset's digest is made of."""
+    shards = {stream: shard["digest"] for stream, shard in entry["shards"].items()}
+    return {"attributes": entry["attributes"], "shards": shards}
 
 
 def _check_lineage(manifest: Manifest) -> None:

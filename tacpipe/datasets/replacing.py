@@ -21,7 +21,7 @@ from tacpipe.datasets import recording_names
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import places, regular
-from tacpipe.io.hashing import bytes_digest, digest
+from tacpipe.io.hashing import digest
 from tacpipe.printable import listed, plain
 from tacpipe.store.store import Store
 
@@ -178,8 +178,8 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
             f"Rename the new ones, or give -o another directory, {alone}"
         )
     _refuse_alike(before, output, plan, alone)
-    others = sorted(set(before.recordings) - set(plan.sources))
-    if plan.sources and others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
+    others = sorted(set(before.recordings) - set(plan.sources)) if plan.sources else []
+    if others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
         raise UsageError(
             f"{output} holds {len(others)} recordings that this source does not have ({listed(others, _SHOWN)}), and they "
             f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
@@ -190,6 +190,8 @@ def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
 def _refuse_alike(before: Manifest, output: Path, plan: Plan, alone: str) -> None:
     """Raise `UsageError` where a new recording has the raw files of one at ``output``, or its name but for case."""
     new = [name for name in plan.sources if name not in before.recordings]
+    if not new:
+        return
     names = {recording_names.folded(name): name for name in before.recordings}
     files = {frozenset(dict(digests).items()): name for name, digests in before.sources.items()}
     for name in new:
@@ -250,7 +252,7 @@ def returning_labels(
     # what a manifest held that is not lasting, the one after it holds too
     names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
     found: dict[str, Mapping[str, Any]] = {}
-    for name in names if before is None else [name for name in names if name != bytes_digest(before.content)]:
+    for name in names if before is None else [name for name in names if name != before.content_digest]:
         try:
             known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
         except StorageError:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
-from tacpipe.datasets import manifest
+from tacpipe.datasets import manifest, pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution, keys, provenance
 from tacpipe.engine.execution import Done, Task
@@ -22,6 +23,14 @@ from tacpipe.store.store import Store
 
 
 @dataclass(frozen=True)
+class _Asked:
+    """A group of recordings: what its key is the digest of, and the recordings."""
+
+    identity: Mapping[str, Any]
+    entries: Mapping[str, Entry]
+
+
+@dataclass(frozen=True)
 class ByRecording:
     """What a request wants of results recording by recording; what was done is added to ``outcome``."""
 
@@ -30,35 +39,58 @@ class ByRecording:
     outcome: Outcome
     chosen: Chosen
 
-    def mapped(self, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> dict[str, Entry]:
+    def mapped(self, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> Mapping[str, Entry]:
         """Return what the map stage of a link of a chain gives for each recording of ``given``; raises as `run`.
 
         A group of recordings has a record of its own, besides those of its recordings. So a dataset of which one recording
-        changed takes one record a group, and one for each recording of the group that changed.
+        changed takes one record a group, and one for each recording of the group that changed. What is answered is kept as
+        text where recordings are many.
         """
         entries, name, stage = given.included, step["stage"], execution.stage_of(step["stage"])
-        found: dict[str, Entry] = {}
-        unknown: list[tuple[dict[str, Any], list[str]]] = []
-
-        def identity_of(group: Sequence[str]) -> dict[str, Any]:
-            return keys.of_group(step, stage, {one: entries[one] for one in group})
-
-        self.store.expect(digest(identity_of(group)) for group in keys.groups(entries))
+        answered: list[pages.Kept | _Asked] = []
+        missing: list[Task] = []
+        stored: dict[str, Mapping[str, Any]] = {}  # of groups of which something is missing
+        many = len(entries) >= pages.MANY
+        self.store.expect(
+            digest(keys.of_group(step, stage, {one: entries[one] for one in group})) for group in keys.groups(entries)
+        )
+        ordered = pages.ordered(entries)
         for group in keys.groups(entries):
-            identity = identity_of(group)
-            record = None if self.request.compare or self._reruns(name) else self.store.record(digest(identity))
-            if record is None or not records.complete(self.store, record):
-                unknown.append((identity, group))
-                continue
-            found |= record["result"]["recordings"]
-            self.outcome.reused += len(group)
-            self.outcome.add_group(record["provenance"])
-        left = replace(given, recordings={one: entries[one] for _, group in unknown for one in group})
-        made = self._records(name, keys.shard_tasks(self.store, left, step, beside), len(found)) if unknown else {}
-        for identity, group in unknown if self.store.run else ():
-            if len(group) > 1 and made.keys() >= set(group):
-                self._remember_group(name, identity, {one: made[one] for one in group})
-        return _after({**found, **{one: record["result"]["recordings"][""] for one, record in made.items()}}, entries)
+            some = dict(islice(ordered, len(group)))
+            asked = _Asked(keys.of_group(step, stage, some), some)
+            made = None if self.request.compare or self._reruns(name) else self._of_group(asked)
+            if made is None:
+                tasks = keys.shard_tasks(self.store, replace(given, recordings=some), step, beside)
+                found, lacking = self._stored(name, tasks)
+                if lacking:
+                    stored |= found
+                    missing += lacking
+                    answered.append(asked)
+                    continue
+                made = self._remember_group(name, asked, found)
+            answered.append(pages.kept(_after(made, some), as_text=many))
+        computed = self._computed(name, missing, stored, len(entries))
+
+        def parts() -> Iterator[pages.Kept]:
+            for one in answered:
+                if not isinstance(one, _Asked):
+                    yield one
+                    continue
+                records_of = {recording: computed[recording] for recording in one.entries if recording in computed}
+                made = self._remember_group(name, one, records_of)
+                yield pages.kept(_after(made, one.entries), as_text=many)
+
+        return pages.joined(parts())
+
+    def _of_group(self, asked: _Asked) -> Mapping[str, Entry] | None:
+        """Return what the record of a group holds, None where there is none or an object is gone."""
+        record = self.store.record(digest(asked.identity))
+        if record is None or not records.complete(self.store, record):
+            return None
+        self.outcome.reused += len(asked.entries)
+        self.outcome.add_group(record["provenance"])
+        made: Mapping[str, Entry] = record["result"]["recordings"]
+        return made
 
     def run(self, name: str, tasks: Sequence[Task]) -> dict[str, Entry]:
         """Return what each task of stage ``name`` gives.
@@ -75,8 +107,13 @@ class ByRecording:
     def _reruns(self, name: str) -> bool:
         return self.request.rerun and registry.whole(name) == self.request.name
 
-    def _records(self, name: str, tasks: Sequence[Task], others: int = 0) -> dict[str, Mapping[str, Any]]:
-        """Return the record of each task, by recording; ``others`` are recordings whose results are known already."""
+    def _records(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
+        """Return the record of each task, by recording."""
+        stored, missing = self._stored(name, tasks)
+        return self._computed(name, missing, stored, len(tasks))
+
+    def _stored(self, name: str, tasks: Sequence[Task]) -> tuple[dict[str, Mapping[str, Any]], list[Task]]:
+        """Return the records that the store has, by recording, and the tasks that are to be computed."""
         found: dict[str, Mapping[str, Any]] = {}
         missing: list[Task] = []
         rerun = self._reruns(name)
@@ -88,25 +125,33 @@ class ByRecording:
                 self.outcome.add_record(name, task.recording, record)
             else:
                 missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
-        count = len(tasks) + others
-        if missing and self.request.check:
-            raise WouldChangeError(f"{registry.whole(name)} would run for {len(missing)} of {count} recordings.")
         if self.request.compare:
             missing = [replace(task, dry=True) for task in tasks]
         self.outcome.reused += len(tasks) - len(missing)
-        found.update(self._compute(name, missing, found))
-        if not found and not others:
+        return found, missing
+
+    def _computed(
+        self, name: str, missing: Sequence[Task], stored: Mapping[str, Mapping[str, Any]], count: int
+    ) -> dict[str, Mapping[str, Any]]:
+        """Return the records that are ``stored`` and those of the tasks that are ``missing``, of ``count`` in all."""
+        if missing and self.request.check:
+            raise WouldChangeError(f"{registry.whole(name)} would run for {len(missing)} of {count} recordings.")
+        found = {**stored, **self._compute(name, missing, stored)}
+        if missing and not found and len(missing) == count:
             lines = _lines(self.outcome.bad)
-            whole = registry.whole(name)
-            raise error(FAILED, f"{whole} could not read any of the {len(tasks)} recordings:\n{lines}")
+            raise error(FAILED, f"{registry.whole(name)} could not read any of the {count} recordings:\n{lines}")
         return found
 
-    def _remember_group(self, name: str, identity: Mapping[str, Any], made: Mapping[str, Mapping[str, Any]]) -> None:
-        stated = Outcome(self.outcome.output)
-        for recording, record in made.items():
-            stated.add_record(name, recording, record)
-        result = {"recordings": {one: record["result"]["recordings"][""] for one, record in made.items()}, "files": {}}
-        self.store.commit(identity, result, {**provenance.of(0.0), **stated.of_results()}, replace=True)
+    def _remember_group(self, name: str, asked: _Asked, made: Mapping[str, Mapping[str, Any]]) -> dict[str, Entry]:
+        """Return what the records of a group's recordings hold, and store it under the key of the group if all are there."""
+        result = {one: record["result"]["recordings"][""] for one, record in made.items()}
+        if self.store.run and len(asked.entries) > 1 and len(made) == len(asked.entries):
+            stated = Outcome(self.outcome.output)
+            for recording, record in made.items():
+                stated.add_record(name, recording, record)
+            made_by = {**provenance.of(0.0), **stated.of_results()}
+            self.store.commit(asked.identity, {"recordings": result, "files": {}}, made_by, replace=True)
+        return result
 
     def replay(self, given: Manifest, model: Manifest, beside: tuple[str, ...], where: str) -> Manifest:
         """Return ``given`` after the stages that a model was trained behind, from wherever it is among them now.
@@ -155,7 +200,11 @@ class ByRecording:
                 self.outcome.ran += done.made
                 self.outcome.reused += not done.made
                 self.outcome.add_record(name, done.recording, done.record)
-                found[done.recording] = done.record
+                made_by = done.record["provenance"]
+                found[done.recording] = {  # what is needed of it: of a million there is no room for more
+                    "result": done.record["result"],
+                    "provenance": {name: made_by[name] for name in ("notes", "code") if name in made_by},
+                }
                 if self.request.compare and done.recording in stored:
                     self.outcome.compare(stored[done.recording], done.record, done.recording)
         self._refuse(name, bad)

@@ -27,7 +27,7 @@ def continued(recordings: Dataset, model: Dataset) -> Dataset:
     given = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
     beside = (str(recordings.path), str(model.path))
     store = locate(recordings.path)
-    manifests = [bytes_digest(source.content), bytes_digest(model.source.content)]
+    manifests = [source.content_digest, bytes_digest(model.source.content)]
     with Chosen("", 0) as chosen, store.at_work(manifests):
         mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()), chosen)
         made = mapping.replay(given, model.source, beside, str(recordings.path))

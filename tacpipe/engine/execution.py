@@ -204,11 +204,12 @@ def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -
 class _Reader:
     """What `reader` returns; in another process it reads from the same store."""
 
-    def __init__(self, store: Store, beside: tuple[str, ...], sizes: Mapping[str, int]) -> None:
+    def __init__(self, store: Store, beside: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> None:
         self._store, self._beside, self._sizes = store, beside, sizes
 
     def __call__(self, name: str, path: str) -> bytes:
-        size = self._sizes.get(name)
+        sizes = self._sizes
+        size = sizes.size_of(name, path) if isinstance(sizes, Manifest) else sizes.get(name)
         try:
             return self._store.read(name, size)
         except MissingError as error:
@@ -222,21 +223,22 @@ class _Reader:
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reader_at, (self._store.place, self._beside, dict(self._sizes))
+        sizes = self._sizes if isinstance(self._sizes, Manifest) else dict(self._sizes)
+        return _reader_at, (self._store.place, self._beside, sizes)
 
 
-def _reader_at(place: str, beside: tuple[str, ...], sizes: Mapping[str, int]) -> _Reader:
+def _reader_at(place: str, beside: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> _Reader:
     return _Reader(opened(place), beside, sizes)
 
 
 def reader(
-    store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] = MappingProxyType({})
+    store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] | Manifest = MappingProxyType({})
 ) -> Callable[[str, str], bytes]:
     """Return a function (digest, path within its dataset) -> content that repairs what it finds damaged.
 
     It reads from the store; what is missing there is adopted from the directories ``beside``, or recomputed from its
-    record. ``sizes`` are those in bytes that a manifest declares, by digest: nothing much larger is read. Raises
-    `DamagedError` where neither can be done. It can be pickled.
+    record. ``sizes`` are those in bytes that a manifest declares, by digest, or the manifest: nothing much larger is read.
+    Raises `DamagedError` where neither can be done. It can be pickled.
     """
     return _Reader(store, beside, sizes)
 

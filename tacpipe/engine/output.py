@@ -11,7 +11,7 @@ from tacpipe.datasets.delivery import deliver
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine.request import Request
 from tacpipe.errors import DamagedError, UsageError, WouldChangeError
-from tacpipe.io.hashing import bytes_digest, file_digest
+from tacpipe.io.hashing import file_digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.store.store import MissingError, Store
 
@@ -106,7 +106,7 @@ class _Place(ABC):
     def check(self, made: Manifest) -> None:
         """Raise `WouldChangeError` where it was made from anything else, `UsageError` where it would be refused."""
         root = self.root
-        if root is None or root["manifest"] != bytes_digest(made.content):
+        if root is None or root["manifest"] != made.content_digest:
             raise WouldChangeError(f"{self.request.output} would change: it was made from other inputs or params.")
 
 
@@ -118,7 +118,7 @@ class _Directory(_Place):
         if root is None:
             return False
         wanted = self.settled(hit)
-        known = root["manifest"] == bytes_digest(wanted.content) and self.store.has(root["manifest"])
+        known = root["manifest"] == wanted.content_digest and self.store.has(root["manifest"])
         return known and directory.shows(self.store, wanted, self.path)
 
     def refuse(self, plan: replacing.Plan) -> None:
@@ -152,7 +152,7 @@ class _Directory(_Place):
     def publish(self, made: Manifest) -> Manifest:
         if not made.recorded and directory.shows(self.store, made, self.path):
             deliver(self.store, self.path, made)
-            self.store.roots.set(self.path, bytes_digest(made.content))
+            self.store.roots.set(self.path, made.content_digest)
             return made
 
         def decided() -> directory.Change:  # somebody may have labelled what is there
@@ -182,7 +182,7 @@ class _File(_Place):
 
     def shows(self, hit: Manifest) -> bool:
         root = self.root
-        known = root is not None and root["manifest"] == bytes_digest(hit.content) and self.path.exists()
+        known = root is not None and root["manifest"] == hit.content_digest and self.path.exists()
         return known and file_digest(self.path) == self._digest(hit)
 
     def refuse(self, plan: replacing.Plan) -> None:
@@ -200,7 +200,7 @@ class _File(_Place):
                 directory.sweep_beside(self.path)
                 directory.place(self.store, wanted, self.path, copy=True)
             deliver(self.store, self.path, made)
-            self.store.roots.set(self.path, bytes_digest(made.content))
+            self.store.roots.set(self.path, made.content_digest)
         return made
 
     def _digest(self, made: Manifest) -> str:

@@ -38,9 +38,8 @@ _NOTHING: Entry = {"attributes": {}, "shards": {}}  # of a part that gives files
 def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
     found = manifest.find(path)
-    sizes = dict(found.manifest.sizes())
     directory = found.directory.absolute()
-    read = execution.reader(locate(directory), (str(directory),), sizes)
+    read = execution.reader(locate(directory), (str(directory),), found.manifest)
     return Dataset(found.manifest, read, directory=directory, opener=open_dataset)
 
 

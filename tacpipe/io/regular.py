@@ -31,7 +31,7 @@ KINDS = (
     (stat.S_ISLNK, "a symbolic link"),
 )
 BLOCK_BYTES = 1 << 20
-JSON_BYTES = 1 << 28  # the largest JSON file that is read: a manifest of a million recordings
+JSON_BYTES = 1 << 30  # the largest JSON file that is read: a manifest of a million recordings has half of it
 JSON_IN_MEMORY = 24  # bytes that a byte of JSON becomes at most when it is parsed: "[]," is an empty list
 _FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
 _LINK = (errno.ELOOP, errno.EMLINK)  # what systems answer to O_NOFOLLOW

@@ -1,0 +1,301 @@
+"""Recordings of a large dataset, kept as the text of its manifest: a page of some hundred is parsed when it is asked for.
+
+Parsed, a recording takes four times the memory of its text, and most commands look at each once, or at a few of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from bisect import bisect_right
+from collections.abc import ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
+from dataclasses import dataclass
+from json.encoder import encode_basestring_ascii
+from math import isfinite
+from typing import Any
+
+from tacpipe.io import regular
+
+LARGE = 1 << 22  # bytes of a manifest from which on its recordings are kept as text
+MANY = 10_000  # recordings from which on a result is: they have about as many bytes
+PAGE_BYTES = 1 << 16
+_MOST_BYTES = 1 << 22  # of a page; a sound one has little more than `PAGE_BYTES`
+_KEPT = 4  # pages that stay parsed
+_BEGIN, _END = b'\n "recordings": {\n', b"\n }"
+_MEMBER = b'\n  "'  # begins a line of a recording's name, and no other line
+_NAME = re.compile(rb'  ("(?:[^"\\]|\\.)*"): ')
+_SHARD = ("bytes", "digest", "rows")
+_ORDER = "its recordings are not in the order of their names"
+_NAMES = re.compile(rb'\n  ("(?:[^"\\]|\\.)*"): ')  # literal from the start, so that searching is fast
+_CONSTANTS = {None: "null", True: "true", False: "false"}
+Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+
+
+class Pages(Mapping[str, Entry]):
+    """Recordings by name, in the order of names; what `page` made of each part of them is given in that order."""
+
+    def __init__(self, texts: Sequence[bytes | memoryview], count: int) -> None:
+        self.texts = texts
+        self._count = count
+        self._first = [json.loads(found[1]) for text in texts if (found := _NAME.match(text))]
+        if len(self._first) < len(texts) or any(a >= b for a, b in zip(self._first, self._first[1:], strict=False)):
+            raise ValueError(_ORDER)
+        self._sound = bytearray(len(texts))  # whether a page holds what its lines begin with, in order
+        self._parsed: dict[int, dict[str, Entry]] = {}
+
+    def __getitem__(self, name: str) -> Entry:
+        return self._page(max(0, bisect_right(self._first, name) - 1))[name]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[str]:
+        for number in range(len(self.texts)):
+            yield from self._names(number)
+
+    def items(self) -> ItemsView[str, Entry]:
+        """Return names and entries; each page is parsed as it comes."""
+        return _Items(self)
+
+    def values(self) -> ValuesView[Entry]:
+        """Return the entries; each page is parsed as it comes."""
+        return _Values(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Pages, ([bytes(text) for text in self.texts], self._count)
+
+    def parts(self) -> Iterator[dict[str, Entry]]:
+        """Yield the recordings a page at a time.
+
+        Raises `ValueError` for a page that is not one, and in the end where there are not as many recordings as there should
+        be, in the order of their names.
+        """
+        count, last = 0, ""
+        for number in range(len(self.texts)):
+            part = self._page(number)
+            names = list(part)
+            if not self._sound[number]:
+                if names != sorted(names) or names != self._names(number) or (count and names[0] <= last):
+                    raise ValueError(_ORDER)
+                self._sound[number] = True
+            count, last = count + len(names), names[-1]
+            yield part
+        if count != self._count:
+            raise ValueError("two of its recordings share a name")
+
+    def changed(self, entries: Mapping[str, Entry | None]) -> Pages:
+        """Return the recordings with others in the place of some that are there; None leaves one out."""
+        texts = list(self.texts)
+        for number in sorted({bisect_right(self._first, name) - 1 for name in entries}):
+            part: Mapping[str, Entry | None] = {**self._page(number), **entries}
+            now = {name: part[name] for name in self._page(number)}
+            texts[number] = page({name: entry for name, entry in now.items() if entry is not None})
+        gone = sum(entry is None for entry in entries.values())
+        return Pages([text for text in texts if len(text)], self._count - gone)
+
+    def holding(self, word: bytes) -> Iterator[dict[str, Entry]]:
+        """Yield those pages alone in whose text a word stands."""
+        for number, text in enumerate(self.texts):
+            if word in bytes(text):
+                yield self._page(number)
+
+    def _names(self, number: int) -> list[str]:
+        names = _NAMES.findall(b"\n" + bytes(self.texts[number]))
+        found: list[str] = json.loads(b"[%b]" % b",".join(names))
+        return found
+
+    def _page(self, number: int) -> dict[str, Entry]:
+        found = self._parsed.get(number)
+        if found is None:
+            found = json.loads(f"{{{str(self.texts[number], 'ascii')}}}")
+            while len(self._parsed) >= _KEPT:
+                del self._parsed[next(iter(self._parsed))]
+            self._parsed[number] = found
+        return found
+
+
+class _Items(ItemsView[str, Entry]):
+    _mapping: Pages
+
+    def __iter__(self) -> Iterator[tuple[str, Entry]]:
+        for part in self._mapping.parts():
+            yield from part.items()
+
+
+class _Values(ValuesView[Entry]):
+    _mapping: Pages
+
+    def __iter__(self) -> Iterator[Entry]:
+        for part in self._mapping.parts():
+            yield from part.values()
+
+
+def changed(recordings: Mapping[str, Entry], entries: Mapping[str, Entry | None]) -> Mapping[str, Entry]:
+    """Return recordings with others in the place of some that are there; None leaves one out."""
+    if isinstance(recordings, Pages):
+        return recordings.changed(entries)
+    found = {name: entries.get(name, entry) for name, entry in recordings.items()}
+    return {name: entry for name, entry in found.items() if entry is not None}
+
+
+def beside(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tuple[str, Entry | None, Entry | None]]:
+    """Yield name and entry, before and now, of all recordings of two datasets, in the order of names."""
+    left, right = ordered(before), ordered(now)
+    old, new = next(left, None), next(right, None)
+    while old is not None or new is not None:
+        if new is None or (old is not None and old[0] < new[0]):
+            assert old is not None
+            yield old[0], old[1], None
+            old = next(left, None)
+        elif old is None or new[0] < old[0]:
+            yield new[0], None, new[1]
+            new = next(right, None)
+        else:
+            yield old[0], old[1], new[1]
+            old, new = next(left, None), next(right, None)
+
+
+def ordered(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
+    """Return names and entries in the order of names."""
+    return iter(recordings.items() if isinstance(recordings, Pages) else sorted(recordings.items()))
+
+
+def parts(recordings: Mapping[str, Entry]) -> Iterator[Mapping[str, Entry]]:
+    """Yield recordings as they lie in memory: a page at a time where they are text, else all at once."""
+    if isinstance(recordings, Pages):
+        yield from recordings.parts()
+    else:
+        yield recordings
+
+
+def write(value: Mapping[str, Any]) -> bytes:
+    """Return the bytes of a manifest with these fields, whose recordings may be `Pages`."""
+    recordings = value["recordings"]
+    if not isinstance(recordings, Pages) or not recordings:
+        return indented({**value, "recordings": dict(recordings)}).encode() + b"\n"
+    head = indented({**value, "recordings": {}}).encode() + b"\n"
+    before, empty, after = head.partition(b'\n "recordings": {}')
+    assert empty
+    texts = (text for number, one in enumerate(recordings.texts) for text in ((b",\n" if number else b""), one))
+    return b"".join([before, _BEGIN, *texts, _END, after])
+
+
+def page(entries: Mapping[str, Entry]) -> bytes:
+    """Return recordings as they stand in a manifest, in the order of names, between the braces."""
+    return ",\n".join(
+        [f"  {encode_basestring_ascii(name)}: {_entry(entries[name])}" for name in sorted(entries)]
+    ).encode()
+
+
+def _entry(entry: Entry) -> str:
+    """Return what `indented` returns for the entry of a recording, in half the time where it has the usual form."""
+    attributes, shards = entry["attributes"], entry["shards"]
+    usual = all(type(one["bytes"]) is type(one["rows"]) is int and len(one) == len(_SHARD) for one in shards.values())
+    if len(entry) > len(("attributes", "shards")) or not (attributes and shards and usual):
+        return indented(entry, "\n  ")
+    labels = [f"{encode_basestring_ascii(name)}: {_label(attributes[name])}" for name in sorted(attributes)]
+    streams = [
+        f'{encode_basestring_ascii(name)}: {{\n     "bytes": {one["bytes"]},\n     "digest": '
+        f'{encode_basestring_ascii(one["digest"])},\n     "rows": {one["rows"]}\n    }}'
+        for name, one in sorted(shards.items())
+    ]
+    inner = ",\n    "
+    return (
+        f'{{\n   "attributes": {{\n    {inner.join(labels)}\n   }},'
+        f'\n   "shards": {{\n    {inner.join(streams)}\n   }}\n  }}'
+    )
+
+
+def _label(value: Any) -> str:
+    kind = type(value)
+    if kind is str:
+        return encode_basestring_ascii(value)
+    return repr(value) if kind is int else indented(value, "\n    ")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A part of the recordings of a result, as text or as it is, and how many they are."""
+
+    entries: Mapping[str, Entry] | bytes
+    count: int
+
+
+def kept(entries: Mapping[str, Entry], *, as_text: bool) -> Kept:
+    """Return recordings as they are kept until all are there: as text where they are many."""
+    return Kept(page(entries) if as_text else entries, len(entries))
+
+
+def joined(given: Iterable[Kept]) -> Mapping[str, Entry]:
+    """Return recordings that come in parts, in the order of names, as one mapping; all parts are kept in the same way."""
+    found: dict[str, Entry] = {}
+    texts, count = [], 0
+    for part in given:
+        if isinstance(part.entries, bytes):
+            texts += [part.entries] if part.count else []
+            count += part.count
+        else:
+            found |= part.entries
+    return Pages(texts, count) if texts else found
+
+
+def split(content: bytes, where: str) -> dict[str, Any] | None:
+    """Return the value of a manifest with its recordings as `Pages`; None where the bytes are not as tacpipe writes them.
+
+    What is returned is what ``json.loads`` would return, once all of `Pages.parts` were gone through without an error.
+    Raises `StorageError` where memory is short.
+    """
+    begin = content.find(_BEGIN + b'  "')
+    end = content.find(_END, begin)
+    if begin < 0 or end < 0:
+        return None
+    head = content[:begin] + b'\n "recordings": {}' + content[end + len(_END) :]
+    regular.expect_parsed(where, len(head))
+    try:
+        value = json.loads(head)
+        if type(value) is not dict or indented(value).encode() + b"\n" != head:
+            return None
+        texts = [*_texts(content, begin + len(_BEGIN), end)]
+        if max(map(len, texts)) > _MOST_BYTES:  # one recording has most of it
+            return None
+        found = Pages(texts, content.count(_MEMBER, begin, end))
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return {**value, "recordings": found}
+
+
+def _texts(content: bytes, begin: int, end: int) -> Iterator[memoryview]:
+    view = memoryview(content)
+    while True:
+        stop = content.find(b"," + _MEMBER, begin + PAGE_BYTES, end)
+        yield view[begin : end if stop < 0 else stop]
+        if stop < 0:
+            return
+        begin = stop + len(b",\n")
+
+
+def indented(value: Any, line: str = "\n") -> str:
+    """Return what ``json.dumps(value, sort_keys=True, indent=1, allow_nan=False)`` returns, in half the time.
+
+    The standard library indents in Python and not in C. ``line`` begins each line. Raises as that does.
+
+    >>> indented({"b": [1, {"c": None}], "a": {}}) == json.dumps({"a": {}, "b": [1, {"c": None}]}, indent=1)
+    True
+    """
+    kind = type(value)
+    if kind is str:
+        return encode_basestring_ascii(value)
+    if kind is int or (kind is float and isfinite(value)):
+        return repr(value)
+    if value is None or kind is bool:
+        return _CONSTANTS[value]
+    inner = f"{line} "
+    if kind is dict and value:
+        if any(type(key) is not str for key in value):
+            return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", line)
+        names = sorted(value)
+        texts = [f"{encode_basestring_ascii(name)}: {indented(value[name], inner)}" for name in names]
+        return f"{{{inner}{f',{inner}'.join(texts)}{line}}}"
+    if kind in (list, tuple) and value:
+        return f"[{inner}{f',{inner}'.join([indented(one, inner) for one in value])}{line}]"
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", line)
