@@ -130,7 +130,8 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
 def _refused(types: Iterable[str], params: Estimator) -> str:
     """Return those of the types that neither the architecture's package has nor the architecture trusts, as text."""
     package = type(params).__module__.partition(".")[0]
-    return listed([plain(one, 100) for one in types if one.partition(".")[0] != package and one not in params.TRUSTED])
+    others = [one for one in types if one.partition(".")[0] != package and one not in params.TRUSTED]
+    return listed([plain(one, 100) for one in others]) if others else ""
 
 
 def _canonical(content: bytes) -> bytes:
