@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import ResultWarning, TacpipeError
 from tacpipe.plugins import architectures, given_params, registry
 from tacpipe.plugins import params as params_of
 from tests.conftest import Ran, forget
@@ -235,6 +237,8 @@ def test_name_and_version_of_the_package_are_in_keys_and_those_of_built_in_ones_
     with pytest.raises(TacpipeError, match=r"lab-architectures 1\.0, and lab-architectures 1\.1"):
         params_of.from_json(stage, before)  # a worker, or a result that is computed again
     assert params_of.from_json(stage, params_of.to_json(params)) == params
+    with pytest.warns(ResultWarning, match=r"lab-architectures 1\.0, and lab-architectures 1\.1 is installed"):
+        assert params_of.read(stage.params, before, "config.json") == params  # a model opens where its weights fit
 
 
 def test_a_model_without_its_package_names_architecture_package_and_version(package: Path) -> None:
@@ -242,12 +246,10 @@ def test_a_model_without_its_package_names_architecture_package_and_version(pack
     (package / "lab_architectures.egg-info" / "entry_points.txt").write_text("")
     forget()
     stage = registry.load("train.forward")
-    for read in (
-        lambda: params_of.read(stage.params, stored, "config.json"),
-        lambda: params_of.from_json(stage, stored),
-    ):
+    for read, of in ((params_of.read, stage.params), (params_of.from_json, stage)):
+        where = ("config.json",) if read is params_of.read else ()
         with pytest.raises(TacpipeError, match=r"'plain' comes from the package lab-architectures 1\.0"):
-            read()
+            read(of, stored, *where)
 
 
 @pytest.mark.parametrize(
@@ -296,6 +298,39 @@ def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_byt
     assert (one.scores(frames).argmax(axis=1) == materials).mean() > 0.8
     with pytest.raises(TacpipeError, match=r"model\.skops is not a file of skops"):
         estimators.unpacked(content[:-30], "model.skops", params)
+
+
+def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_packages_run_nothing(
+    package: Path,
+) -> None:
+    from tacpipe.tasks.material import estimators
+
+    params = built("material", architecture="nearest")
+    frames, materials = slides(0)
+    content = estimators.packed({"biotac": estimators.Fitted.fit(params, frames, materials)}, params)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        changed = bytearray(content)
+        changed[rng.integers(len(changed))] ^= int(rng.integers(1, 256))
+        try:
+            estimators.unpacked(bytes(changed), "model.skops", params)
+        except TacpipeError as error:
+            assert "model.skops" in str(error)
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    call = {
+        "__class__": "system",
+        "__module__": "os",
+        "__loader__": "FunctionNode",
+        "__id__": 1,
+        "content": "os.system",
+    }
+    written, described = io.BytesIO(), json.loads(members["schema.json"])
+    with zipfile.ZipFile(written, "w") as file:
+        for name, own in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
+            file.writestr(name, own)
+    with pytest.raises(TacpipeError, match="system"):
+        estimators.unpacked(written.getvalue(), "model.skops", params)
 
 
 def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts_them(package: Path) -> None:

@@ -20,10 +20,11 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import ResultWarning, TacpipeError
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import registry
 from tacpipe.printable import excerpt, plain
@@ -111,6 +112,17 @@ def check_installed(base: Any, values: Mapping[str, Any], kind: Kind | None) -> 
                 f"The architecture {excerpt(values.get(TAG))} comes from the package {plain(str(values[PLUGIN]), 100)}, "
                 f"which is not installed here. Install it to use the model."
             )
+
+
+def warn_of_version(values: Mapping[str, Any], kind: Kind) -> None:
+    """Warn where a model was trained with another version of its architecture's package than is installed."""
+    before, now = values.get(PLUGIN), plugin(kind)
+    if before != now:
+        trained = f"{excerpt(values.get(TAG))} of {plain(str(before), 100)}"
+        sentence = (
+            f"This model was trained with the architecture {trained}, and {now} is installed: predictions may differ."
+        )
+        warnings.warn(sentence, ResultWarning, stacklevel=2)
 
 
 def check_version(values: Mapping[str, Any], kind: Kind) -> None:

@@ -191,6 +191,7 @@ def read(union: Any, values: Mapping[str, Any], where: str) -> Any:
         allowed = [str(choice) for one in several for choice in choices(one, name)]
         found = excerpt(values.get(_stored_name(several[0], name)))
         raise TacpipeError(f"{where}: {name} is {found}; it must be one of {', '.join(allowed)}.")
+    architectures.warn_of_version(values, kind)
     known = fields_of.hints(kind)
     fitted = {name: _of_type(value, known[name], name, where) for name, value in current.items() if name in known}
     return kind(**fitted)
