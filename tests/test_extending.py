@@ -45,7 +45,7 @@ def environment(folder: Path) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(1500)
+@pytest.mark.timeout(3600)
 def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_path: Path) -> None:
     """One project serves all pages: what one computed is reused on the next."""
     programs = environment(tmp_path / "environment")
