@@ -204,5 +204,5 @@ def test_what_the_data_cannot_give_is_refused(rows: int, how: dict[str, float], 
 def test_an_unknown_kind_and_missing_files_are_refused() -> None:
     with pytest.raises(TacpipeError, match=r"no codec\.safetensors"):
         stored.load({"codec.json": b"{}"})
-    with pytest.raises(TacpipeError, match="kind 'magic' is not installed.*autoencoder, pca"):
+    with pytest.raises(TacpipeError, match=r"kind 'magic' is not installed.*autoencoder, pca"):
         stored.load({"codec.json": b'{"kind": "magic"}', "codec.safetensors": b""})
